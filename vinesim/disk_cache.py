@@ -26,6 +26,8 @@ from typing import IO
 import numpy as np
 
 log = logging.getLogger(__name__)
+progress = logging.getLogger("vinesim.progress")
+"""What is worth a line on the terminal because it takes longer than a second."""
 
 MAX_SIZE = 1 << 30
 """Size of all entries [bytes]; those that were not used for longest are deleted."""
@@ -158,11 +160,11 @@ def _prune(place: pathlib.Path) -> None:
 
 
 @contextlib.contextmanager
-def exclusive(name: str, timeout: float | None = None) -> Iterator[bool]:
+def exclusive(name: str, timeout: float | None = None, waiting_for: str = "") -> Iterator[bool]:
     """Be the only process in work that has this ``name``; yields whether another process was waited for.
 
     The lock ends with the process that holds it, however that ends. Goes on without it where there can be none, and
-    after ``timeout`` [s], :data:`LOCK_TIMEOUT` unless given.
+    after ``timeout`` [s], :data:`LOCK_TIMEOUT` unless given. ``waiting_for``: logged after a second of waiting.
     """
     timeout = LOCK_TIMEOUT if timeout is None else timeout
     try:
@@ -174,9 +176,12 @@ def exclusive(name: str, timeout: float | None = None) -> Iterator[bool]:
         yield False
         return
     with file:
-        start, waited = time.monotonic(), False
+        start, waited, told = time.monotonic(), False, False
         while not _try_lock(file):
             waited = True
+            if not told and time.monotonic() > start + 1.0:
+                progress.info("waiting for %s", waiting_for or f"another process that makes {name}")
+                told = True
             if time.monotonic() > start + timeout:
                 log.warning("another process has held %s for %.0f s; going on without it", path, timeout)
                 break

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from tests.support.live_server import need_links, wait
+from tests.support.live_server import require_network_emulation, wait
 from vinesim.bench.support import network_emulator
 from vinesim.bench.support.network_emulator import Count, Link, LinkProfile, NetworkEmulator
 
@@ -48,7 +48,7 @@ print(json.dumps([trips, answered]))
 
 @pytest.fixture(autouse=True)
 def _links():
-    need_links()
+    require_network_emulation()
 
 
 def probe(net: NetworkEmulator, end: str, count: int, *flood: str) -> tuple[list[float], int]:

@@ -80,3 +80,25 @@ def test_steps_come_at_100_hz_by_the_real_clock():
         loop.end()
     assert (100 + loop.dropped) / (time.perf_counter() - begun) == pytest.approx(100.0, rel=0.1)
     assert loop.overruns <= 5
+
+
+def test_a_log_gives_the_statistics_of_a_part_of_the_run(clock, tmp_path):
+    loop = RateLoop(0.01)
+    run(loop, clock, [0.002] * 50 + [0.015] + [0.004] * 50)
+    loop.log().save(tmp_path / "ticks.npz")
+    log = module.TickLog.load(tmp_path / "ticks.npz")
+    start = log.begins[0]
+    early, late = log.between(start, start + 0.4), log.between(start + 0.6, np.inf)
+    assert early["tick_p99_ms"] == pytest.approx(2.0, rel=1e-3)
+    assert late["tick_p50_ms"] == pytest.approx(4.0, rel=1e-3)
+    assert late["tick_hz"] == pytest.approx(100.0)
+    assert log.between(start, np.inf)["overruns"] == 1
+    with pytest.raises(ValueError, match="0 steps"):
+        log.between(start - 2.0, start - 1.0)
+
+
+def test_a_log_that_is_full_keeps_the_newest_in_order(clock):
+    loop = RateLoop(0.01, capacity=8)
+    starts = run(loop, clock, [0.001] * 11)
+    log = loop.log()
+    assert log.begins - log.begins[0] == pytest.approx(starts[3:] - starts[3])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from tests.support.recorded_world import TICK, Light, vineyard
+from tests.support.recorded_world import TICK, MinimalClient, vineyard
 from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Observer, Recorder, observer_grid
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
@@ -34,7 +34,7 @@ class World:
         )
         fact = RetainedRecord(object_id(ObjectKind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
         server.declare_queryable("snap/0/0", lambda _: messages.encode_records([fact]))
-        self.ada, self.bob = Light(self.hub.bus("ada"), 0.5), Light(self.hub.bus("bob"), 0.5 + apart)
+        self.ada, self.bob = MinimalClient(self.hub.bus("ada"), 0.5), MinimalClient(self.hub.bus("bob"), 0.5 + apart)
         self.clients = [self.ada, self.bob]
         self.steps = [lambda: None]
         if path is not None:
@@ -185,7 +185,7 @@ def test_another_vineyard_is_refused_and_a_late_stranger_ignored(tmp_path):
 
     world = World(tmp_path / "run.mcap")
     world.run(0.5)
-    Light(world.hub.bus("eve"), 1.0, digest="elsewhere")  # it serves its greeting
+    MinimalClient(world.hub.bus("eve"), 1.0, digest="elsewhere")  # it serves its greeting
     world.run(0.5)
     greetings = {e.key for e in world.tape().messages if e.key.startswith("hello/")}
     assert greetings == {"hello/ada", "hello/bob"}

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.client.test_recorder import EPOCH, World
-from tests.support.recorded_world import TICK, Light, vineyard
+from tests.support.recorded_world import TICK, MinimalClient, vineyard
 from vinesim.client.recording.replay import Replay, ReplayBus
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
@@ -35,10 +35,10 @@ def tape(tmp_path_factory) -> Recording:
     return world.tape()
 
 
-def watch(tape: Recording, **span: float) -> tuple[Light, list[bytes], list[tuple]]:
+def watch(tape: Recording, **span: float) -> tuple[MinimalClient, list[bytes], list[tuple]]:
     """One who stands beside the tree while the tape is played: it, its states, and what it saw move, tick by tick."""
     bus = ReplayBus(tape, "viewer", **span)
-    viewer = Light(bus, 1.5, kind="spectator", joints=0)
+    viewer = MinimalClient(bus, 1.5, kind="spectator", joints=0)
     states, seen = [], []
     while not bus.ended:
         bus.play(TICK)
@@ -149,7 +149,7 @@ class Stage:
         self.kept: list[RetainedRecord] = []
         self.server = server
         server.subscribe("fact/**", KEEP_ALL)
-        self.viewer = Light(self.hub.bus("viewer"), 1.5, kind="spectator", joints=0)
+        self.viewer = MinimalClient(self.hub.bus("viewer"), 1.5, kind="spectator", joints=0)
         self.replay = Replay(tape, self.hub.bus("replay", live=False), self.hub.bus, self.hub.time, **span)
 
     def run(self) -> None:

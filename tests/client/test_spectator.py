@@ -10,7 +10,7 @@ import pytest
 
 from tests.client.test_recorder import World
 from tests.client.test_replay import recorded_trees
-from tests.support.recorded_world import TICK, Light, vineyard
+from tests.support.recorded_world import TICK, MinimalClient, vineyard
 from vinesim import frames
 from vinesim.cli.replay import run as replay
 from vinesim.client.client import Client
@@ -77,11 +77,11 @@ def test_a_replay_moves_the_trees_the_same_way_twice(bent):
 
 def test_a_spectator_owns_nothing_even_when_an_owner_goes():
     hub = MemoryHub(delay=0.004)
-    ada = Light(hub.bus("ada"), 0.5)
-    onlooker = Light(hub.bus("aaa"), 0.6, kind="spectator", joints=0)
-    bob = Light(hub.bus("bob"), 3.0)
+    ada = MinimalClient(hub.bus("ada"), 0.5)
+    onlooker = MinimalClient(hub.bus("aaa"), 0.6, kind="spectator", joints=0)
+    bob = MinimalClient(hub.bus("bob"), 3.0)
 
-    def run(*clients: Light, seconds: float = 0.5) -> None:
+    def run(*clients: MinimalClient, seconds: float = 0.5) -> None:
         for _ in range(round(seconds / TICK)):
             hub.advance(TICK)
             for client in clients:

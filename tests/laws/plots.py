@@ -1,4 +1,4 @@
-"""``make validation``: draws what the laws compare and writes their figures into docs/validation.md.
+"""``make validation``: plots the comparisons of tests/laws and writes their figures into docs/validation.md.
 
 Everything comes from the functions that the tests call: ``tests/support/beam_theory.py`` and the scenes of
 ``tests/support/contact_scenes.py``.
@@ -68,10 +68,10 @@ def elastica() -> Table:
     shapes.set(aspect="equal", xlabel="forward [m]", ylabel="up [m]", xlim=(-0.03, 1.12))
     shapes.set_title("elastica (lines) and 16 bodies (dots) under a tip load, by alpha")
 
-    cases, truth, seen = beam_theory.elastica_sweep()
+    cases, truth, measured = beam_theory.elastica_sweep()
     alpha, share, angle = np.array(cases).T
     straight = np.stack([np.cos(angle), np.sin(angle)], 1)
-    off = 100 * np.linalg.norm(seen - truth, axis=1) / np.linalg.norm(truth - straight, axis=1)
+    off = 100 * np.linalg.norm(measured - truth, axis=1) / np.linalg.norm(truth - straight, axis=1)
     kinds = ((0.0, "own weight", LEAF), (0.5, "both", WOOD), (1.0, "tip load", GRAPE))
     for which, name, colour in kinds:
         here = share == which
@@ -127,20 +127,20 @@ def convergence() -> Table:
 
 def damping() -> Table:
     """Damping ratio asked against seen, at 100 Hz and the shipping phi."""
-    seen, frequency, floor = beam_theory.damping_sweep()
+    measured, frequency, floor = beam_theory.damping_sweep()
     asked = np.array(beam_theory.ZETAS)
     figure, axes = plt.subplots(figsize=(5.4, 4.4), layout="constrained")
     axes.plot([0, 0.21], [0, 0.21], color=GREY, lw=1, ls="--")
     axes.fill_between([0, 0.21], [-0.005, 0.205], [0.005, 0.215], color=GREY, alpha=0.18, lw=0, label="gate: 0.005")
     axes.axhline(floor[0], color=WOOD, lw=1, label=f"floor {floor[0]:.4f} (2.8 Hz, phi 0.55)")
-    axes.plot(asked, seen, "o", color=GRAPE, ms=6, label="seen")
+    axes.plot(asked, measured, "o", color=GRAPE, ms=6, label="seen")
     axes.set(xlabel="damping ratio asked", ylabel="damping ratio seen", xlim=(0, 0.21), ylim=(0, 0.21), aspect="equal")
     axes.set_title("first mode of a cane, 100 Hz")
     axes.legend(loc="upper left")
     save(figure, "damping")
     lines = table(
         ("damping ratio asked", *(f"{z:g}" for z in asked)),
-        [("seen", *(f"{z:.4f}" for z in seen)), ("frequency", *(f"{100 * (f - 1):+.2f} %" for f in frequency))],
+        [("seen", *(f"{z:.4f}" for z in measured)), ("frequency", *(f"{100 * (f - 1):+.2f} %" for f in frequency))],
     )
     f_seen, f_truth = beam_theory.measured_frequencies()
     off = [f"{100 * (a / b - 1):+.2f} %" for a, b in zip(f_seen, f_truth, strict=True)]
@@ -163,13 +163,13 @@ def grasped() -> Table:
         place[:, tick] = [test_contact.middle_of(q) for q in (ours.snapshot().body_q[body], reference.body_pose(body))]
         force[:, tick] = abs(force_on(ours, "left")[1]), abs(reference.contact_force_on("left")[1])
     time = 0.01 * np.arange(800)
-    figure, (way, press) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
+    figure, (position, press) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")
     for axis, name, colour in ((1, "aside", LEAF), (2, "up", GRAPE)):
-        way.plot(time, 1e3 * (place[1, :, axis] - place[1, 0, axis]), color=colour, lw=3.5, alpha=0.35)
-        way.plot(time, 1e3 * (place[0, :, axis] - place[1, 0, axis]), color=colour, lw=1.2, label=name)
-    way.set_ylabel("bunch [mm]")
-    way.set_title("a bunch grasped, lifted, moved, pulled, let go: vinesim (thin), all in MuJoCo (broad)")
-    way.legend(loc="upper left")
+        position.plot(time, 1e3 * (place[1, :, axis] - place[1, 0, axis]), color=colour, lw=3.5, alpha=0.35)
+        position.plot(time, 1e3 * (place[0, :, axis] - place[1, 0, axis]), color=colour, lw=1.2, label=name)
+    position.set_ylabel("bunch [mm]")
+    position.set_title("a bunch grasped, lifted, moved, pulled, let go: vinesim (thin), all in MuJoCo (broad)")
+    position.legend(loc="upper left")
     press.plot(time, force[1], color=WOOD, lw=3.5, alpha=0.35)
     press.plot(time, force[0], color=WOOD, lw=1.2)
     press.set(xlabel="time [s]", ylabel="left finger [N]", ylim=(0, 60))
@@ -190,9 +190,9 @@ def energy() -> Table:
     canes = [(name, test_rod_in_space.drawn_cane(), np.array(kick)) for name, kick in kicks.items()]
     canes.append(("aside, 100 g on the tip", test_rod_in_space.loaded_cane(0.1), np.array([0.0, 0.0, 0.02])))
     for (name, cane, kick), colour in zip(canes, COLOURS, strict=True):
-        seen, fastest = test_rod_in_space.drift(cane, kick)
-        share = 100 * (seen[-100:].mean() / seen[:100].mean() - 1)
-        axes.plot(0.05 * np.arange(len(seen)), 100 * (seen / seen[0] - 1), color=colour, lw=1.2, label=name)
+        measured, fastest = test_rod_in_space.drift(cane, kick)
+        share = 100 * (measured[-100:].mean() / measured[:100].mean() - 1)
+        axes.plot(0.05 * np.arange(len(measured)), 100 * (measured / measured[0] - 1), color=colour, lw=1.2, label=name)
         rows.append((name, f"{fastest:.2f} rad/s", f"{share:+.2f} %"))
     axes.axhspan(-1, 1, color=GREY, alpha=0.18, lw=0, label="gate: 1 %")
     axes.set(xlabel="time [s]", ylabel="energy, % off", ylim=(-2, 2))

@@ -1,4 +1,4 @@
-"""Boxes stack, rub, are carried with what lies in them; and whatever meets in the air keeps its momentum."""
+"""Boxes: stacking, friction, carrying with contents; and momentum of pairs that collide in the air."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def robot(
     return RobotSpec(name, 0, urdf, "base_footprint", frames.pose(at), drives, np.zeros(1), (1e5, 1e5))
 
 
-def pile(count: int) -> Physics:
-    """Boxes on one another, each turned a little."""
+def stack(count: int) -> Physics:
+    """A stack of boxes, each rotated a little."""
     at = [frames.pose([0.0, 0.0, 0.3 * i], frames.from_yaw(0.01 * (-1) ** i)) for i in range(count)]
     return Physics(assemble([cane((0.0, 50.0, 2.0))], box_pose=at, box_size=[SIZE] * count, box_mass=MASSES[:count]))
 
@@ -42,8 +42,8 @@ def poses(physics: Physics) -> np.ndarray:
     return np.array([physics.rigid.mj_data.joint(f"box/{i}").qpos for i in range(len(physics.model.box_mass))])
 
 
-def test_four_boxes_stand_on_one_another_and_fall_asleep():
-    physics = pile(4)
+def test_four_stacked_boxes_stand_and_sleep():
+    physics = stack(4)
     for _ in range(100):
         physics.step()
     settled = poses(physics)
@@ -58,31 +58,33 @@ def test_four_boxes_stand_on_one_another_and_fall_asleep():
     assert (physics.rigid.mj_data.tree_asleep[trees] >= 0).all()
 
 
-@pytest.mark.parametrize("share", [0.95, 1.05])
+@pytest.mark.parametrize("fraction", [0.95, 1.05])
 @pytest.mark.parametrize("which", [0, 1])
-def test_what_starts_a_box_is_mu_times_what_rests_on_its_sole(which, share):
-    """F34: the upper of two boxes slides at mu m g of its own, the lower one at mu g times both."""
-    physics = pile(2)
+def test_a_box_starts_to_slide_at_mu_times_its_load(which, fraction):
+    """F34: the upper of two boxes slides at mu m g of its own mass, the lower one of both masses."""
+    physics = stack(2)
     for _ in range(150):
         physics.step()
     start = poses(physics)
     data, body = physics.rigid.mj_data, physics.rigid.mj_model.body(f"box/{which}").id
-    force = share * PhysicsParameters().friction * WEIGHT * sum(MASSES[which:2])
+    force = fraction * PhysicsParameters().friction * WEIGHT * sum(MASSES[which:2])
     data.xfrc_applied[body, 0] = force
-    data.xfrc_applied[body, 4] = -force * (data.xipos[body, 2] - start[which, 2])  # acts at its sole: does not tip it
+    data.xfrc_applied[body, 4] = -force * (
+        data.xipos[body, 2] - start[which, 2]
+    )  # applied at its bottom, so that it does not tip
     for _ in range(60):
         physics.step()
-    went = poses(physics)[:, 0] - start[:, 0]
-    if share < 1.0:
-        assert np.abs(went).max() < 3e-3
+    displacement = poses(physics)[:, 0] - start[:, 0]
+    if fraction < 1.0:
+        assert np.abs(displacement).max() < 3e-3
     else:
-        assert went[which] > 0.03
+        assert displacement[which] > 0.03
     if which == 1:
-        assert abs(went[0]) < 3e-3, "the lower one stays"
+        assert abs(displacement[0]) < 3e-3, "the lower box moved"
 
 
-def test_a_box_of_bunches_is_lifted_driven_and_set_down_with_all_that_is_in_it():
-    """A fork carries the box up by 40 cm and forth by 1 m; its drive feels the weight of box and bunches."""
+def test_a_box_of_bunches_is_lifted_moved_and_set_down():
+    """A fork lifts the box by 40 cm and moves it by 1 m; its drive carries the weight of box and bunches."""
     masses = [0.4, 0.5, 0.6]
     trees = [cane((0.0, 9.0 + i, 2.0), bunch=mass) for i, mass in enumerate(masses)]
     physics = Physics(
@@ -121,11 +123,11 @@ def test_a_box_of_bunches_is_lifted_driven_and_set_down_with_all_that_is_in_it()
 # ---------------------------------------------------------------------- momentum of pairs
 
 HIGH = 60.0
-"""All meets in free fall, far above ground: nothing else pushes sideways [m]."""
+"""Height of the collisions, in free fall without other horizontal forces [m]."""
 
 
 def airborne() -> Physics:
-    """Two boxes, two bunches and two cut canes, apart from one another, and two coasting rams."""
+    """Two boxes, two bunches and two cut canes, far from one another, and two coasting rams."""
     trees = [cane((20.0 * i, 30.0, HIGH), bunch=0.5) for i in range(2)]
     trees += [cane((20.0 * i, 60.0, HIGH), radius=0.006) for i in range(2)]
     at = [frames.pose([5.0 * i, -30.0, HIGH]) for i in range(2)]
@@ -138,7 +140,7 @@ def airborne() -> Physics:
 
 
 def momentum(physics: Physics) -> np.ndarray:
-    """Of all that moves freely [3] kg m/s; of a ram, along its way."""
+    """Total momentum of all free bodies [3] kg m/s; of a ram, along its axis."""
     rigid, model = physics.rigid, physics.model
     rigid.update_kinematics()
     total, J = np.zeros(3), np.zeros((3, rigid.mj_model.nv))
@@ -154,8 +156,8 @@ def momentum(physics: Physics) -> np.ndarray:
     return total + model.body_mass[free].astype(float) @ velocity[free]
 
 
-def hurl(physics: Physics, kind: str, index: int, x: float, speed: float) -> None:
-    """Put a thing where it meets its fellow at (0, 0, 60), a little off centre, flying along x."""
+def throw(physics: Physics, kind: str, index: int, x: float, speed: float) -> None:
+    """Place an object so that it collides near (0, 0, 60), a little off centre, moving along x."""
     rigid = physics.rigid
     at = np.array([x, 0.02 * index, HIGH - 0.01 * index])
     if kind == "box":
@@ -176,28 +178,30 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("one", "other"), PAIRS)
-def test_what_one_loses_the_other_gains(one, other):
-    """Contacts give what they take, tick by tick; how much a spin about another point than the centre of mass then
-    adds up to in free flight is of the order of the step."""
+def test_colliding_pairs_conserve_momentum(one, other):
+    """Contact impulses of a pair cancel in every step; rotation about a point other than the centre of mass then
+    drifts in free flight by the order of the step."""
     physics = airborne()
     rigid = physics.rigid
     rigid.mj_model.opt.gravity[:] = 0.0
-    hurl(physics, one, 0, -0.5, 1.5)
-    hurl(physics, other, 1, 0.5, -1.0)
+    throw(physics, one, 0, -0.5, 1.5)
+    throw(physics, other, 1, 0.5, -1.0)
     start, exchanged = momentum(physics), np.zeros(2)
     for _ in range(60):
         physics.step()
-        given = rigid.mj_data.qacc - rigid.mj_data.qacc_smooth  # by contacts, at the poses of the tick's start
-        pair = np.array([along(physics, *thing, given) for thing in ((one, 0), (other, 1))]) * physics.dt
+        acceleration = rigid.mj_data.qacc - rigid.mj_data.qacc_smooth  # of contacts, at the poses of the step's start
+        pair = (
+            np.array([momentum_rate_x(physics, *which, acceleration) for which in ((one, 0), (other, 1))]) * physics.dt
+        )
         assert abs(pair.sum()) <= 1e-4 * np.abs(pair).max() + 1e-5
         exchanged += pair
-    assert exchanged[0] < -0.3, "it was hit"
+    assert exchanged[0] < -0.3, "no collision"
     assert exchanged.sum() == pytest.approx(0.0, abs=1e-4 * exchanged[1])
     assert abs(momentum(physics) - start)[0] < 5e-3 * exchanged[1]
 
 
-def along(physics: Physics, kind: str, index: int, rates: np.ndarray) -> float:
-    """Mass times the rate of a thing's centre of mass along x, at the poses that MuJoCo has now."""
+def momentum_rate_x(physics: Physics, kind: str, index: int, rates: np.ndarray) -> float:
+    """Mass times the rate of an object's centre of mass along x, at MuJoCo's current poses."""
     rigid = physics.rigid
     name = {"box": f"box/{index}", "bunch": f"free_bunch/{rigid._bunch_slot[index]}", "ram": f"ram{index}/tool"}[kind]
     body, J = rigid.mj_model.body(name).id, np.zeros((3, rigid.mj_model.nv))
@@ -206,8 +210,8 @@ def along(physics: Physics, kind: str, index: int, rates: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("other", ["box", "bunch", "ram"])
-def test_a_cut_cane_takes_what_the_other_loses(other):
-    """A cane that falls freely, met in the middle by a box, a bunch, a ram."""
+def test_a_collision_with_a_cut_cane_conserves_momentum(other):
+    """A freely falling cane, hit in the middle by a box, a bunch or a ram."""
     physics = airborne()
     tree = 2
     physics.plants.cut(int(physics.model.tree_first[tree]))
@@ -222,10 +226,10 @@ def test_a_cut_cane_takes_what_the_other_loses(other):
         joint.qvel[1] = 1.0
     else:
         rigid.place_bunch(0, frames.pose([middle[0] - 0.085, 59.85, HIGH]), np.array([0, 1.0, 0, 0, 0, 0]))
-    start, met = momentum(physics), 0
+    start, contact_count = momentum(physics), 0
     for _ in range(50):
         physics.step()
-        met += len(physics.contacts)
-    assert met > 0
-    off = momentum(physics) - start
-    assert abs(off[1]) < 1e-4 * abs(start[1])
+        contact_count += len(physics.contacts)
+    assert contact_count > 0
+    change = momentum(physics) - start
+    assert abs(change[1]) < 1e-4 * abs(start[1])

@@ -1,6 +1,6 @@
 """Compliant joints against mechanics: static deflection F / K, log-decrement of D, springs in series (D6.4, 3.1).
 
-Inertias and weights come from the URDF's text, by hand, not from the engine that moves the joints.
+Inertias and weights are computed from the URDF's text, independently of the physics engine.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def gate(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     folder = tmp_path_factory.mktemp("gate")
     (folder / "gate.urdf").write_text(GATE)
     (folder / "gate.toml").write_text(
-        "[base]\neffort = [1e8, 1e8]\n"  # a post in the ground: tracks would give way and damp the swing
+        "[base]\neffort = [1e8, 1e8]\n"  # a post in the ground: tracks would slip and damp the swing
         f'[groups.hinge]\njoints = ["hinge_joint"]\nstiffness = [2000.0]\ndamping = [100.0]\nrotor = [{ROTOR}]\n'
         "elastic = [150.0]\nelastic_damping = [3.0]\n"
     )
@@ -82,9 +82,9 @@ class Stand:
         robot, step = self.robot, 1e-6
         position = self.rigid.joint_measurements("anna")[0].copy()
         centre = next(
-            np.array(found.find("inertial/origin").get("xyz").split(), float)
-            for found in ElementTree.fromstring(robot.description.urdf).iterfind("link")
-            if found.get("name") == link
+            np.array(measured.find("inertial/origin").get("xyz").split(), float)
+            for measured in ElementTree.fromstring(robot.description.urdf).iterfind("link")
+            if measured.get("name") == link
         )
         columns = []
         for joint in range(len(position)):
@@ -100,7 +100,7 @@ class Stand:
 
 
 def weight_beyond(stand: Stand, joint: str) -> float:
-    """Moment [N m] of the weight of all that a joint carries, about its axis: how much its drive must give."""
+    """Moment [N m] about a joint's axis of the weight that it carries: the effort of its drive."""
     description, position = stand.robot.description, stand.rigid.joint_measurements("anna")[0]
     i = description.joints.index(joint)
     height = []
@@ -129,14 +129,14 @@ def decrement(position: np.ndarray) -> tuple[float, float]:
             peaks.append(abs(here - 0.25 * (before - after) * shift))
             times.append(k + shift)
     first = position[0]
-    good = [i for i, peak in enumerate(peaks) if peak > 0.02 * abs(first)]
-    assert len(good) >= 3, "it hardly swings"
-    slope = np.polyfit(good, np.log(np.array(peaks)[good]), 1)[0]
-    return -2.0 * slope, 2.0 * DT * float(np.polyfit(good, np.array(times)[good], 1)[0])
+    large = [i for i, peak in enumerate(peaks) if peak > 0.02 * abs(first)]
+    assert len(large) >= 3, "too few oscillations"
+    slope = np.polyfit(large, np.log(np.array(peaks)[large]), 1)[0]
+    return -2.0 * slope, 2.0 * DT * float(np.polyfit(large, np.array(times)[large], 1)[0])
 
 
 def expected(stiffness: float, damping: float, inertia: float) -> tuple[float, float]:
-    """The same for an oscillator."""
+    """Log-decrement and period [s] of a damped oscillator."""
     zeta = damping / (2.0 * np.sqrt(stiffness * inertia))
     root = np.sqrt(1.0 - zeta**2)
     return 2.0 * np.pi * zeta / root, 2.0 * np.pi / np.sqrt(stiffness / inertia) / root
@@ -147,7 +147,7 @@ def expected(stiffness: float, damping: float, inertia: float) -> tuple[float, f
 
 @pytest.mark.parametrize("zeta", [0.02, 0.05, 0.1, 0.2, 0.3])
 @pytest.mark.parametrize("stiffness", [15.0, 60.0, 240.0])
-def test_log_decrement_is_that_of_the_damping_asked_for(gate: RobotDescription, stiffness: float, zeta: float) -> None:
+def test_log_decrement_is_that_of_the_commanded_damping(gate: RobotDescription, stiffness: float, zeta: float) -> None:
     """2 %, from 0.5 to 2 Hz: the implicit servo alone would add dt K, at 2 Hz twice what zeta 0.05 asks for."""
     inertia = GATE_INERTIA + ROTOR
     damping = 2.0 * zeta * np.sqrt(stiffness * inertia)
@@ -155,12 +155,12 @@ def test_log_decrement_is_that_of_the_damping_asked_for(gate: RobotDescription, 
     stand.robot.command_impedance([stiffness], [damping])
     stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
     swing = stand.run(14.0 * np.sqrt(inertia / stiffness))[:, 0]
-    found, wanted = decrement(swing), expected(stiffness, damping, inertia)
-    assert found[0] == pytest.approx(wanted[0], rel=0.02)
-    assert found[1] == pytest.approx(wanted[1], rel=0.02)
+    measured, desired = decrement(swing), expected(stiffness, damping, inertia)
+    assert measured[0] == pytest.approx(desired[0], rel=0.02)
+    assert measured[1] == pytest.approx(desired[1], rel=0.02)
 
 
-def test_an_undamped_joint_swings_on(gate: RobotDescription) -> None:
+def test_an_undamped_joint_keeps_oscillating(gate: RobotDescription) -> None:
     stand = Stand(gate)
     stand.robot.command_impedance([60.0], [0.0])
     stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
@@ -169,8 +169,8 @@ def test_an_undamped_joint_swings_on(gate: RobotDescription) -> None:
 
 
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5, 1e6, 1e8])
-def test_no_stiffness_blows_up(gate: RobotDescription, stiffness: float) -> None:
-    """Whatever the gains, even without any damping, no energy comes from the scheme."""
+def test_any_stiffness_is_stable(gate: RobotDescription, stiffness: float) -> None:
+    """For any stiffness, even without damping, the scheme adds no energy."""
     stand = Stand(gate)
     stand.robot.command_impedance([stiffness], [0.0])
     stand.run(0.02)
@@ -179,13 +179,13 @@ def test_no_stiffness_blows_up(gate: RobotDescription, stiffness: float) -> None
     stand.push("leaf", np.zeros(3))
     swing = np.abs(stand.run(10.0)[:, 0])
     bound = 60.0 * 0.5 / stiffness
-    assert swing[:200].max() <= 2.0 * bound  # of a load that comes suddenly and goes at the worst moment
+    assert swing[:200].max() <= 2.0 * bound  # of a load that is applied suddenly and removed at the worst time
     assert swing[-200:].max() <= swing[:200].max() * 1.001
 
 
 @pytest.mark.parametrize("stiffness", [40.0, 400.0])
-def test_against_a_pole_it_presses_as_its_stiffness_says(gate: RobotDescription, stiffness: float) -> None:
-    """A set-point behind a pole: K times what is missing is the moment of the contact, quietly."""
+def test_contact_moment_at_a_pole_is_stiffness_times_error(gate: RobotDescription, stiffness: float) -> None:
+    """A set-point behind a pole: K times the position error is the moment of the contact, without noise."""
     pole = {"fixed_start": [[0.9, 0.3, 0.0]], "fixed_end": [[0.9, 0.3, 2.0]], "fixed_radius": [[0.05, 0.05]]}
     stand = Stand(gate, fixed_organ=[int(Organ.POLE)], **pole)
     stand.robot.command_impedance([stiffness], [0.4 * np.sqrt(stiffness)])
@@ -201,8 +201,8 @@ def test_against_a_pole_it_presses_as_its_stiffness_says(gate: RobotDescription,
     assert np.ptp(moments) < 1e-3 * abs(moments[-1])
 
 
-def test_a_whole_arm_gives_way_by_f_over_k(vinebot: RobotDescription) -> None:
-    """All seven joints compliant: K times deflection is J^T F at the place where the arm comes to rest."""
+def test_a_whole_arm_deflects_by_f_over_k(vinebot: RobotDescription) -> None:
+    """All seven joints compliant: K times deflection is J^T F where the arm comes to rest."""
     stand = Stand(vinebot)
     joints = stand.robot.joint_indices(ARM)
     stiffness = np.array([60.0, 60.0, 40.0, 40.0, 15.0, 15.0, 15.0])
@@ -217,16 +217,16 @@ def test_a_whole_arm_gives_way_by_f_over_k(vinebot: RobotDescription) -> None:
 
 
 @pytest.mark.parametrize(("joint", "stiffness", "zeta"), [(0, 80.0, 0.08), (3, 30.0, 0.15), (5, 40.0, 0.25)])
-def test_a_joint_of_an_arm_swings_as_asked(
+def test_a_joint_of_an_arm_oscillates_as_commanded(
     vinebot: RobotDescription, joint: int, stiffness: float, zeta: float
 ) -> None:
     """The robot's own hinge friction (URDF) adds to the damping asked for; inertia from the URDF and the rotor."""
     stand, name = Stand(vinebot), ARM[joint]
     inertia = inertia_about(vinebot, name) + next(d.armature for d in vinebot.drives if d.joint == name)
     friction = next(
-        float(found.find("dynamics").get("damping"))
-        for found in ElementTree.fromstring(vinebot.urdf).iterfind("joint")
-        if found.get("name") == name
+        float(measured.find("dynamics").get("damping"))
+        for measured in ElementTree.fromstring(vinebot.urdf).iterfind("joint")
+        if measured.get("name") == name
     )
     total = 2.0 * zeta * np.sqrt(stiffness * inertia)
     stand.robot.command_impedance([stiffness], [total - friction], [name])
@@ -234,23 +234,25 @@ def test_a_joint_of_an_arm_swings_as_asked(
     start[i] += 0.05
     stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), start)
     swing = stand.run(14.0 * np.sqrt(inertia / stiffness))[:, i] - vinebot.home[i]
-    found, wanted = decrement(swing), expected(stiffness, total, inertia)
-    assert found[0] == pytest.approx(wanted[0], rel=0.02)
-    assert found[1] == pytest.approx(wanted[1], rel=0.02)
+    measured, desired = decrement(swing), expected(stiffness, total, inertia)
+    assert measured[0] == pytest.approx(desired[0], rel=0.02)
+    assert measured[1] == pytest.approx(desired[1], rel=0.02)
 
 
 def inertia_about(description: RobotDescription, joint: str) -> float:
     """[kg m2] of all that a joint carries at home, about its axis, from the URDF's text."""
     root, poses = ElementTree.fromstring(description.urdf), description.link_poses(description.home)
-    joints = {found.get("name"): found for found in root.iterfind("joint")}
+    joints = {measured.get("name"): measured for measured in root.iterfind("joint")}
     carried = {joints[joint].find("child").get("link")}
     while (
-        more := {
-            found.find("child").get("link") for found in joints.values() if found.find("parent").get("link") in carried
+        children := {
+            measured.find("child").get("link")
+            for measured in joints.values()
+            if measured.find("parent").get("link") in carried
         }
         - carried
     ):
-        carried |= more
+        carried |= children
     pose = poses[joints[joint].find("child").get("link")]
     axis = frames.rotate(pose[3:], np.array(joints[joint].find("axis").get("xyz").split(), float))
     total = 0.0
@@ -272,14 +274,14 @@ def inertia_about(description: RobotDescription, joint: str) -> float:
 # ---------------------------------------------------------------------- F20: a series elastic element per joint
 
 
-def test_a_locked_motor_lets_the_gate_swing_on_its_spring(gate: RobotDescription) -> None:
+def test_behind_a_locked_motor_the_gate_oscillates_on_its_spring(gate: RobotDescription) -> None:
     stand, inertia = Stand(gate), GATE_INERTIA + ROTOR
     stand.robot.command_motor_position([0.0])
     stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.2]))
     swing = stand.run(3.0)[:, 0]
-    found, wanted = decrement(swing), expected(150.0, 3.0, inertia)
-    assert found[0] == pytest.approx(wanted[0], rel=0.02)
-    assert found[1] == pytest.approx(wanted[1], rel=0.02)
+    measured, desired = decrement(swing), expected(150.0, 3.0, inertia)
+    assert measured[0] == pytest.approx(desired[0], rel=0.02)
+    assert measured[1] == pytest.approx(desired[1], rel=0.02)
 
 
 def test_spring_torque_is_the_load_and_deflection_is_load_over_k(vinebot: RobotDescription) -> None:
@@ -311,7 +313,7 @@ def test_motor_command_is_followed_by_the_link(gate: RobotDescription) -> None:
     elements = stand.robot.sample(stand.time).elements
     assert stand.rigid.joint_measurements("anna")[0][0] == pytest.approx(0.4, abs=1e-5)
     assert elements.motor[0] == pytest.approx(0.4, abs=1e-5)
-    stand.push("leaf", np.array([0.0, 20.0, 0.0]))  # turned away by 0.4 rad: its lever is 0.5 cos
+    stand.push("leaf", np.array([0.0, 20.0, 0.0]))  # rotated by 0.4 rad: its lever is 0.5 cos
     stand.run(12.0)
     elements, angle = stand.robot.sample(stand.time).elements, stand.rigid.joint_measurements("anna")[0][0]
     assert elements.torque[0] == pytest.approx(-20.0 * 0.5 * np.cos(angle), rel=1e-5)

@@ -1,4 +1,4 @@
-"""Laws of contact, against the same scenes wholly in MuJoCo and against what was predicted."""
+"""Contact against the same scenes entirely in MuJoCo, and against predicted velocities."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def middle_of(pose: np.ndarray) -> np.ndarray:
 
 
 def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
-    """Body velocities [body, 6] of the new joint rates, at the poses ``start`` of the tick's start."""
+    """Body velocities [body, 6] of the new joint rates, at the poses ``start`` of the step's start."""
     model, velocity = physics.model, np.zeros((len(physics.model.body_mass), 6))
     for b, parent in enumerate(model.body_parent):
         above = model.tree_pose[model.body_tree[b]] if parent < 0 else start[parent]
@@ -34,7 +34,7 @@ def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def held():
-    """Close, lift, move, pull, let go: ours and the reference's bunch, finger forces and efforts, tick by tick."""
+    """Close, lift, move, pull, release: bunch, finger forces and efforts of vinesim and MuJoCo, tick by tick."""
     model, body, middle = bunch_scene()
     ours, reference = Physics(model), MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
@@ -55,19 +55,19 @@ def held():
     return {key: np.array(value) for key, value in rows.items()} | {"physics": ours, "body": body}
 
 
-def test_held_bunch_is_where_the_reference_has_it(held):
-    off = np.linalg.norm(held["ours"] - held["reference"], axis=1)
+def test_pose_of_a_held_bunch_is_mujocos(held):
+    error = np.linalg.norm(held["ours"] - held["reference"], axis=1)
     lifted = held["reference"][290, 2] - held["reference"][140, 2]
     assert lifted > 0.095
-    assert off[:640].max() < 1e-3
+    assert error[:640].max() < 1e-3
 
 
-def test_held_bunch_presses_the_fingers_as_the_reference_does(held):
+def test_finger_forces_and_efforts_of_a_grasp_are_mujocos(held):
     for start, end in ((120, 150), (250, 300), (400, 450), (500, 590)):
-        mine = held["force"][start:end].mean(0)
-        theirs = held["reference_force"][start:end].mean(0)
-        np.testing.assert_allclose(mine[:, 1], theirs[:, 1], rtol=0.01)
-        assert mine[:, 2].sum() == pytest.approx(theirs[:, 2].sum(), abs=0.05)
+        vinesim = held["force"][start:end].mean(0)
+        mujoco = held["reference_force"][start:end].mean(0)
+        np.testing.assert_allclose(vinesim[:, 1], mujoco[:, 1], rtol=0.01)
+        assert vinesim[:, 2].sum() == pytest.approx(mujoco[:, 2].sum(), abs=0.05)
         np.testing.assert_allclose(
             held["effort"][start:end].mean(0), held["reference_effort"][start:end].mean(0), atol=0.05
         )
@@ -78,7 +78,7 @@ def test_held_bunch_does_not_creep(held):
     assert np.linalg.norm(after - before) < 5e-5
 
 
-def test_released_bunch_swings_home(held):
+def test_a_released_bunch_returns_to_rest(held):
     physics, body = held["physics"], held["body"]
     _, _, middle = bunch_scene()
     physics.rigid.command("grip", np.zeros(4))
@@ -147,41 +147,44 @@ def test_predicted_velocities_are_realised_and_action_is_reaction():
     assert rigid_error < 1e-12
 
 
-def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, give: float | None = None):
-    """A bar of 3 kg goes through five canes, coasting or (with damping) driven: ours, and the reference in substeps.
+def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, time_constant: float | None = None):
+    """A bar of 3 kg moves through five canes, coasting or (with damping) driven: vinesim, and MuJoCo in substeps.
 
-    Returns our physics, force on the bar along y [N] tick by tick, ours and theirs [tick, 2], trees that were met.
+    Returns physics, force on the bar along y by vinesim and MuJoCo [tick, 2] N, and the trees that were touched.
     """
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005) for i in range(5)])
     spec = bar((0.7, -0.08, 0.95), damping=damping)
-    ours, reference = Physics(model), MujocoScene(model, [spec], dt=0.01 / substeps, contact_time_constant=give)
+    ours, reference = (
+        Physics(model),
+        MujocoScene(model, [spec], dt=0.01 / substeps, contact_time_constant=time_constant),
+    )
     ours.contact_solver.plant_plant_contacts = False  # in the reference canes pass through each other
     ours.add_robot(spec)
     for rigid in (ours.rigid, reference.rigid):
         rigid.command("bar", np.zeros(1), np.array([speed]))
         rigid.mj_data.qvel[rigid.robot("bar").v] = speed
-    force, met = [], set()
+    force, touched = [], set()
     base = ours.rigid.robot("bar").base_v[:2]
     for _ in range(round(seconds / ours.dt)):
         ours.step()
-        on_bar, theirs = force_on(ours, "bar"), np.zeros(3)
+        on_bar, mujoco = force_on(ours, "bar"), np.zeros(3)
         for _ in range(substeps):
             reference.step()
-            theirs += reference.contact_force_on("bar") / substeps
-        force.append((on_bar[1], theirs[1]))
-        met.update(tree for tree, _ in ours.touched)
+            mujoco += reference.contact_force_on("bar") / substeps
+        force.append((on_bar[1], mujoco[1]))
+        touched.update(tree for tree, _ in ours.touched)
         np.testing.assert_allclose(ours.contact_solver.wrenches[:, :3].sum(0), -on_bar, atol=1e-9)
         if ours.contact_solver.rigid_force is not None:
             np.testing.assert_allclose(ours.contact_solver.rigid_force[base], on_bar[:2], atol=1e-9)
-    return ours, np.array(force), met
+    return ours, np.array(force), touched
 
 
 def peaks(force: np.ndarray) -> np.ndarray:
-    """Largest mean force over 30 ms: within one tick it depends on whether a blow falls into one tick or on two."""
+    """Largest mean force over 30 ms: that over one tick depends on whether an impact falls into one tick or two."""
     return np.abs(force[:-2] + force[1:-1] + force[2:]).max(0) / 3.0
 
 
-def test_a_coasting_bar_is_thrown_back_as_the_reference_says():
+def test_rebound_of_a_coasting_bar_is_mujocos():
     _, force, _ = sweep(0.5, 3.0, 0.0)
     impulse, peak = 0.01 * force.sum(0), np.abs(force).max(0)
     assert impulse[0] == pytest.approx(impulse[1], rel=0.02)
@@ -190,15 +193,15 @@ def test_a_coasting_bar_is_thrown_back_as_the_reference_says():
 
 @pytest.mark.parametrize("speed", [0.25, 0.5, 1.0, 2.0, 3.0])
 def test_a_driven_bar_passes_five_canes_and_loses_none(speed):
-    """Impulse and peak are the reference's, every cane is met, none is passed through, all swing back to where they
-    hung.
+    """Impulse and peak equal MuJoCo's, every cane is touched, none is passed through, all return to rest.
 
-    At 3 m/s the bar goes 3 cm a tick, five times a cane's radius. The reference takes 1 ms, where it has converged:
+
+    At 3 m/s the bar moves 3 cm a tick, five times a cane's radius. MuJoCo steps by 1 ms, where it has converged:
     with 0.25 ms and contacts ten times as stiff its impulse changes by 1.7 % at 3 m/s, by 0.4 % at 0.5 m/s.
     """
-    ours, force, met = sweep(speed, 2.0 / speed, 200.0)
+    ours, force, touched = sweep(speed, 2.0 / speed, 200.0)
     impulse, peak = 0.01 * force.sum(0), peaks(force)
-    assert met == {0, 1, 2, 3, 4}
+    assert touched == {0, 1, 2, 3, 4}
     assert ours.rigid.joint_measurements("bar")[0][0] > 1.2
     assert impulse[0] == pytest.approx(impulse[1], rel=0.02)
     assert peak[0] == pytest.approx(peak[1], rel=0.05)
@@ -208,8 +211,8 @@ def test_a_driven_bar_passes_five_canes_and_loses_none(speed):
     assert np.abs(ours.snapshot().body_q - ours.model.forward_kinematics(ours.model.joint_settled))[:, :3].max() < 0.01
 
 
-def test_a_fast_sweep_agrees_with_hard_contacts_in_quarters_of_a_millisecond():
-    _, force, _ = sweep(3.0, 0.66, 200.0, substeps=40, give=0.002)
+def test_a_fast_sweep_agrees_with_mujoco_at_a_quarter_of_a_millisecond():
+    _, force, _ = sweep(3.0, 0.66, 200.0, substeps=40, time_constant=0.002)
     impulse, peak = 0.01 * force.sum(0), np.abs(force).max(0)
     assert impulse[0] == pytest.approx(impulse[1], rel=0.01)
     assert peak[0] == pytest.approx(peak[1], rel=0.05)
@@ -221,7 +224,7 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
     spec = gripper(middle, effort=effort)
     ours, reference = Physics(model, detachment=False), MujocoScene(model, [spec])
     ours.add_robot(spec)
-    held, force, off = [], [], 0.0
+    held, force, error = [], [], 0.0
     for tick in range(450):
         t = 0.01 * tick
         grip = 0.05 * ramp(t, 0.3, 0.8)
@@ -230,14 +233,14 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
             rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, -pull * ramp(t, 2.5, 3.0)]))
         ours.step()
         reference.step()
-        mine = middle_of(ours.snapshot().body_q[body])
-        held.append(mine - ours.rigid.link_pose("grip", "left")[:3])
+        vinesim = middle_of(ours.snapshot().body_q[body])
+        held.append(vinesim - ours.rigid.link_pose("grip", "left")[:3])
         force.append([[world.contact_force_on(f) if world is reference else force_on(ours, f) for f in FINGERS]
                       for world in (ours, reference)])  # fmt: skip
-        off = max(off, float(np.linalg.norm(mine - middle_of(reference.body_pose(body)))))
+        error = max(error, float(np.linalg.norm(vinesim - middle_of(reference.body_pose(body)))))
     held, force = np.array(held), np.array(force)
     assert np.linalg.norm(held[440:].mean(0) - held[240:250].mean(0)) < 5e-5
-    assert off < 1e-3
+    assert error < 1e-3
     np.testing.assert_allclose(force[400:, 0, :, 1].mean(0), force[400:, 1, :, 1].mean(0), rtol=0.01)
     np.testing.assert_allclose(
         ours.rigid.joint_measurements("grip")[2][2:],
@@ -247,12 +250,12 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
     )
 
 
-def test_a_finger_that_mimics_presses_like_the_one_that_is_driven():
+def test_a_mimicking_finger_presses_like_the_driven_one():
     model, body, middle = bunch_scene()
     spec = gripper(middle, mimic=True)
     ours, reference = Physics(model), MujocoScene(model, [spec])
     ours.add_robot(spec)
-    force, off = [], 0.0
+    force, error = [], 0.0
     for tick in range(450):
         t = 0.01 * tick
         for rigid in (ours.rigid, reference.rigid):
@@ -261,18 +264,18 @@ def test_a_finger_that_mimics_presses_like_the_one_that_is_driven():
         ours.step()
         reference.step()
         force.append([[force_on(ours, f)[1], reference.contact_force_on(f)[1]] for f in FINGERS])
-        off = max(
-            off, float(np.linalg.norm(middle_of(ours.snapshot().body_q[body]) - middle_of(reference.body_pose(body))))
+        error = max(
+            error, float(np.linalg.norm(middle_of(ours.snapshot().body_q[body]) - middle_of(reference.body_pose(body))))
         )
     force = np.array(force)
     for phase in (slice(150, 240), slice(400, 450)):
-        mine, theirs = force[phase].mean(0).T
-        np.testing.assert_allclose(mine, theirs, rtol=0.01)
-        assert np.abs(mine).min() > 15.0
-    assert off < 1e-3
+        vinesim, mujoco = force[phase].mean(0).T
+        np.testing.assert_allclose(vinesim, mujoco, rtol=0.01)
+        assert np.abs(vinesim).min() > 15.0
+    assert error < 1e-3
 
 
-def test_two_fingers_take_a_cane_lift_it_pull_it_and_let_it_go():
+def test_two_fingers_grasp_lift_pull_and_release_a_cane():
     """Force: each finger closes against its servo (4000 N/m) and two contacts in a row of the fingers' compliance."""
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.006, beta=0.02)])
     body = 12
@@ -296,11 +299,11 @@ def test_two_fingers_take_a_cane_lift_it_pull_it_and_let_it_go():
     np.testing.assert_allclose(force[110:119, 0, 1], expected, rtol=0.01)
     np.testing.assert_allclose(force[110:119, 1, 1], -expected, rtol=0.01)
     assert ours.snapshot().body_q[body, 2] - home[body, 2] > 0.08
-    assert np.abs(held[480:] - held[290:300].mean(0)).max() < 5e-4  # it gives way when the pull begins
-    assert np.abs(held[480:] - held[380:390].mean(0)).max() < 1e-6  # and holds
+    assert np.abs(held[480:] - held[290:300].mean(0)).max() < 5e-4  # it yields when the pull begins
+    assert np.abs(held[480:] - held[380:390].mean(0)).max() < 1e-6  # and is constant afterwards
     on_fingers = force[480:, :, 2].sum(1)
     assert np.abs(np.diff(on_fingers)).max() < 1e-3
-    assert on_fingers.mean() < -3.0  # what a bent cane weighs
+    assert on_fingers.mean() < -3.0  # elastic force and weight of the bent cane
     ours.rigid.command("grip", np.zeros(4))
     for _ in range(1500):
         ours.step()
@@ -308,7 +311,7 @@ def test_two_fingers_take_a_cane_lift_it_pull_it_and_let_it_go():
     assert np.abs(ours.snapshot().body_q - home)[:, :3].max() < 1e-3
 
 
-def test_what_is_dragged_along_a_cane_rubs_as_the_reference_says():
+def test_friction_along_a_cane_is_mujocos():
     """Mean force over three pieces within 1 %; from tick to tick it is smooth but for the corners between pieces."""
     model, spec = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.1)]), probe((0.5, 0.0, 1.03))
     ours, reference = Physics(model), MujocoScene(model, [spec], dt=0.0005, contact_time_constant=0.004)
@@ -320,19 +323,19 @@ def test_what_is_dragged_along_a_cane_rubs_as_the_reference_says():
             if tick > 600:
                 rigid.command("probe", np.array([0.001 * (tick - 600), 0.0]), np.array([0.1, 0.0]))
         ours.step()
-        theirs = np.zeros(3)
+        mujoco = np.zeros(3)
         for _ in range(20):
             reference.step()
-            theirs += reference.contact_force_on("rod") / 20
-        force.append([force_on(ours, "rod"), theirs])
+            mujoco += reference.contact_force_on("rod") / 20
+        force.append([force_on(ours, "rod"), mujoco])
     force = np.array(force)[650:]
     np.testing.assert_allclose(force[:, 0].mean(0)[[0, 2]], force[:, 1].mean(0)[[0, 2]], rtol=0.01)
-    rough = np.diff(force[:, :, 2], n=2, axis=0)
-    assert np.sqrt((rough[:, 0] ** 2).mean()) < 0.01 * 3.0
-    assert np.sqrt((rough[:, 0] ** 2).mean()) < np.sqrt((rough[:, 1] ** 2).mean())
+    roughness = np.diff(force[:, :, 2], n=2, axis=0)
+    assert np.sqrt((roughness[:, 0] ** 2).mean()) < 0.01 * 3.0
+    assert np.sqrt((roughness[:, 0] ** 2).mean()) < np.sqrt((roughness[:, 1] ** 2).mean())
 
 
-def test_two_runs_agree_to_the_bit():
+def test_two_runs_are_bitwise_equal():
     def run() -> bytes:
         model, _, middle = bunch_scene()
         physics = Physics(model)

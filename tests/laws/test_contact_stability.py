@@ -1,4 +1,4 @@
-"""Laws of contact without a reference: stability, energy, momentum, weight, and plants on plants, poles and ground."""
+"""Contact without a reference: stability, energy, momentum, weight, and plants on plants, poles and ground."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ def energy(physics: Physics) -> float:
     model, q, v = physics.model, physics.state.body_q.astype(float), physics.state.body_qd.astype(float)
     com = frames.rotate(q[:, 3:], model.body_com.astype(float))
     velocity = v[:, :3] + np.cross(v[:, 3:], com)
-    spin = frames.rotate(frames.conjugate(q[:, 3:]), v[:, 3:])
-    bent = frames.log(physics.state.joint_q.astype(float))
-    moving = model.body_mass * (velocity**2).sum(1) + (model.body_inertia * spin**2).sum(1)
-    springs = (model.joint_stiffness * bent**2).sum(1)
-    return float((0.5 * moving + 0.5 * springs + 9.81 * model.body_mass * (q[:, 2] + com[:, 2])).sum())
+    angular = frames.rotate(frames.conjugate(q[:, 3:]), v[:, 3:])
+    theta = frames.log(physics.state.joint_q.astype(float))
+    kinetic = model.body_mass * (velocity**2).sum(1) + (model.body_inertia * angular**2).sum(1)
+    springs = (model.joint_stiffness * theta**2).sum(1)
+    return float((0.5 * kinetic + 0.5 * springs + 9.81 * model.body_mass * (q[:, 2] + com[:, 2])).sum())
 
 
 @pytest.mark.parametrize("servo", [1e4, 1e5])
 @pytest.mark.parametrize("stiffness", [1e3, 1e4, 1e5, 1e6])
 def test_thirty_kilograms_press_on_pieces_of_half_a_gram(servo, stiffness):
-    """No blow-up, steady to a millinewton, and the force that hardly depends on the contact's stiffness."""
+    """Stable, steady to a millinewton, and nearly independent of the contact stiffness."""
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.004, pieces=64)])
     assert model.body_mass.max() < 7e-4
     drives = (
@@ -54,7 +54,7 @@ def test_thirty_kilograms_press_on_pieces_of_half_a_gram(servo, stiffness):
 
 @pytest.mark.parametrize("stiffness", [1e3, 2e4, 1e6])
 @pytest.mark.parametrize("speed", [0.5, 3.0])
-def test_contact_without_damping_gives_no_energy(stiffness, speed):
+def test_undamped_contact_adds_no_energy(stiffness, speed):
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005, beta=0.0) for i in range(5)])
     physics = Physics(model, parameters=PhysicsParameters(contact_stiffness=stiffness, contact_damping_time=0.0))
     physics.contact_solver.plant_plant_contacts = False
@@ -62,34 +62,34 @@ def test_contact_without_damping_gives_no_energy(stiffness, speed):
     drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = speed
     start = energy(physics) + 1.5 * speed**2
-    most, met = -np.inf, set()
+    gain, touched = -np.inf, set()
     for _ in range(round(2.0 / speed * 100)):
         physics.step()
-        most = max(most, energy(physics) + 1.5 * float(physics.rigid.mj_data.qvel[drive][0]) ** 2 - start)
-        met |= set(physics.touched)
-    assert len(met) > 1
-    assert most < 1e-6
+        gain = max(gain, energy(physics) + 1.5 * float(physics.rigid.mj_data.qvel[drive][0]) ** 2 - start)
+        touched |= set(physics.touched)
+    assert len(touched) > 1
+    assert gain < 1e-6
 
 
-def test_branches_that_push_each_other_give_no_energy():
+def test_contact_of_branches_adds_no_energy():
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005, beta=0.0) for i in range(5)])
     physics = Physics(model)
     physics.add_robot(bar((0.7, -0.08, 0.95)))
     drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = 0.5
     start = energy(physics) + 1.5 * 0.5**2
-    most, pushed = -np.inf, 0
+    gain, pushed = -np.inf, 0
     physics.plants.wake(np.arange(5))
     for _ in range(400):
         physics.step()
-        most = max(most, energy(physics) + 1.5 * float(physics.rigid.mj_data.qvel[drive][0]) ** 2 - start)
+        gain = max(gain, energy(physics) + 1.5 * float(physics.rigid.mj_data.qvel[drive][0]) ** 2 - start)
         pushed += any(c.actor == "plants" for c in physics.contacts)
     assert pushed > 10
-    assert most < 1e-6
+    assert gain < 1e-6
 
 
 @pytest.mark.parametrize("places", [(0.5,), (0.4, 0.8)])
-def test_what_rests_on_a_cane_weighs_what_it_weighs(places):
+def test_a_load_at_rest_on_a_cane_presses_with_its_weight(places):
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.03)])
     physics = Physics(model)
     names = [f"probe{i}" for i in range(len(places))]
@@ -103,7 +103,7 @@ def test_what_rests_on_a_cane_weighs_what_it_weighs(places):
     np.testing.assert_allclose(np.array(force)[-50:], 3.0, rtol=1e-3)
 
 
-def test_a_floating_cane_takes_the_momentum_that_the_bar_loses():
+def test_a_bar_and_a_floating_cane_conserve_momentum():
     model = assemble([cane((0.0, 0.0, 3.0), radius=0.005)])
     physics = Physics(model)
     physics.plants.cut(0)
@@ -123,18 +123,18 @@ def test_a_floating_cane_takes_the_momentum_that_the_bar_loses():
     np.testing.assert_allclose(total.sum(1), 3.0, atol=1e-4)
 
 
-def test_a_cut_cane_falls_on_the_ground_lies_there_with_its_weight_and_sleeps():
+def test_a_cut_cane_falls_presses_on_the_ground_with_its_weight_and_sleeps():
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.005)])
     physics = Physics(model)
     physics.plants.cut(4)
-    weight, lying, ticks = 9.81 * model.body_mass[4:].sum(), [], 0
+    weight, ground_forces, ticks = 9.81 * model.body_mass[4:].sum(), [], 0
     while len(physics.plants.awake) and ticks < 2000:
         physics.step()
         ticks += 1
         ground = sum((c.force for c in physics.contacts if c.link == "ground"), np.zeros(3))
-        lying.append(-ground[2])
+        ground_forces.append(-ground[2])
     assert ticks < 2000
-    np.testing.assert_allclose(lying[-20:], weight, rtol=0.01)
+    np.testing.assert_allclose(ground_forces[-20:], weight, rtol=0.01)
     height = physics.snapshot().body_q[4:, 2]
     assert height.min() > 0.004
     assert height.max() < 0.05
@@ -144,38 +144,38 @@ def test_a_cut_cane_falls_on_the_ground_lies_there_with_its_weight_and_sleeps():
     assert len(physics.plants.awake) == 0
 
 
-def test_a_cut_cane_lies_across_a_pole_and_a_branch_that_it_falls_on():
+def test_a_cut_cane_comes_to_rest_on_a_pole_and_on_a_branch():
     poles = {"fixed_start": [[0.3, -0.5, 0.5]], "fixed_end": [[0.3, 0.5, 0.5]], "fixed_radius": [[0.03, 0.03]]}
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.006)], **poles, fixed_organ=[int(Organ.POLE)], fixed_index=[0])
     physics = Physics(model)
     physics.plants.cut(0)
-    met, low = set(), np.inf
+    touched, lowest = set(), np.inf
     for _ in range(60):
         physics.step()
-        met |= {c.link for c in physics.contacts}
+        touched |= {c.link for c in physics.contacts}
         middle = physics.snapshot().body_q[:, :3]
         near = np.abs(middle[:, 0] - 0.3) < 0.03
         if near.any() and np.abs(middle[near, 1]).max() < 0.4:
-            low = min(low, float(middle[near, 2].min()))
-    assert "fixed/0" in met
-    assert low > 0.5
+            lowest = min(lowest, float(middle[near, 2].min()))
+    assert "fixed/0" in touched
+    assert lowest > 0.5
 
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.008), cane((0.3, -0.3, 1.2), radius=0.006, heading=np.pi / 2)])
     physics = Physics(model)
     physics.plants.wake([0, 1])
     cut = int(model.tree_first[1])
     physics.plants.cut(cut)
-    met, sunk = 0, 0.0
+    touched, lowest_offset = 0, 0.0
     for _ in range(60):
         physics.step()
-        met += any(c.actor == "plants" for c in physics.contacts)
-        sunk = min(sunk, float((physics.snapshot().body_q[:cut, 2] - 1.0).min()))
-    assert met > 5
-    assert sunk < -0.01
+        touched += any(c.actor == "plants" for c in physics.contacts)
+        lowest_offset = min(lowest_offset, float((physics.snapshot().body_q[:cut, 2] - 1.0).min()))
+    assert touched > 5
+    assert lowest_offset < -0.01
 
 
-def test_what_overlaps_as_drawn_stays_at_rest():
-    """Two canes through each other, one through a pole and one through the ground."""
+def test_plants_that_overlap_when_drawn_stay_at_rest():
+    """Two canes intersect each other, one a pole and one the ground."""
     standing = {"fixed_start": [[0.5, -0.5, 1.0]], "fixed_end": [[0.5, 0.5, 1.0]], "fixed_radius": [[0.03, 0.03]]}
     model = assemble(
         [cane((0.0, 0.0, 1.0)), cane((0.4, -0.4, 1.003), heading=np.pi / 2), cane((3.0, 0.0, 0.004))],

@@ -1,4 +1,4 @@
-"""Copies of robots: pulled by springs to what their owner says, yet they can be pushed; who is stronger wins."""
+"""Copies of remote robots: springs pull them to the received state; they can be pushed; the larger force wins."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ RAM = f"""<robot name="ram"><link name="base_footprint"><inertial><mass value="5
 <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1000" velocity="1"/></joint></robot>"""
 HERE = frames.pose([0.0, 0.0, 0.0])
 BEYOND = 0.08
-"""Each ram wants to go so far beyond the place where they meet [m]."""
+"""Goal of each ram beyond the meeting point [m]."""
 
 
 def ram(name: str, effort: float) -> RobotSpec:
-    """A head of 20 cm that is pushed along x with at most ``effort`` [N]; *right* comes from the other side."""
+    """A head of 20 cm driven along x with at most ``effort`` [N]; *right* drives in the opposite direction."""
     left = name == "left"
     pose = frames.pose([-0.6, 0.0, 1.0]) if left else frames.pose([0.6, 0.0, 1.0], frames.from_yaw(np.pi))
     drives = (Drive("push", STIFFNESS, DAMPING, effort, 1.0, -1.0, 1.0),)
@@ -43,8 +43,8 @@ def step(rigid: RigidWorld, ticks: int = 1) -> None:
         rigid.integrate()
 
 
-def meeting(rigid: RigidWorld) -> float:
-    """Where the heads touch, along the left ram's way [m]; 0 is the middle."""
+def contact_point(rigid: RigidWorld) -> float:
+    """Contact point of the heads along the left ram's axis [m]; 0 is the middle."""
     left, right = rigid.joint_measurements("left")[0][0], rigid.joint_measurements("right")[0][0]
     assert left + right == pytest.approx(0.0, abs=2e-3), "the heads touch"
     return 0.5 * (left - right)
@@ -54,16 +54,16 @@ FORCES = [(20.0, 80.0), (40.0, 80.0), (70.0, 80.0), (80.0, 70.0), (80.0, 40.0), 
 
 
 @pytest.mark.parametrize(("left", "right"), FORCES)
-def test_of_two_that_fight_the_stronger_wins(left, right):
-    """F23. Both servos want more than they can give; the weaker gives all it has, and the stronger one's spring
-    stands against that: it stays short of its goal by (the weaker one's limit) / K."""
+def test_of_two_opposed_robots_the_stronger_wins(left, right):
+    """F23. Both servos saturate towards their goals; the weaker one at its limit, and the stronger one's spring
+    balances that: it stays short of its goal by (the weaker one's limit) / K."""
     rigid = RigidWorld(assemble([]))
     for name, effort in (("left", left), ("right", right)):
         rigid.add_robot(ram(name, effort))
         rigid.command(name, np.array([BEYOND]))
     step(rigid, 600)
     expected = np.sign(left - right) * (BEYOND - min(left, right) / STIFFNESS)
-    assert meeting(rigid) == pytest.approx(expected, abs=1e-3)
+    assert contact_point(rigid) == pytest.approx(expected, abs=1e-3)
     for name in ("left", "right"):
         contact = rigid.joint_measurements(name)[3][0]
         assert -contact == pytest.approx(min(left, right), rel=0.02)
@@ -71,35 +71,35 @@ def test_of_two_that_fight_the_stronger_wins(left, right):
 
 @pytest.mark.parametrize("delay", [1, 5, 10])
 @pytest.mark.parametrize(("left", "right"), [(30.0, 80.0), (80.0, 30.0)])
-def test_across_the_network_the_stronger_wins_too(left, right, delay):
-    """Each client moves its own ram and has a copy of the other, ``delay`` ticks old. In both worlds the same one wins,
-    and the worlds differ by the spring that carries the force: limit / K."""
+def test_of_two_opposed_robots_of_two_clients_the_stronger_wins(left, right, delay):
+    """Each client moves its own ram and has a copy of the other, ``delay`` ticks old. The same ram wins on both,
+    and the clients differ by the deflection of the spring that carries the force: limit / K."""
     worlds = {"left": RigidWorld(assemble([])), "right": RigidWorld(assemble([]))}
-    post: dict[str, deque] = {name: deque() for name in worlds}
+    queue: dict[str, deque] = {name: deque() for name in worlds}
     for rigid in worlds.values():
         rigid.add_robot(ram("left", left))
         rigid.add_robot(ram("right", right))
     for own, rigid in worlds.items():
         rigid.command(own, np.array([BEYOND]))
-    seen = []
+    points = []
     for tick in range(1200):
         for own in worlds:
-            post[own].append(
+            queue[own].append(
                 (*worlds[own].base_state(own), *(x.copy() for x in worlds[own].joint_measurements(own)[:2]))
             )
         for own, other in (("left", "right"), ("right", "left")):
             if tick >= delay:
-                worlds[own].follow_remote(other, *post[other].popleft())
+                worlds[own].follow_remote(other, *queue[other].popleft())
             step(worlds[own])
         if tick >= 1000:
-            seen.append([meeting(rigid) for rigid in worlds.values()])
-    here, there = np.mean(seen, axis=0)
-    assert np.ptp(seen, axis=0).max() < 2e-3, "the fight came to rest"
-    weak = min(left, right) / STIFFNESS
+            points.append([contact_point(rigid) for rigid in worlds.values()])
+    here, there = np.mean(points, axis=0)
+    assert np.ptp(points, axis=0).max() < 2e-3, "the rams came to rest"
+    deflection = min(left, right) / STIFFNESS
     stronger = here if left > right else -there
     weaker = there if left > right else -here
-    assert stronger == pytest.approx(BEYOND - weak, abs=2e-3)
-    assert weaker == pytest.approx(BEYOND - 2.0 * weak, abs=2e-3)
+    assert stronger == pytest.approx(BEYOND - deflection, abs=2e-3)
+    assert weaker == pytest.approx(BEYOND - 2.0 * deflection, abs=2e-3)
 
 
 @pytest.fixture(scope="module")
@@ -108,60 +108,60 @@ def vinebot() -> RobotDescription:
 
 
 @pytest.mark.parametrize("latency", [0, 2, 5, 10, 20])
-def test_a_copy_lags_by_speed_times_latency_and_no_more(vinebot, latency):
-    """F81, F85: springs and dampers pull to position and velocity, so the copy itself adds no lag worth the name."""
+def test_a_copy_lags_by_speed_times_latency(vinebot, latency):
+    """F81, F85: springs and dampers pull to position and velocity, so the copy itself adds hardly any lag."""
     here, there = RigidWorld(assemble([])), RigidWorld(assemble([]))
     robot, copy = Robot(here, vinebot, "anna"), RemoteRobot(there, vinebot, "anna")
     arm = robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint"])
-    post, rows = deque(), []
+    queue, rows = deque(), []
     for tick in range(400):
         time = 0.01 * tick
         robot.command_position(vinebot.home[arm] + 0.3 * np.sin(2.0 * time) * np.array([1, -1]), arm)
         robot.command_base(0.4, 0.2, time)
         robot.control(time)
         step(here)
-        post.append(robot.update(time))
+        queue.append(robot.update(time))
         if tick >= latency:
-            copy.follow(post.popleft())
+            copy.follow(queue.popleft())
         step(there)
-        off = np.abs(there.joint_measurements("anna")[0] - here.joint_measurements("anna")[0])[arm].max()
+        error = np.abs(there.joint_measurements("anna")[0] - here.joint_measurements("anna")[0])[arm].max()
         base = np.linalg.norm(there.base_state("anna")[0][:2] - here.base_state("anna")[0][:2])
-        rows.append((off, base, np.abs(here.joint_measurements("anna")[1])[arm].max()))
-    off, base, speed = np.max(rows[100:], axis=0)
+        rows.append((error, base, np.abs(here.joint_measurements("anna")[1])[arm].max()))
+    error, base, speed = np.max(rows[100:], axis=0)
     assert speed > 0.5
-    assert off < speed * 0.01 * latency + 1e-3
+    assert error < speed * 0.01 * latency + 1e-3
     assert base < 0.4 * 0.01 * latency + 5e-3
 
 
-def told(copy: RobotInstance, position: np.ndarray) -> RobotUpdate:
+def update_to(copy: RobotInstance, position: np.ndarray) -> RobotUpdate:
     return RobotUpdate(copy.name, 0.0, HERE, np.zeros(6), position, np.zeros(len(position)))
 
 
-def test_a_copy_answers_a_step_in_a_tenth_of_a_second_without_overshoot(vinebot):
+def test_step_response_of_a_copy_takes_a_tenth_of_a_second_without_overshoot(vinebot):
     """F85."""
     rigid = RigidWorld(assemble([]))
     copy = RemoteRobot(rigid, vinebot, "anna")
     elbow = vinebot.joints.index("arm_left_4_joint")
     goal = vinebot.home.copy()
     goal[elbow] -= 0.1
-    way = []
+    response = []
     for _ in range(100):
-        copy.follow(told(copy, goal))
+        copy.follow(update_to(copy, goal))
         step(rigid)
-        way.append((vinebot.home[elbow] - rigid.joint_measurements("anna")[0][elbow]) / 0.1)
-    assert np.argmax(np.array(way) > 0.95) <= 12
-    assert max(way) < 1.02
-    assert way[-1] == pytest.approx(1.0, abs=1e-3)
+        response.append((vinebot.home[elbow] - rigid.joint_measurements("anna")[0][elbow]) / 0.1)
+    assert np.argmax(np.array(response) > 0.95) <= 12
+    assert max(response) < 1.02
+    assert response[-1] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_copy_that_is_pushed_gives_way_as_its_springs_say_and_comes_back(vinebot):
-    """F86: deflection = J^T F / K of a push of 60 N on the wrist; a second after its end nothing is left of it."""
+def test_a_pushed_copy_deflects_by_f_over_k_and_returns(vinebot):
+    """F86: deflection = J^T F / K under 60 N on the wrist; a second after its end the deflection is zero."""
     rigid = RigidWorld(assemble([]))
     copy = RemoteRobot(rigid, vinebot, "anna")
     step(rigid, 20)
     rigid.apply_wrench("anna", "arm_left_7_link", np.array([0.0, 0.0, -60.0]))
     for _ in range(200):
-        copy.follow(told(copy, vinebot.home))
+        copy.follow(update_to(copy, vinebot.home))
         step(rigid)
     deflection = rigid.joint_measurements("anna")[0] - vinebot.home
     body = rigid.mj_model.body("anna/arm_left_7_link").id
@@ -171,13 +171,13 @@ def test_a_copy_that_is_pushed_gives_way_as_its_springs_say_and_comes_back(vineb
     np.testing.assert_allclose(deflection, expected, atol=0.02 * np.abs(expected).max())
     rigid.apply_wrench("anna", "arm_left_7_link", np.zeros(3))
     for _ in range(100):
-        copy.follow(told(copy, vinebot.home))
+        copy.follow(update_to(copy, vinebot.home))
         step(rigid)
     assert np.abs(rigid.joint_measurements("anna")[0] - vinebot.home).max() < 1e-6
 
 
-def test_what_is_sent_is_what_is_measured_and_only_the_owner_commands(vinebot):
-    """F82, F84: an arm that is held back is sent where it is, not where it was told to go."""
+def test_the_measured_state_is_sent_and_only_the_owner_commands(vinebot):
+    """F82, F84: of an arm that is held back the measured position is sent, not the commanded one."""
     rigid = RigidWorld(assemble([]))
     robot = Robot(rigid, vinebot, "anna")
     robot.command_position(vinebot.home + 0.2)

@@ -1,4 +1,4 @@
-"""The same run twice is the same to the bit: plants, contacts, grasp, cut, fall, sleep and waking, a stopped tree."""
+"""Two runs are bitwise equal: plants, contacts, grasp, cut, fall, sleep and waking, a stopped tree."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HERE = pathlib.Path(__file__)
 
 
 def digest(physics: Physics, h: hashlib._Hash) -> None:
-    """Everything that the next tick depends on, and what others are told."""
+    """Hash all state that the next step depends on, and detachments."""
     state = physics.state
     for name in state.array_fields():
         h.update(np.ascontiguousarray(getattr(state, name)).tobytes())
@@ -30,9 +30,9 @@ def digest(physics: Physics, h: hashlib._Hash) -> None:
     h.update(physics.plants.awake.tobytes() + repr([(p.body, p.cause) for p in physics.detachments]).encode())
 
 
-def a_day() -> tuple[str, dict[str, int]]:
-    """Hash of three hundred ticks, and how often each thing happened in them."""
-    seen = dict.fromkeys(("contacts", "partings", "woken", "rested", "stopped"), 0)
+def eventful_run() -> tuple[str, dict[str, int]]:
+    """Hash of 300 steps, and the number of events of each kind."""
+    events = dict.fromkeys(("contacts", "detachments", "woken", "rested", "stopped"), 0)
     h = hashlib.blake2b(digest_size=16)
     physics = Physics(scenes.cane_row(5))
     robots = [scenes.bar("bar", 0, 2), scenes.gripper("hand", scenes.bunch_center(2))]
@@ -40,11 +40,11 @@ def a_day() -> tuple[str, dict[str, int]]:
         physics.add_robot(robot)
     physics.sleep_monitor.patience = 20
     for tick in range(300):
-        slowly = min(1.0, tick / 60)
-        physics.rigid.command("bar", np.array([0.06 * slowly if tick < 150 else 0.0]))
-        physics.rigid.command("hand", slowly * np.array([0.05, 0.05, 0.05]) * (tick < 220))
+        ramp = min(1.0, tick / 60)
+        physics.rigid.command("bar", np.array([0.06 * ramp if tick < 150 else 0.0]))
+        physics.rigid.command("hand", ramp * np.array([0.05, 0.05, 0.05]) * (tick < 220))
         if tick == 120:
-            physics.pick(2)  # in the hand
+            physics.pick(2)  # while the gripper holds it
         if tick == 140:
             physics.cut(3 * 19 + 8)  # half a cane falls
         if tick == 160:
@@ -52,17 +52,17 @@ def a_day() -> tuple[str, dict[str, int]]:
             physics.plants.body_load[4 * 19 + 12, 1] = np.nan
         before = physics.plants.awake
         physics.step()
-        seen["contacts"] += len(physics.contacts)
-        seen["partings"] += len(physics.detachments)
-        seen["woken"] += len(np.setdiff1d(physics.plants.awake, before))
-        seen["rested"] += len(np.setdiff1d(before, physics.plants.awake))
-        seen["stopped"] = int(physics.fault_guard.count.sum())
+        events["contacts"] += len(physics.contacts)
+        events["detachments"] += len(physics.detachments)
+        events["woken"] += len(np.setdiff1d(physics.plants.awake, before))
+        events["rested"] += len(np.setdiff1d(before, physics.plants.awake))
+        events["stopped"] = int(physics.fault_guard.count.sum())
         digest(physics, h)
-    return h.hexdigest(), seen
+    return h.hexdigest(), events
 
 
-def a_vineyard() -> str:
-    """Hash of the demo's vineyard, kicked, for half a second."""
+def vineyard_run() -> str:
+    """Hash of half a second of the demo vineyard with random joint rates."""
     model = generate(load_scene("demo"))
     h = hashlib.blake2b(model.digest().encode(), digest_size=16)
     physics = Physics(model)
@@ -75,14 +75,14 @@ def a_vineyard() -> str:
 
 
 def test_two_runs_in_one_process() -> None:
-    first, seen = a_day()
-    assert min(seen.values()) > 0, seen  # everything did happen
-    assert a_day() == (first, seen)
-    assert a_vineyard() == a_vineyard()
+    first, events = eventful_run()
+    assert min(events.values()) > 0, events  # every kind of event occurred
+    assert eventful_run() == (first, events)
+    assert vineyard_run() == vineyard_run()
 
 
 def test_two_runs_in_two_processes() -> None:
-    """Other hash seeds, other addresses, the same bits."""
+    """With other hash seeds and addresses."""
     path = os.pathsep.join([str(HERE.parents[2]), os.environ.get("PYTHONPATH", "")])
     runs = [
         subprocess.run(
@@ -92,8 +92,8 @@ def test_two_runs_in_two_processes() -> None:
         for seed in ("1", "2")
     ]  # fmt: skip
     assert runs[0] == runs[1]
-    assert runs[0] == f"{a_day()[0]} {a_vineyard()}"
+    assert runs[0] == f"{eventful_run()[0]} {vineyard_run()}"
 
 
 if __name__ == "__main__":
-    print(a_day()[0], a_vineyard())
+    print(eventful_run()[0], vineyard_run())

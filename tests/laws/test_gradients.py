@@ -1,4 +1,4 @@
-"""Gradients of the differentiable rollout against central differences of the very same scheme, and their use."""
+"""Gradients of the differentiable rollout against central differences of the same scheme, and their use."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def squares(track: Trajectory) -> tuple[float, np.ndarray, np.ndarray]:
 def slope(loss: Callable[[float], float], reach: float = 0.06) -> float:
     """d loss(1 + e) / de at 0: the odd part of the loss over eight steps up to ``reach``, fitted by e and its cube.
 
-    One central difference would tell the rounding of single precision, not a mass's slope to a thousandth.
+    A single central difference would be dominated by single precision rounding.
     """
     e = np.linspace(reach / 3.0, reach, 8)
     odd = np.array([0.5 * (loss(1.0 + x) - loss(1.0 - x)) for x in e])
@@ -61,11 +61,11 @@ def test_gradient_is_the_slope_of_the_loss(ticks: int, checkpoint: int) -> None:
     rollout = Rollout(model, ticks, watched=np.array([9, 13, 14]), checkpoint=checkpoint, fast_rate=1e9)
     _, *by = squares(rollout.run(joint_qd=rates))
     gradient = rollout.gradient(*by)
-    everybody = np.arange(len(model.body_mass))
+    all_bodies = np.arange(len(model.body_mass))
     cases = [
-        ("stiffness", model.joint_stiffness, everybody), ("stiffness", model.joint_stiffness, [0]),
-        ("damping", model.joint_damping, everybody), ("damping", model.joint_damping, [3]),
-        ("mass", model.body_mass, everybody), ("mass", model.body_mass, [14]), ("joint_qd", rates, everybody),
+        ("stiffness", model.joint_stiffness, all_bodies), ("stiffness", model.joint_stiffness, [0]),
+        ("damping", model.joint_damping, all_bodies), ("damping", model.joint_damping, [3]),
+        ("mass", model.body_mass, all_bodies), ("mass", model.body_mass, [14]), ("joint_qd", rates, all_bodies),
     ]  # fmt: skip
     for name, value, bodies in cases:
 
@@ -76,12 +76,12 @@ def test_gradient_is_the_slope_of_the_loss(ticks: int, checkpoint: int) -> None:
 
         found = float((getattr(gradient, name) * value)[bodies].sum())
         assert found == pytest.approx(slope(loss), rel=1e-3), (name, bodies)
-    # what is as many times as stiff, damped and heavy moves the same
-    shares = [(getattr(gradient, name) * value).sum() for name, value, _ in cases[:6:2]]
-    assert sum(shares) == pytest.approx(0.0, abs=1e-4 * max(map(abs, shares)))
+    # scaling stiffness, damping and mass by one factor does not change the motion
+    terms = [(getattr(gradient, name) * value).sum() for name, value, _ in cases[:6:2]]
+    assert sum(terms) == pytest.approx(0.0, abs=1e-4 * max(map(abs, terms)))
 
 
-def test_gradient_by_first_pose_load_and_brisk_motion() -> None:
+def test_gradient_by_initial_pose_load_and_fast_motion() -> None:
     """phi = 1 while a joint turns fast is the same in the adjoint; a turn of the first pose; a steady wrench."""
     model = forked()
     rates = 3.0 * swinging(model)
@@ -90,9 +90,9 @@ def test_gradient_by_first_pose_load_and_brisk_motion() -> None:
     load[[5, 12]] = [0.1, 0.2, -0.1, 0.01, 0.02, 0.0]
     turn = 0.1 * np.random.default_rng(1).normal(size=(len(model.body_mass), 3))
 
-    def run(*, load: np.ndarray = load, angle: float = 0.0, **more: np.ndarray) -> Trajectory:
+    def run(*, load: np.ndarray = load, angle: float = 0.0, **values: np.ndarray) -> Trajectory:
         joint_q = frames.multiply(frames.exp(angle * turn), model.joint_settled)
-        return rollout.run(joint_qd=rates, joint_q=joint_q, load=load, **more)
+        return rollout.run(joint_qd=rates, joint_q=joint_q, load=load, **values)
 
     track = run()
     assert (track.phi == 1.0).all()
@@ -109,7 +109,7 @@ def test_gradient_by_first_pose_load_and_brisk_motion() -> None:
     )
 
 
-def test_damping_below_what_the_scheme_adds_has_no_gradient() -> None:
+def test_damping_below_that_of_the_scheme_has_no_gradient() -> None:
     model = forked()
     rollout = Rollout(model, 30, watched=np.array([14]))
     _, *by = squares(rollout.run(damping=0.0005 * model.joint_stiffness, joint_qd=swinging(model)))
@@ -123,5 +123,5 @@ def test_stiffness_and_damping_of_a_cane_from_a_noisy_track() -> None:
     exec(re.search(r"```python\n(.*?)```", text, re.S).group(1), example)
     assert example["scale"] == pytest.approx(0.8, rel=0.01)
     assert example["beta"] == pytest.approx(0.03, rel=0.02)
-    assert example["found"].fun == pytest.approx(0.5, rel=0.1)  # what is left is the noise
+    assert example["found"].fun == pytest.approx(0.5, rel=0.1)  # the residual is the noise
     assert example["found"].nfev <= 30

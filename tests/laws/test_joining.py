@@ -1,4 +1,4 @@
-"""Actors come and go in mid-motion: nobody else feels it, not by a bit."""
+"""Actors that join and leave in mid-motion change no bit of the others."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ BOXES = {
     "box_size": [[0.6, 0.4, 0.3]] * 3,
     "box_mass": [[2.0]] * 3,
 }
-"""Two stacked, one that falls."""
+"""Two stacked boxes and one that falls."""
 
 
-def busy(*first: RobotSpec) -> Physics:
-    """A hand grasps a bunch on its vine, a bar moves, four bunches fall into the upper of two boxes.
+def busy_scene(*first: RobotSpec) -> Physics:
+    """A gripper grasps a hanging bunch, a bar moves, four bunches fall into the upper of two boxes.
 
-    ``first`` come before the others.
+    Robots in ``first`` are added before the others.
     """
     trees = [cane((0.0, 0.0, 2.0), bunch=0.5), *(cane((0.0, 5.0 + i, 2.0), bunch=0.4) for i in range(4))]
     model = assemble(trees, **BOXES)
@@ -49,8 +49,8 @@ def command(physics: Physics, tick: int) -> None:
     physics.rigid.command("sweeper", np.array([0.004 * tick]), np.array([0.4]))
 
 
-def numbers(physics: Physics) -> dict[str, bytes]:
-    """Every number that the next tick starts from, by the name of what it belongs to."""
+def state_of(physics: Physics) -> dict[str, bytes]:
+    """The state from which the next step starts, by the name of joint or array."""
     world, data = physics.rigid.mj_model, physics.rigid.mj_data
     found = {"plants": physics.state.joint_q.tobytes() + physics.state.joint_qd.tobytes()}
     for i in range(world.njnt):
@@ -63,7 +63,7 @@ def numbers(physics: Physics) -> dict[str, bytes]:
         )
     warm_start = physics.contact_solver.impulses.warm_start
     n = int(warm_start.count[0])
-    found["memory"] = warm_start.normal_impulse[:n].tobytes() + warm_start.anchor[:n].tobytes()
+    found["warm start"] = warm_start.normal_impulse[:n].tobytes() + warm_start.anchor[:n].tobytes()
     found["contacts"] = b"".join(c.force.tobytes() for c in physics.contacts)
     parked = {f"free_bunch/{slot}" for slot in range(physics.rigid._pool_size)} - {
         f"free_bunch/{slot}" for slot in physics.rigid._bunch_slot.values()
@@ -71,18 +71,18 @@ def numbers(physics: Physics) -> dict[str, bytes]:
     return {k: v for k, v in found.items() if k not in parked and not k.startswith("newcomer")}
 
 
-def story(events: dict[int, Callable[[Physics], None]]) -> list[dict[str, bytes]]:
-    physics = busy()
-    told = []
+def run_with_events(events: dict[int, Callable[[Physics], None]]) -> list[dict[str, bytes]]:
+    physics = busy_scene()
+    states = []
     for tick in range(TICKS):
         if tick in events:
             events[tick](physics)
-            if told:
-                assert numbers(physics) == told[-1], f"not the same right after tick {tick}"
+            if states:
+                assert state_of(physics) == states[-1], f"the state changed right after tick {tick}"
         command(physics, tick)
         physics.step()
-        told.append(numbers(physics))
-    return told
+        states.append(state_of(physics))
+    return states
 
 
 def differences(one: list[dict[str, bytes]], other: list[dict[str, bytes]]) -> list[tuple[int, str]]:
@@ -93,67 +93,67 @@ def differences(one: list[dict[str, bytes]], other: list[dict[str, bytes]]) -> l
 
 @pytest.fixture(scope="module")
 def undisturbed() -> list[dict[str, bytes]]:
-    return story({})
+    return run_with_events({})
 
 
-def test_a_robot_that_comes_and_goes_changes_no_bit_of_anybody(undisturbed):
-    """A grasp, bunches that settle in a box, a box that tumbles and the contacts' memory, tick by tick."""
-    far = bar((30.0, 30.0, 1.0), "newcomer", 1000.0, 100.0)
-    visited = story({120: lambda p: p.add_robot(far), 200: lambda p: p.remove_robot("newcomer")})
-    assert differences(undisturbed, visited) == []
+def test_a_robot_that_joins_and_leaves_changes_no_bit_of_the_others(undisturbed):
+    """A grasp, bunches that settle in a box, a box that tumbles and the contacts' warm start, tick by tick."""
+    distant = bar((30.0, 30.0, 1.0), "newcomer", 1000.0, 100.0)
+    disturbed = run_with_events({120: lambda p: p.add_robot(distant), 200: lambda p: p.remove_robot("newcomer")})
+    assert differences(undisturbed, disturbed) == []
 
 
-def test_who_came_first_leaves_and_the_others_numbers_move_up():
-    """The sweeper is done and gone: what lies in MuJoCo's arrays behind it goes on as if it had stayed out of reach."""
-    early = bar((30.0, 30.0, 1.0), "newcomer", 1000.0, 100.0)
+def test_removing_the_first_robot_changes_no_bit_of_the_others():
+    """Bodies behind a removed robot in MuJoCo's arrays continue as if it had stayed, far away."""
+    distant = bar((30.0, 30.0, 1.0), "newcomer", 1000.0, 100.0)
 
-    def story_of(leaves: int) -> list[dict[str, bytes]]:
-        physics, told = busy(early), []
+    def run_until(leaves: int) -> list[dict[str, bytes]]:
+        physics, states = busy_scene(distant), []
         for tick in range(TICKS):
             if tick == leaves:
                 physics.remove_robot("newcomer")
             command(physics, tick)
             physics.step()
-            told.append(numbers(physics))
-        return told
+            states.append(state_of(physics))
+        return states
 
-    assert differences(story_of(-1), story_of(120)) == []
-    assert differences(story_of(70), story_of(200)) == []
+    assert differences(run_until(-1), run_until(120)) == []
+    assert differences(run_until(70), run_until(200)) == []
 
 
-def test_what_sleeps_goes_on_sleeping_and_wakes_with_what_it_leans_on():
-    """A newcomer wakes neither stacked boxes nor bunches; a bunch that is taken away wakes those that lay on it."""
-    physics = busy()
+def test_sleeping_bodies_sleep_until_a_body_in_contact_is_removed():
+    """A new robot wakes neither stacked boxes nor bunches; removing a bunch wakes those in contact with it."""
+    physics = busy_scene()
     for _ in range(900):
         physics.step()
     rigid = physics.rigid
-    lie = ["box/0", "box/1", *(f"free_bunch/{slot}" for slot in rigid._bunch_slot.values())]
+    names = ["box/0", "box/1", *(f"free_bunch/{slot}" for slot in rigid._bunch_slot.values())]
 
     def sleeping() -> list[bool]:
-        trees = [rigid.mj_model.body_treeid[rigid.mj_model.body(name).id] for name in lie]
+        trees = [rigid.mj_model.body_treeid[rigid.mj_model.body(name).id] for name in names]
         return (rigid.mj_data.tree_asleep[trees] >= 0).tolist()
 
     assert all(sleeping())
-    before = [rigid.mj_data.joint(name).qpos.copy() for name in lie]
+    before = [rigid.mj_data.joint(name).qpos.copy() for name in names]
     physics.add_robot(bar((30.0, 30.0, 1.0), "newcomer", 1000.0, 100.0))
     assert all(sleeping())
     for _ in range(50):
         physics.step()
     assert all(sleeping())
-    for name, pose in zip(lie, before, strict=True):
+    for name, pose in zip(names, before, strict=True):
         np.testing.assert_array_equal(rigid.mj_data.joint(name).qpos, pose)
-    deepest = min(rigid.free_bunches, key=lambda bunch: rigid.bunch_pose(bunch)[2])
-    gone = lie.index(f"free_bunch/{rigid._bunch_slot[deepest]}")
-    physics.rigid.remove_bunch(deepest)
-    del lie[gone]
-    assert not any(sleeping()), "all leaned on each other"
+    lowest = min(rigid.free_bunches, key=lambda bunch: rigid.bunch_pose(bunch)[2])
+    index = names.index(f"free_bunch/{rigid._bunch_slot[lowest]}")
+    physics.rigid.remove_bunch(lowest)
+    del names[index]
+    assert not any(sleeping()), "all bodies were in contact"
     physics.step()
     assert np.isfinite(rigid.mj_data.qpos).all()
 
 
-def test_a_dozen_robots_join():
-    """MuJoCo tries a step when it compiles, with all bases at the origin: that must not count as a pile-up."""
-    physics = busy()
+def test_twelve_robots_join():
+    """MuJoCo steps once when it compiles, with all bases at the origin: this must not count as a fault."""
+    physics = busy_scene()
     for i in range(12):
         physics.add_robot(bar((20.0 + i, 30.0, 1.0), f"newcomer{i}", 1000.0, 100.0))
     physics.step()

@@ -1,4 +1,4 @@
-"""Whatever three clients do to trees, boxes and bunches, on whatever network: soon there is one owner, everywhere."""
+"""Ownership of trees, boxes and bunches: any actions of three clients on any network end with one owner."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from vinesim.scene.values import RobotUpdate
 TICK = 0.01
 DELAY, JITTER = 0.03, 0.02
 RTT = 2.0 * (DELAY + JITTER)
-THINGS = (0, BOX(0), BUNCH(0), BUNCH(1))
+OBJECTS = (0, BOX(0), BUNCH(0), BUNCH(1))
 NAMES = ("ada", "bob", "cleo")
 
 
-class Echoing(MemoryHub):
-    """A network that delivers some samples twice."""
+class DuplicatingHub(MemoryHub):
+    """A network that duplicates some unreliable samples."""
 
     def send(self, sender: str, key: str, payload: bytes, reliable: bool) -> None:
         super().send(sender, key, payload, reliable)
@@ -32,60 +32,60 @@ class Echoing(MemoryHub):
             super().send(sender, key, payload, reliable)
 
 
-class Least:
-    """The least client of rigid things: what it touches it moves, each its own way."""
+class MinimalClient:
+    """A minimal client with rigid objects: it moves what it touches, in a direction of its own."""
 
     def __init__(self, hub: MemoryHub, name: str, start: Claim) -> None:
         self.hub, self.name, self.model = hub, name, vineyard()
         self.bus = hub.bus(name)
         self.replicator = Replicator(self.bus, Hello(name, scene="rows", digest="same", joints=0), self.model)
-        for thing in THINGS:
-            self.replicator._state.ownership[thing].claim = start
+        for object_id in OBJECTS:
+            self.replicator._state.ownership[object_id].claim = start
         self.x = -1.5 + NAMES.index(name)
         self.robot = RobotUpdate(name, 0.0, frames.pose([self.x, 0.0, 0.0]), np.zeros(6), np.zeros(0), np.zeros(0))
         self.touched: set[int] = set()
         self.picked: set[int] = set()
-        self.pose = {thing: frames.pose([-1.0, 0.0, 0.1]) for thing in THINGS if not is_tree(thing)}
-        self.mine_to_tell: set[int] = set()
+        self.pose = {object_id: frames.pose([-1.0, 0.0, 0.1]) for object_id in OBJECTS if not is_tree(object_id)}
+        self.newly_grabbed: set[int] = set()
 
     def tick(self) -> None:
         now = self.hub.time
         inbox = self.replicator.receive(now)
-        for fact, holds in inbox.records:
-            if not is_tree(fact.object):
-                self.picked.add(fact.object)
-                if holds:
-                    self.pose[fact.object] = np.array(fact.pose)
+        for record, is_newest in inbox.records:
+            if not is_tree(record.object):
+                self.picked.add(record.object)
+                if is_newest:
+                    self.pose[record.object] = np.array(record.pose)
         for update in inbox.objects:
             self.picked.add(update.object)
             self.pose[update.object] = update.pose
-        there = {thing for thing in self.touched if thing in self.picked or thing in (0, BOX(0))}
-        for thing in there - {0}:
-            self.pose[thing] = self.pose[thing] + [0.002 * self.x, 0.001, 0, 0, 0, 0, 0]
-        told, self.mine_to_tell = self.mine_to_tell, set()
+        active = {object_id for object_id in self.touched if object_id in self.picked or object_id in (0, BOX(0))}
+        for object_id in active - {0}:
+            self.pose[object_id] = self.pose[object_id] + [0.002 * self.x, 0.001, 0, 0, 0, 0, 0]
+        grabbed, self.newly_grabbed = self.newly_grabbed, set()
         self.replicator.send(
-            now, self.robot, touched=there, moving=there, read=self.read, grabbed=told, detached=told & self.picked,
-            pose_on_support=lambda thing: ("", self.pose[thing]),
+            now, self.robot, touched=active, moving=active, read=self.read, grabbed=grabbed,
+            detached=grabbed & self.picked, pose_on_support=lambda object_id: ("", self.pose[object_id]),
         )  # fmt: skip
 
-    def read(self, thing: int) -> tuple[np.ndarray, np.ndarray]:
-        if is_tree(thing):
-            here = self.model.bodies_of(thing)
-            return self.model.joint_settled[here], np.zeros((here.stop - here.start, 3))
-        return self.pose[thing], np.zeros(6)
+    def read(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
+        if is_tree(object_id):
+            bodies = self.model.bodies_of(object_id)
+            return self.model.joint_settled[bodies], np.zeros((bodies.stop - bodies.start, 3))
+        return self.pose[object_id], np.zeros(6)
 
-    def act(self, action: str, thing: int) -> None:
+    def apply_action(self, action: str, object_id: int) -> None:
         if action == "let":
-            self.touched.discard(thing)
+            self.touched.discard(object_id)
             return
         if action == "grab":
-            picks = thing not in (0, BOX(0)) and thing not in self.picked
-            self.picked |= {thing} if picks else set()
-            self.mine_to_tell.add(thing)
-        self.touched.add(thing)
+            picks = object_id not in (0, BOX(0)) and object_id not in self.picked
+            self.picked |= {object_id} if picks else set()
+            self.newly_grabbed.add(object_id)
+        self.touched.add(object_id)
 
 
-def run(hub: MemoryHub, server: Server, clients: dict[str, Least], seconds: float) -> None:
+def run(hub: MemoryHub, server: Server, clients: dict[str, MinimalClient], seconds: float) -> None:
     for _ in range(round(seconds / TICK)):
         hub.advance(TICK)
         server.tick()
@@ -95,28 +95,30 @@ def run(hub: MemoryHub, server: Server, clients: dict[str, Least], seconds: floa
 
 actions = st.lists(
     st.tuples(
-        st.sampled_from(NAMES), st.sampled_from(["touch", "touch", "let", "grab", "leave"]), st.sampled_from(THINGS),
+        st.sampled_from(NAMES), st.sampled_from(["touch", "touch", "let", "grab", "leave"]), st.sampled_from(OBJECTS),
         st.integers(1, 12),
     ),
     min_size=1, max_size=20,
 )  # fmt: skip
 
 
-def tell(story, seed: int, loss: float, start: Claim) -> tuple[MemoryHub, Server, dict[str, Least], set[int]]:
-    hub = Echoing(delay=DELAY, jitter=JITTER, loss=loss, seed=seed)
+def play(
+    scenario, seed: int, loss: float, start: Claim
+) -> tuple[MemoryHub, Server, dict[str, MinimalClient], set[int]]:
+    hub = DuplicatingHub(delay=DELAY, jitter=JITTER, loss=loss, seed=seed)
     server = Server(hub)
-    clients = {name: Least(hub, name, start) for name in NAMES}
+    clients = {name: MinimalClient(hub, name, start) for name in NAMES}
     run(hub, server, clients, 0.5)
     picked: set[int] = set()
-    for name, action, thing, ticks in story:
+    for name, action, object_id, ticks in scenario:
         if action == "leave":
             clients.pop(name).bus.close()
             run(hub, server, clients, 0.15)
-            # it comes back and remembers nothing
-            clients[name] = Least(hub, name, start)
+            # it rejoins without its earlier state
+            clients[name] = MinimalClient(hub, name, start)
             run(hub, server, clients, 0.4)
         else:
-            clients[name].act(action, thing)
+            clients[name].apply_action(action, object_id)
         run(hub, server, clients, ticks * TICK)
         picked |= clients[name].picked
     return hub, server, clients, picked
@@ -124,45 +126,47 @@ def tell(story, seed: int, loss: float, start: Claim) -> tuple[MemoryHub, Server
 
 @given(actions, st.integers(0, 2**31), st.sampled_from([Claim(), Claim(65534, 65533), Claim(65535, 65535)]))
 @settings(max_examples=30, deadline=None)
-def test_once_all_have_let_go_everything_lies_where_everybody_says_within_a_round_trip(story, seed, start):
-    hub, server, clients, picked = tell(story, seed, 0.0, start)
+def test_after_all_release_all_agree_within_a_round_trip(scenario, seed, start):
+    hub, server, clients, picked = play(scenario, seed, 0.0, start)
     for client in clients.values():
         client.touched.clear()
     run(hub, server, clients, RTT + 2 * TICK)
-    for thing in THINGS:
-        owners = {client.replicator.owner(thing) for client in clients.values()}
-        assert owners == {None}, [client.replicator.claim(thing) for client in clients.values()]
-        facts = {client.replicator.record(thing) for client in clients.values()}
-        assert facts == {server.facts.get(thing)}
+    for object_id in OBJECTS:
+        owners = {client.replicator.owner(object_id) for client in clients.values()}
+        assert owners == {None}, [client.replicator.claim(object_id) for client in clients.values()]
+        records = {client.replicator.record(object_id) for client in clients.values()}
+        assert records == {server.records.get(object_id)}
     for client in clients.values():
-        # nothing picked hangs again, nothing is picked for some only
+        # picked bunches stay picked, on all clients
         assert client.picked - {BOX(0)} == picked - {BOX(0)}
-        for thing in client.picked:
-            np.testing.assert_array_equal(client.pose[thing], clients["ada"].pose[thing])
+        for object_id in client.picked:
+            np.testing.assert_array_equal(client.pose[object_id], clients["ada"].pose[object_id])
 
 
 @given(actions, st.integers(0, 2**31), st.sampled_from([0.02, 0.3]))
 @settings(max_examples=15, deadline=None)
-def test_with_losses_one_heartbeat_later_there_is_one_owner_who_touches(story, seed, loss):
-    hub, server, clients, _ = tell(story, seed, loss, Claim())
+def test_after_losses_one_heartbeat_restores_one_owner_among_those_that_touch(scenario, seed, loss):
+    hub, server, clients, _ = play(scenario, seed, loss, Claim())
     hub.loss = 0.0
     run(hub, server, clients, 1.5)
-    for thing in THINGS:
-        owners = {client.replicator.owner(thing) for client in clients.values()}
-        assert len(owners) == 1, [client.replicator.claim(thing) for client in clients.values()]
+    for object_id in OBJECTS:
+        owners = {client.replicator.owner(object_id) for client in clients.values()}
+        assert len(owners) == 1, [client.replicator.claim(object_id) for client in clients.values()]
         touching = {
-            c.name for c in clients.values() if thing in c.touched and (thing in c.picked or thing in (0, BOX(0)))
+            c.name
+            for c in clients.values()
+            if object_id in c.touched and (object_id in c.picked or object_id in (0, BOX(0)))
         }
         assert owners <= (touching or {None})
-        where = [client.pose[thing] for client in clients.values() if thing in client.picked]
-        for pose in where[1:]:
-            assert np.linalg.norm(pose[:3] - where[0][:3]) < 0.05
+        poses = [client.pose[object_id] for client in clients.values() if object_id in client.picked]
+        for pose in poses[1:]:
+            assert np.linalg.norm(pose[:3] - poses[0][:3]) < 0.05
 
 
 @pytest.mark.parametrize("start", [Claim(), Claim(65535, 65535)])
 @pytest.mark.parametrize("order", [("ada", "bob"), ("bob", "ada")])
-def test_of_two_that_grab_in_the_same_tick_the_lower_name_has_it(start, order):
-    _, _, clients, _ = tell([(name, "grab", BUNCH(0), 15 * i) for i, name in enumerate(order)], 1, 0.0, start)
+def test_of_two_that_grab_in_the_same_tick_the_lower_name_owns(start, order):
+    _, _, clients, _ = play([(name, "grab", BUNCH(0), 15 * i) for i, name in enumerate(order)], 1, 0.0, start)
     assert {client.replicator.owner(BUNCH(0)) for client in clients.values()} == {"ada"}
     assert {client.replicator.claim(BUNCH(0)).ownership for client in clients.values()} == {
         (start.ownership + 1) % 65536

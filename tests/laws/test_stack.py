@@ -1,4 +1,4 @@
-"""Ten loose bunches in a crate and on the ground: they come to rest, weigh what they weigh, and rub as Coulomb says."""
+"""Ten free bunches in a crate and on the ground: rest, weight, and Coulomb friction."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ MASSES = 0.4 + 0.03 * np.arange(10)
 CRATE = 2.0
 
 
-def dropped(into_crate: bool) -> Physics:
-    """Ten bunches let fall one after the other, in any attitude: from the crate's rim, or from 15 cm above ground."""
+def drop_bunches(into_crate: bool) -> Physics:
+    """Ten bunches dropped one after the other in random orientations: into the crate, or from 15 cm above ground."""
     trees = [cane((1.5 * i, 20.0, 1.0), bunch=float(mass)) for i, mass in enumerate(MASSES)]
     box = {"box_pose": [[0.0, 0.0, 0.001, 0, 0, 0, 1]], "box_size": [[0.6, 0.4, 0.3]], "box_mass": [[CRATE]]}
     physics = Physics(assemble(trees, **box))
@@ -37,7 +37,7 @@ def dropped(into_crate: bool) -> Physics:
 
 
 def on_the_ground(physics: Physics) -> tuple[float, float]:
-    """Vertical force [N] of all contacts with the ground, and the deepest contact [m] of any two things."""
+    """Vertical force of all contacts with the ground [N], and the deepest penetration of any contact [m]."""
     world, data = physics.rigid.mj_model, physics.rigid.mj_data
     force, wrench, deepest = 0.0, np.zeros(6), 0.0
     for c in range(data.ncon):
@@ -50,14 +50,14 @@ def on_the_ground(physics: Physics) -> tuple[float, float]:
 
 
 def watch_awake(physics: Physics, ticks: int = 100) -> tuple[float, float]:
-    """Keep everything awake for a second: mean force on the ground and deepest contact."""
+    """Step without sleep for a second: mean force on the ground [N] and deepest penetration [m]."""
     physics.rigid.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-    seen = []
+    samples = []
     for _ in range(ticks):
         physics.step()
-        seen.append(on_the_ground(physics))
-    force, deep = np.array(seen[ticks // 2 :]).T
-    return float(force.mean()), float(deep.min())
+        samples.append(on_the_ground(physics))
+    force, penetration = np.array(samples[ticks // 2 :]).T
+    return float(force.mean()), float(penetration.min())
 
 
 def settle(physics: Physics, ticks: int = 300) -> None:
@@ -67,8 +67,8 @@ def settle(physics: Physics, ticks: int = 300) -> None:
     assert (asleep >= 0).all()  # every bunch, and the crate
 
 
-def test_ten_bunches_lie_in_the_crate_and_weigh_what_they_weigh():
-    physics = dropped(into_crate=True)
+def test_ten_bunches_rest_in_the_crate_with_their_weight():
+    physics = drop_bunches(into_crate=True)
     settle(physics)
     crate = physics.rigid.mj_data.joint("box/0").qpos
     for bunch in range(10):
@@ -79,13 +79,13 @@ def test_ten_bunches_lie_in_the_crate_and_weigh_what_they_weigh():
         assert np.abs(local[1]) < 0.2
         assert 0.01 < local[2] < 0.3
     force, deepest = watch_awake(physics)
-    # parked bodies fall once sleep is off, but touch nothing
+    # parked bodies fall once sleep is disabled, without contacts
     assert force == pytest.approx(-GRAVITY[2] * (MASSES.sum() + CRATE), rel=0.01)
     assert deepest > -0.002
 
 
 def test_ten_bunches_come_to_rest_on_the_ground():
-    physics = dropped(into_crate=False)
+    physics = drop_bunches(into_crate=False)
     settle(physics)
     poses = np.array([physics.rigid.bunch_pose(bunch) for bunch in range(10)])
     assert poses[:, 2].min() > 0.0
@@ -97,25 +97,25 @@ def test_ten_bunches_come_to_rest_on_the_ground():
     assert np.abs(after[:, :3] - poses[:, :3]).max() < 1e-3
 
 
-@pytest.mark.parametrize(("share", "moves"), [(0.95, False), (1.05, True)])
-def test_a_full_crate_is_pushed_by_mu_m_g(share, moves):
-    """F34: the push that starts a laden crate is the friction coefficient times the weight of all that is in it."""
-    physics = dropped(into_crate=True)
+@pytest.mark.parametrize(("fraction", "moves"), [(0.95, False), (1.05, True)])
+def test_a_full_crate_slides_at_mu_m_g(fraction, moves):
+    """F34: the force that starts a loaded crate is the friction coefficient times its total weight."""
+    physics = drop_bunches(into_crate=True)
     settle(physics)
     box, data = physics.rigid.mj_model.body("box/0").id, physics.rigid.mj_data
     start = data.joint("box/0").qpos[:3].copy()
-    data.xfrc_applied[box, 0] = -share * PhysicsParameters().friction * GRAVITY[2] * (MASSES.sum() + CRATE)
+    data.xfrc_applied[box, 0] = -fraction * PhysicsParameters().friction * GRAVITY[2] * (MASSES.sum() + CRATE)
     # at the height of the ground, so that it does not tip the crate
     data.xfrc_applied[box, 4] = -data.xfrc_applied[box, 0] * (data.xipos[box, 2])
     for _ in range(100):
         physics.step()
-    went = data.joint("box/0").qpos[0] - start[0]
-    assert went > 0.1 if moves else abs(went) < 2e-3
+    displacement = data.joint("box/0").qpos[0] - start[0]
+    assert displacement > 0.1 if moves else abs(displacement) < 2e-3
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_nothing_leaves_faster_than_it_came(seed):
-    """Six bunches fall together from 0.6 m to 1.85 m into a crate: none gains speed where they meet."""
+def test_contacts_add_no_speed(seed):
+    """Six bunches fall together from 0.6 m to 1.85 m into a crate: contacts add no speed."""
     trees = [cane((0.0, 5.0 + i, 2.0), bunch=0.4) for i in range(6)]
     box = {"box_pose": [[0.0, 0.0, 0.001, 0, 0, 0, 1]], "box_size": [[0.6, 0.4, 0.3]], "box_mass": [[CRATE]]}
     physics = Physics(assemble(trees, **box))
@@ -133,13 +133,13 @@ def test_nothing_leaves_faster_than_it_came(seed):
         fastest = max(fastest, *speeds)
     fall = np.sqrt(2.0 * 9.81 * 1.85)
     assert 0.8 * fall < fastest < 1.25 * fall
-    # and none is pushed through the bottom, which would lift the crate
+    # none is pushed through the bottom, which would lift the crate
     assert rigid.mj_data.joint("box/0").qpos[2] == pytest.approx(0.0, abs=2e-3)
 
 
-def test_twice_the_same_bits():
+def test_two_runs_are_bitwise_equal():
     ends = []
     for _ in range(2):
-        physics = dropped(into_crate=True)
+        physics = drop_bunches(into_crate=True)
         ends.append(physics.rigid.mj_data.qpos.tobytes() + physics.rigid.mj_data.qvel.tobytes())
     assert ends[0] == ends[1]

@@ -1,4 +1,4 @@
-"""Forked trees in space against MuJoCo, against conservation laws, and against themselves."""
+"""Forked trees in space against MuJoCo and conservation laws, and for determinism."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DT = 0.01
 
 
 def forked(rng: np.random.Generator, *, beta: float = 0.012, isotropic: bool = True, soft: float = 1.0) -> TreeBuilder:
-    """Thirteen crooked bodies with two forks, nothing aligned with anything."""
+    """Thirteen bodies with two forks and random, unaligned frames."""
     tree = TreeBuilder(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
 
     def grow(parent: int, count: int) -> list[int]:
@@ -56,26 +56,26 @@ def awake(model: Model, state: State, **options: float) -> ArticulationSolver:
 
 
 def test_free_motion_in_space_is_mujocos() -> None:
-    """Backward Euler is MuJoCo's ``discrete``: 1e-5 m over 1 s, 5 rad/s in every joint, springs that nearly float."""
+    """Backward Euler is MuJoCo's ``discrete``: 1e-5 m over 1 s, 5 rad/s in every joint, very soft springs."""
     rng = np.random.default_rng(3)
     model = assemble([forked(rng), forked(rng, soft=0.1)])
     plants = awake(
         model, random_state(model, rng, 5.0), phi=1.0, geometric_stiffness=False, fast_rate=np.inf, max_rate=np.inf
     )
-    # our solver takes off the damping that its scheme adds; MuJoCo keeps both
-    peer = compile_plants(model, dt=DT, damping=model.joint_damping[:, 1] - DT * model.joint_stiffness[:, 1])
-    data = mujoco.MjData(peer)
+    # our solver subtracts the damping that its scheme adds; MuJoCo does not
+    mj_model = compile_plants(model, dt=DT, damping=model.joint_damping[:, 1] - DT * model.joint_stiffness[:, 1])
+    data = mujoco.MjData(mj_model)
     copy_state_to_mujoco(plants.state, data)
     worst = travelled = 0.0
     start = None
     for _ in range(100):
         plants.predict()
-        mujoco.mj_kinematics(peer, data)
+        mujoco.mj_kinematics(mj_model, data)
         start = plants.state.body_q[:, :3].copy() if start is None else start
         worst = max(worst, np.abs(data.xpos[1:] - plants.state.body_q[:, :3]).max())
         travelled = max(travelled, np.abs(plants.state.body_q[:, :3] - start).max())
         plants.integrate()
-        mujoco.mj_step(peer, data)
+        mujoco.mj_step(mj_model, data)
     assert travelled > 0.1
     assert worst < 1e-5
 
@@ -89,14 +89,14 @@ def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
     state, size = plants.state, int(model.tree_size[0])
     touched = np.array([4, size + 12, 9, size + 3], np.int32)
     plants.predict()
-    seen = plants.impulse_response(touched)
+    measured = plants.impulse_response(touched)
 
-    peer = compile_plants(model, dt=DT)
-    data = mujoco.MjData(peer)
+    mj_model = compile_plants(model, dt=DT)
+    data = mujoco.MjData(mj_model)
     copy_state_to_mujoco(state, data)
-    mujoco.mj_forward(peer, data)
-    inertia = np.zeros((peer.nv, peer.nv))
-    mujoco.mj_fullM(peer, data, inertia)
+    mujoco.mj_forward(mj_model, data)
+    inertia = np.zeros((mj_model.nv, mj_model.nv))
+    mujoco.mj_fullM(mj_model, data, inertia)
     stiffness = model.joint_stiffness.astype(float)
     damping = np.maximum(model.joint_damping - (2 * phi - 1) * DT * stiffness, 0.0)
     metric = phi * DT * (phi * DT * stiffness + damping)
@@ -104,20 +104,20 @@ def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
     for body in range(len(metric)):
         block = slice(3 * body, 3 * body + 3)
         inertia[block, block] += axes[body].T @ np.diag(metric[body]) @ axes[body]
-    jacobian = np.zeros((len(touched), 6, peer.nv))
+    jacobian = np.zeros((len(touched), 6, mj_model.nv))
     for row, body in zip(jacobian, touched, strict=True):
-        mujoco.mj_jacBody(peer, data, row[:3], row[3:], int(body) + 1)
-    flat = jacobian.reshape(-1, peer.nv)
-    truth = (flat @ np.linalg.solve(inertia, flat.T)).reshape(seen.shape)
-    np.testing.assert_allclose(seen, truth, rtol=0, atol=1e-4 * np.abs(truth).max())
-    blocks = np.linalg.norm(truth, axis=(1, 3))
-    np.testing.assert_array_less(np.linalg.norm(seen - truth, axis=(1, 3)), 1e-4 * blocks + 1e-12)
-    assert not seen[0, :, 1].any()  # different trees
-    assert seen[0, :, 2].any()
+        mujoco.mj_jacBody(mj_model, data, row[:3], row[3:], int(body) + 1)
+    flat = jacobian.reshape(-1, mj_model.nv)
+    expected = (flat @ np.linalg.solve(inertia, flat.T)).reshape(measured.shape)
+    np.testing.assert_allclose(measured, expected, rtol=0, atol=1e-4 * np.abs(expected).max())
+    blocks = np.linalg.norm(expected, axis=(1, 3))
+    np.testing.assert_array_less(np.linalg.norm(measured - expected, axis=(1, 3)), 1e-4 * blocks + 1e-12)
+    assert not measured[0, :, 1].any()  # different trees
+    assert measured[0, :, 2].any()
 
 
 def test_predicted_velocity_is_realised() -> None:
-    """velocity_free + response @ impulse is what the bodies have after commit, at the poses of the tick's start."""
+    """velocity_free + response @ impulse is the velocity after ``integrate``, at the poses of the step's start."""
     rng = np.random.default_rng(7)
     model = assemble([forked(rng, isotropic=False), forked(rng)])
     plants = awake(model, random_state(model, rng, 2.0), max_rate=np.inf)
@@ -126,19 +126,19 @@ def test_predicted_velocity_is_realised() -> None:
     touched = np.array([5, 8, 20, 5], np.int32)  # one body twice
     wrenches = rng.normal(size=(4, 6)) * [1, 1, 1, 0.02, 0.02, 0.02]
     predicted = plants.velocity_free.astype(float)
-    once, which = np.unique(touched, return_inverse=True)
-    impulse = np.zeros((len(once), 6))
+    unique_bodies, which = np.unique(touched, return_inverse=True)
+    impulse = np.zeros((len(unique_bodies), 6))
     np.add.at(impulse, which, wrenches * DT)
-    predicted = predicted[once] + np.einsum("uitj,tj->ui", plants.impulse_response(once), impulse)
+    predicted = predicted[unique_bodies] + np.einsum("uitj,tj->ui", plants.impulse_response(unique_bodies), impulse)
     before = state.joint_q.copy()
     plants.integrate(touched, wrenches)
     state.joint_q[:] = before
     plants.forward_kinematics()
-    np.testing.assert_allclose(state.body_qd[once], predicted, atol=1e-4, rtol=1e-4)
+    np.testing.assert_allclose(state.body_qd[unique_bodies], predicted, atol=1e-4, rtol=1e-4)
 
 
 def energy(plants: ArticulationSolver) -> float:
-    """Kinetic, of height, of springs [J]; right after predict()."""
+    """Kinetic, potential and elastic energy [J], right after ``predict()``."""
     model, state = plants.model, plants.state
     pose, speed = state.body_q.astype(float), state.body_qd.astype(float)
     com = frames.rotate(pose[:, 3:], model.body_com.astype(float))
@@ -168,13 +168,13 @@ def test_a_hanging_bunch_gains_no_energy(phi: float, loss: float) -> None:
     state = State.at_rest(model)
     state.joint_q[0] = frames.exp(np.array([0.0, 0.3, 0.0]))
     plants = awake(model, state, phi=phi)
-    seen = []
+    measured = []
     for _ in range(1000):
         plants.predict()
-        seen.append(energy(plants) - energy(rest))
+        measured.append(energy(plants) - energy(rest))
         plants.integrate()
-    assert max(seen) < 1.01 * seen[0]
-    assert min(seen) > (1.0 - loss) * seen[0]
+    assert max(measured) < 1.01 * measured[0]
+    assert min(measured) > (1.0 - loss) * measured[0]
 
 
 def test_energy_of_an_undamped_cane() -> None:
@@ -187,19 +187,19 @@ def test_energy_of_an_undamped_cane() -> None:
     rest.predict()
     plants = awake(model, State.at_rest(model), phi=0.5)
     plants.state.joint_qd[:, 1:] = np.array([0.5, 0.2]) / 16
-    seen = []
+    measured = []
     for _ in range(6000):
         plants.predict()
-        seen.append(energy(plants) - energy(rest))
+        measured.append(energy(plants) - energy(rest))
         plants.integrate()
-    assert seen[0] > 1e-4
-    assert np.mean(seen[-200:]) == pytest.approx(np.mean(seen[:200]), rel=0.01)
+    assert measured[0] > 1e-4
+    assert np.mean(measured[-200:]) == pytest.approx(np.mean(measured[:200]), rel=0.01)
 
 
 @pytest.mark.parametrize("mass", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("radius", [0.0015, 0.0025])
-def test_a_heavy_bunch_on_a_thin_peduncle_stays(mass: float, radius: float) -> None:
-    """Springs softer than the weight they carry, pulled by 60 N for a second, then let go: calm after 10 s."""
+def test_a_heavy_bunch_on_a_thin_peduncle_is_stable(mass: float, radius: float) -> None:
+    """Springs softer than the weight they carry, pulled by 60 N for a second and released: slow after 10 s."""
     tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, -1.0]))))
     last = tree.add_rod(-1, 0.06, (radius, radius), RodMaterial(0.5e9, 900.0, 0.02), 3)[-1]
     spring = tree.bodies[last]
@@ -221,7 +221,7 @@ def test_a_heavy_bunch_on_a_thin_peduncle_stays(mass: float, radius: float) -> N
 
 
 @pytest.mark.parametrize(("phi", "rate"), [(0.55, 20.0), (1.0, 50.0)])
-def test_survives_violence(phi: float, rate: float) -> None:
+def test_survives_extreme_joint_rates(phi: float, rate: float) -> None:
     rng = np.random.default_rng(11)
     trees = []
     for i in range(4):
@@ -233,12 +233,12 @@ def test_survives_violence(phi: float, rate: float) -> None:
     for _ in range(1000):
         plants.predict()
         plants.integrate()
-        assert (plants.tree_rate < plants.fault_rate).all()  # false of NaN too
+        assert (plants.tree_rate < plants.fault_rate).all()  # also false for NaN
     assert plants.tree_rate.max() < 1.0
 
 
 def test_joint_wrench_carries_weight_and_pull() -> None:
-    """At rest, statics: the joint bears everything beyond it."""
+    """At rest the joint carries weight and load of all bodies beyond it."""
     rng = np.random.default_rng(13)
     model = assemble([forked(rng, beta=0.1)])
     plants = awake(model, State.at_rest(model), phi=1.0)
@@ -258,9 +258,9 @@ def test_joint_wrench_carries_weight_and_pull() -> None:
             load = plants.body_load[7].astype(float)
             force = force + load[:3]
             moment = moment + load[3:] + np.cross(pose[7, :3] - pose[joint, :3], load[:3])
-        seen = plants.joint_wrench(np.array([joint]))[0]
-        np.testing.assert_allclose(seen[:3], -force, atol=2e-3)
-        np.testing.assert_allclose(seen[3:], -moment, atol=2e-3)
+        measured = plants.joint_wrench(np.array([joint]))[0]
+        np.testing.assert_allclose(measured[:3], -force, atol=2e-3)
+        np.testing.assert_allclose(measured[3:], -moment, atol=2e-3)
 
 
 def digest_of_a_run() -> str:
@@ -277,11 +277,11 @@ def digest_of_a_run() -> str:
     return h.hexdigest()
 
 
-def test_two_runs_are_equal_bit_for_bit() -> None:
+def test_two_runs_are_bitwise_equal() -> None:
     assert digest_of_a_run() == digest_of_a_run()
 
 
-# ---- what has been cut off
+# ---- cut bodies
 
 
 def cane(**wood: float) -> TreeBuilder:
@@ -290,8 +290,10 @@ def cane(**wood: float) -> TreeBuilder:
     return tree
 
 
-def spun(tree: TreeBuilder, rng: np.random.Generator, body: int = 0, **options: float) -> ArticulationSolver:
-    """A tree cut at a body, bent, every joint turning and the whole of it spinning and thrown."""
+def spinning_cut_tree(
+    tree: TreeBuilder, rng: np.random.Generator, body: int = 0, **options: float
+) -> ArticulationSolver:
+    """A tree cut at a body, bent, with joint rates, spin and linear velocity."""
     model = assemble([tree])
     plants = awake(model, State.at_rest(model), **options)
     state = plants.state
@@ -307,21 +309,23 @@ def spun(tree: TreeBuilder, rng: np.random.Generator, body: int = 0, **options: 
 @pytest.mark.parametrize("phi", [0.5, 0.55, 1.0])
 @pytest.mark.parametrize("kind", ["cane", "fork", "fast"])
 def test_a_cut_cane_keeps_its_momentum(kind: str, phi: float) -> None:
-    """Spinning, bending, falling for 2 s: momentum less m g t, angular momentum about the centre of mass, the path of
-    that centre: 1e-4."""
+    """Spinning, bending, falling for 2 s: momentum less m g t, angular momentum about the centre of mass, and its
+    path: 1e-4."""
     rng = np.random.default_rng(19)
     body = 0 if kind == "cane" else 3
-    plants = spun(cane() if kind == "cane" else forked(rng), rng, body, phi=phi)
+    plants = spinning_cut_tree(cane() if kind == "cane" else forked(rng), rng, body, phi=phi)
     if kind == "fast":
         plants.state.joint_qd[body] *= 4.0
-    off = np.flatnonzero(plants._root == body)
+    cut_bodies = np.flatnonzero(plants._root == body)
     plants.forward_kinematics()
-    linear, _, start, energy = momenta(plants, off, np.zeros(3))
-    angular = momenta(plants, off, start)[1]
-    mass = plants.body_mass[off].sum()
+    linear, _, start, energy = momenta(plants, cut_bodies, np.zeros(3))
+    angular = momenta(plants, cut_bodies, start)[1]
+    mass = plants.body_mass[cut_bodies].sum()
 
     def spring() -> float:
-        return 0.5 * float((plants.joint_stiffness * frames.log(plants.state.joint_q.astype(float)) ** 2)[off].sum())
+        return 0.5 * float(
+            (plants.joint_stiffness * frames.log(plants.state.joint_q.astype(float)) ** 2)[cut_bodies].sum()
+        )
 
     energy += spring()
     worst = np.zeros(3)
@@ -329,100 +333,102 @@ def test_a_cut_cane_keeps_its_momentum(kind: str, phi: float) -> None:
         plants.predict()
         plants.integrate()
         plants.forward_kinematics()
-        now, _, center, _ = momenta(plants, off, np.zeros(3))
-        spin = momenta(plants, off, center)[1]
+        now, _, center, _ = momenta(plants, cut_bodies, np.zeros(3))
+        spin = momenta(plants, cut_bodies, center)[1]
         path = start + linear / mass * tick * DT + fall(tick * DT)
         error = now - linear - mass * GRAVITY * tick * DT, spin - angular, center - path
         worst = np.maximum(worst, np.linalg.norm(error, axis=1))
     assert worst[0] < 1e-4 * np.linalg.norm(linear)
     assert worst[1] < 1e-4 * np.linalg.norm(angular)
     assert worst[2] < 1e-4
-    own = momenta(plants, off, np.zeros(3))[3] - 0.5 * mass * ((now / mass) ** 2).sum() + spring()
+    own = momenta(plants, cut_bodies, np.zeros(3))[3] - 0.5 * mass * ((now / mass) ** 2).sum() + spring()
     assert own < energy - 0.5 * mass * ((linear / mass) ** 2).sum()  # spinning and bending lose energy only
 
 
 @pytest.mark.parametrize("phi", [0.55, 1.0])
 def test_response_of_a_cut_tree_is_that_of_a_free_joint(phi: float) -> None:
-    """Against MuJoCo's inertia with a free joint where the cut is; what stands and what fell do not feel each other."""
+    """Against MuJoCo's inertia with a free joint at the cut; standing and cut bodies are not coupled."""
     rng = np.random.default_rng(23)
-    plants = spun(forked(rng, isotropic=False), rng, 0, phi=phi, geometric_stiffness=False, fast_rate=np.inf)
+    plants = spinning_cut_tree(
+        forked(rng, isotropic=False), rng, 0, phi=phi, geometric_stiffness=False, fast_rate=np.inf
+    )
     model, state = plants.model, plants.state
     plants.cut(6)
     plants.predict()
     touched = np.array([5, 0, 9, 6], np.int32)
-    seen = plants.impulse_response(touched)
+    measured = plants.impulse_response(touched)
 
     spec = mujoco.MjSpec()
-    made: list[mujoco.MjsBody] = []
+    mj_bodies: list[mujoco.MjsBody] = []
     for body in range(len(model.body_mass)):
         parent = int(plants._parent[body])
         pose = state.body_q[body] if parent < 0 else frames.pose(model.body_offset[body], model.body_rest[body])
-        child = (spec.worldbody if parent < 0 else made[parent]).add_body(
+        child = (spec.worldbody if parent < 0 else mj_bodies[parent]).add_body(
             pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[body]), ipos=model.body_com[body],
             inertia=model.body_inertia[body], explicitinertial=True,
         )  # fmt: skip
         child.add_joint(type=mujoco.mjtJoint.mjJNT_FREE if parent < 0 else mujoco.mjtJoint.mjJNT_BALL)
-        made.append(child)
-    peer = spec.compile()
-    data = mujoco.MjData(peer)
-    for body, at in enumerate(peer.jnt_qposadr):
+        mj_bodies.append(child)
+    mj_model = spec.compile()
+    data = mujoco.MjData(mj_model)
+    for body, at in enumerate(mj_model.jnt_qposadr):
         if plants._parent[body] >= 0:
             data.qpos[at : at + 4] = frames.to_wxyz(state.joint_q[body])
-    mujoco.mj_forward(peer, data)
+    mujoco.mj_forward(mj_model, data)
     np.testing.assert_allclose(data.xpos[1:], state.body_q[:, :3], atol=1e-5)
-    inertia = np.zeros((peer.nv, peer.nv))
-    mujoco.mj_fullM(peer, data, inertia)
+    inertia = np.zeros((mj_model.nv, mj_model.nv))
+    mujoco.mj_fullM(mj_model, data, inertia)
     stiffness = model.joint_stiffness.astype(float)
     damping = np.maximum(model.joint_damping - (2 * phi - 1) * DT * stiffness, 0.0)
     used = float(plants.phi_used[0])
     metric = used * DT * (used * DT * stiffness + np.maximum(damping, 0.0))
     assert used == pytest.approx(phi)
     axes = frames.to_matrix(state.joint_q.astype(float))
-    for body, at in enumerate(peer.jnt_dofadr):
+    for body, at in enumerate(mj_model.jnt_dofadr):
         if plants._parent[body] >= 0:
             inertia[at : at + 3, at : at + 3] += axes[body].T @ np.diag(metric[body]) @ axes[body]
-    jacobian = np.zeros((len(touched), 6, peer.nv))
+    jacobian = np.zeros((len(touched), 6, mj_model.nv))
     for row, body in zip(jacobian, touched, strict=True):
-        mujoco.mj_jacBody(peer, data, row[:3], row[3:], int(body) + 1)
-    flat = jacobian.reshape(-1, peer.nv)
-    truth = (flat @ np.linalg.solve(inertia, flat.T)).reshape(seen.shape)
-    np.testing.assert_allclose(seen, truth, rtol=0, atol=1e-4 * np.abs(truth).max())
-    assert seen[1, :3, 1, :3].any()  # the root moves
-    apart = plants._root[touched]
-    assert set(apart.tolist()) == {0, 6}
+        mujoco.mj_jacBody(mj_model, data, row[:3], row[3:], int(body) + 1)
+    flat = jacobian.reshape(-1, mj_model.nv)
+    expected = (flat @ np.linalg.solve(inertia, flat.T)).reshape(measured.shape)
+    np.testing.assert_allclose(measured, expected, rtol=0, atol=1e-4 * np.abs(expected).max())
+    assert measured[1, :3, 1, :3].any()  # the root moves
+    root = plants._root[touched]
+    assert set(root.tolist()) == {0, 6}
     for u in range(4):
         for t in range(4):
-            assert seen[u, :, t].any() == (apart[u] == apart[t])
+            assert measured[u, :, t].any() == (root[u] == root[t])
 
 
-def test_a_push_on_a_cut_cane_moves_it_as_predicted() -> None:
-    """Impulses go over into momentum, and velocities are those that ``response`` foretold."""
+def test_a_force_on_a_cut_cane_moves_it_as_predicted() -> None:
+    """Impulses change the momentum, and velocities are those predicted by ``impulse_response``."""
     rng = np.random.default_rng(29)
-    plants = spun(cane(), rng, 4)
+    plants = spinning_cut_tree(cane(), rng, 4)
     plants.state.joint_q[5:] = [0.0, 0.0, 0.0, 1.0]
     plants.state.joint_qd[:] *= 0.1
-    off = np.flatnonzero(plants._root == 4)
+    cut_bodies = np.flatnonzero(plants._root == 4)
     plants.forward_kinematics()
-    linear, angular, center, _ = momenta(plants, off, np.zeros(3))
+    linear, angular, center, _ = momenta(plants, cut_bodies, np.zeros(3))
     plants.predict()
     touched, wrench = np.array([6, 4, 10]), rng.normal(size=(3, 6)) * [0.1, 0.1, 0.1, 1e-5, 1e-5, 1e-5]
     at = plants.state.body_q[touched, :3].astype(float)
-    foretold = plants.velocity_free[touched] + np.einsum("uitj,tj->ui", plants.impulse_response(touched), wrench * DT)
+    predicted = plants.velocity_free[touched] + np.einsum("uitj,tj->ui", plants.impulse_response(touched), wrench * DT)
     plants.integrate(touched, wrench)
     plants.forward_kinematics()
-    after = momenta(plants, off, np.zeros(3))
-    force = plants.body_mass[off].sum() * GRAVITY + wrench[:, :3].sum(0)
+    after = momenta(plants, cut_bodies, np.zeros(3))
+    force = plants.body_mass[cut_bodies].sum() * GRAVITY + wrench[:, :3].sum(0)
     np.testing.assert_allclose(after[0], linear + DT * force, atol=1e-6)
     twist = (np.cross(at - center, wrench[:, :3]) + wrench[:, 3:]).sum(0)
-    spin = momenta(plants, off, after[2])[1] - (angular - np.cross(center, linear))
+    spin = momenta(plants, cut_bodies, after[2])[1] - (angular - np.cross(center, linear))
     np.testing.assert_allclose(spin, DT * twist, atol=2e-7)
-    np.testing.assert_allclose(plants.state.body_qd[touched], foretold, atol=0.05)  # the poses have moved on
+    np.testing.assert_allclose(plants.state.body_qd[touched], predicted, atol=0.05)  # the poses have changed since
 
 
-def test_a_violently_cut_tree_calms_down() -> None:
+def test_a_cut_tree_with_extreme_rates_slows_down() -> None:
     rng = np.random.default_rng(31)
     for body in (0, 2, 7):
-        plants = spun(forked(rng, beta=0.004), rng, body)
+        plants = spinning_cut_tree(forked(rng, beta=0.004), rng, body)
         plants.state.joint_qd[:] = frames.normalize(rng.normal(size=plants.state.joint_qd.shape)) * 20.0
         rates = []
         for _ in range(1000):
@@ -436,14 +442,14 @@ def test_a_violently_cut_tree_calms_down() -> None:
 # ---- ties
 
 
-def bound(
+def tied(
     tree: TreeBuilder,
     body: int,
     stiffness: float,
     damping: float = 0.0,
     point: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Model:
-    """A tree with one tie that is slack as the tree is drawn."""
+    """A tree with one tie that is unstretched at the drawn pose."""
     drawn = assemble([tree])
     at = frames.compose(drawn.forward_kinematics(drawn.joint_settled)[body], frames.pose(np.array(point)))[:3]
     return assemble(
@@ -463,7 +469,7 @@ def flat(mass: float = 0.0, beta: float = 0.01) -> TreeBuilder:
 @pytest.mark.parametrize("stiffness", [5.0, 100.0, 1e4, 1e6])
 def test_a_tied_cane_bends_like_a_propped_beam(stiffness: float) -> None:
     """Side load P at the tip, spring support at a: w(x) by superposition of two cantilevers (Euler-Bernoulli)."""
-    model = bound(flat(beta=0.05), 9, stiffness, point=(1 / 16, 0.0, 0.0))
+    model = tied(flat(beta=0.05), 9, stiffness, point=(1 / 16, 0.0, 0.0))
     plants = awake(model, State.at_rest(model), phi=1.0)
     load, bend, a = 0.01, 5e9 * np.pi / 4 * 0.004**4, 10 / 16
     plants.body_load[15] = [0.0, load, 0.0, 0.0, 0.0, load / 16]
@@ -472,38 +478,38 @@ def test_a_tied_cane_bends_like_a_propped_beam(stiffness: float) -> None:
         plants.integrate()
     plants.forward_kinematics()
     assert plants.tree_rate[0] < 1e-4
-    alone = load * a * a * (3.0 - a) / (6.0 * bend)
-    held = stiffness * alone / (1.0 + stiffness * a**3 / (3.0 * bend))
-    tip = load / (3.0 * bend) - held * a * a * (3.0 - a) / (6.0 * bend)
+    deflection_without_tie = load * a * a * (3.0 - a) / (6.0 * bend)
+    tie_force = stiffness * deflection_without_tie / (1.0 + stiffness * a**3 / (3.0 * bend))
+    tip = load / (3.0 * bend) - tie_force * a * a * (3.0 - a) / (6.0 * bend)
     rest = model.forward_kinematics(model.joint_settled)
-    seen = [
+    measured = [
         frames.compose(plants.state.body_q[b], frames.pose([1 / 16, 0, 0]))[1]
         - frames.compose(rest[b], frames.pose([1 / 16, 0, 0]))[1]
         for b in (15, 9)
     ]
-    assert seen[0] == pytest.approx(tip, rel=0.02)
-    assert stiffness * seen[1] == pytest.approx(held, rel=0.01, abs=1e-7 * stiffness)
-    # what the joint bears is the load less what the tie takes, and the weight
+    assert measured[0] == pytest.approx(tip, rel=0.02)
+    assert stiffness * measured[1] == pytest.approx(tie_force, rel=0.01, abs=1e-7 * stiffness)
+    # the joint carries the load less the force of the tie, and the weight
     root = plants.joint_wrench(np.array([0]))[0]
-    assert root[1] == pytest.approx(held - load, abs=2e-4 + 2e-7 * stiffness)
+    assert root[1] == pytest.approx(tie_force - load, abs=2e-4 + 2e-7 * stiffness)
 
 
 @pytest.mark.parametrize("stiffness", [1e2, 1e3, 1e4, 1e5, 1e6])
 @pytest.mark.parametrize(("mass", "beta"), [(0.0, 0.0), (0.5, 0.006)])
 def test_a_tied_cane_gains_no_energy(stiffness: float, mass: float, beta: float) -> None:
-    model = bound(flat(mass, beta), 9, stiffness, point=(1 / 16, 0.0, 0.0))
+    model = tied(flat(mass, beta), 9, stiffness, point=(1 / 16, 0.0, 0.0))
     rest = awake(model, State.at_rest(model))
     rest.predict()
     plants = awake(model, State.at_rest(model))
     plants.state.joint_qd[:, 1:] = [0.1, 0.06]
-    seen = []
+    measured = []
     for _ in range(1000):
         plants.predict()
         at = frames.compose(plants.state.body_q[9], frames.pose([1 / 16, 0, 0]))[:3]
-        stretched = 0.5 * stiffness * ((at - model.tie_anchor[0]) ** 2).sum()
-        seen.append(energy(plants) - energy(rest) + stretched)
+        elastic = 0.5 * stiffness * ((at - model.tie_anchor[0]) ** 2).sum()
+        measured.append(energy(plants) - energy(rest) + elastic)
         plants.integrate()
-    assert max(seen[1:]) <= seen[0]
+    assert max(measured[1:]) <= measured[0]
     assert plants.tree_rate[0] < 0.1
 
 
@@ -514,7 +520,7 @@ def test_a_tie_damps_as_asked(zeta: float) -> None:
     tree = TreeBuilder(frames.pose(np.zeros(3)))
     tree.add_body(-1, mass=1.0, inertia=[inertia] * 3, length=0.2)
     damping = 2.0 * zeta * np.sqrt(stiffness * inertia) / lever
-    model = bound(tree, 0, stiffness, damping, point=(lever, 0.0, 0.0))
+    model = tied(tree, 0, stiffness, damping, point=(lever, 0.0, 0.0))
     state = State.at_rest(model)
     state.joint_q[0] = frames.exp(np.array([0.0, 0.0, 0.02]))
     plants = awake(model, state)
@@ -524,17 +530,17 @@ def test_a_tie_damps_as_asked(zeta: float) -> None:
         plants.integrate()
         angle.append(frames.log(state.joint_q[0].astype(float))[2])
     angle = np.array(angle)
-    turns = np.flatnonzero((angle[1:-1] < angle[:-2]) & (angle[1:-1] < angle[2:])) + 1  # troughs, by a parabola
-    trough = angle[turns] - (angle[turns + 1] - angle[turns - 1]) ** 2 / (
-        8.0 * (angle[turns + 1] - 2 * angle[turns] + angle[turns - 1])
+    troughs = np.flatnonzero((angle[1:-1] < angle[:-2]) & (angle[1:-1] < angle[2:])) + 1  # troughs, by a parabola
+    trough = angle[troughs] - (angle[troughs + 1] - angle[troughs - 1]) ** 2 / (
+        8.0 * (angle[troughs + 1] - 2 * angle[troughs] + angle[troughs - 1])
     )
     loss = np.log(trough[0] / trough[1])
     assert loss / np.hypot(loss, 2.0 * np.pi) == pytest.approx(zeta, abs=0.005)
-    assert (turns[1] - turns[0]) * DT == pytest.approx(2.0 * np.pi / (10.0 * np.sqrt(1.0 - zeta**2)), rel=0.03)
+    assert (troughs[1] - troughs[0]) * DT == pytest.approx(2.0 * np.pi / (10.0 * np.sqrt(1.0 - zeta**2)), rel=0.03)
 
 
-def test_a_tie_follows_its_anchor_and_can_be_undone() -> None:
-    model = bound(flat(), 15, 200.0, 1.0)
+def test_a_tie_follows_its_anchor_and_can_be_removed() -> None:
+    model = tied(flat(), 15, 200.0, 1.0)
     plants = awake(model, State.at_rest(model), phi=1.0)
     plants.tie_anchor[0, 1] += 0.05
     for _ in range(500):
@@ -551,30 +557,30 @@ def test_a_tie_follows_its_anchor_and_can_be_undone() -> None:
     np.testing.assert_allclose(plants.state.body_q[15, :3], drawn[15, :3], atol=2e-3)
 
 
-def test_what_is_tied_hangs_by_its_tie_when_it_is_cut() -> None:
-    model = bound(flat(), 9, 500.0, 2.0)
+def test_a_cut_cane_hangs_by_its_tie() -> None:
+    model = tied(flat(), 9, 500.0, 2.0)
     plants = awake(model, State.at_rest(model), phi=1.0)
     plants.cut(4)
     for tick in range(3000):
         plants.predict()
         plants.integrate()
-        if tick % 12 == 0:  # nothing else would end its swinging
+        if tick % 12 == 0:  # damp the free swing
             plants.state.joint_qd[:] = 0.0
             plants.state.joint_xd[:] = 0.0
     plants.forward_kinematics()
     at = plants.state.body_q[9, :3].astype(float)
-    off = np.arange(4, 16)
-    _, _, center, _ = momenta(plants, off, np.zeros(3))
-    weight = 9.81 * plants.body_mass[off].sum()
+    cut_bodies = np.arange(4, 16)
+    _, _, center, _ = momenta(plants, cut_bodies, np.zeros(3))
+    weight = 9.81 * plants.body_mass[cut_bodies].sum()
     np.testing.assert_allclose(at - model.tie_anchor[0], [0.0, 0.0, -weight / 500.0], atol=1e-4)
-    np.testing.assert_allclose(center[:2], at[:2], atol=1e-3)  # hanging straight below
+    np.testing.assert_allclose(center[:2], at[:2], atol=1e-3)  # hanging vertically below
 
 
-# ---- trunk, arms, canes: all one tree
+# ---- trunk, arms and canes as one tree
 
 
 def vine() -> tuple[TreeBuilder, list[int]]:
-    """A trunk of 7 cm and 1.5 m, two arms, eight canes, a bunch on each: one tree, parents of like kind."""
+    """A trunk of 7 cm and 1.5 m, two arms, eight canes, a bunch on each, as one tree."""
     tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
     trunk = tree.add_rod(-1, 1.5, (0.035, 0.035), RodMaterial(10e9, 900.0, 0.004), 6)
     bunches = []
@@ -606,8 +612,8 @@ def vine() -> tuple[TreeBuilder, list[int]]:
     return tree, bunches
 
 
-def test_a_whole_vine_is_one_tree_and_stands() -> None:
-    """Drawn at rest it stays; shaken hard it calms down where it was; its foot bears all its weight."""
+def test_a_whole_vine_as_one_tree_stands() -> None:
+    """Drawn at rest it stays; after a strong kick it returns; its root joint carries all its weight."""
     tree, bunches = vine()
     tree.solve_rest_pose()
     model = assemble([tree])
@@ -619,8 +625,8 @@ def test_a_whole_vine_is_one_tree_and_stands() -> None:
         plants.integrate()
     plants.forward_kinematics()
     np.testing.assert_allclose(plants.state.body_q[:, :3], drawn[:, :3], atol=2e-4)
-    foot = plants.joint_wrench(np.array([0]))[0]
-    np.testing.assert_allclose(foot[:3], -model.body_mass.sum() * GRAVITY, atol=0.02)
+    root_wrench = plants.joint_wrench(np.array([0]))[0]
+    np.testing.assert_allclose(root_wrench[:3], -model.body_mass.sum() * GRAVITY, atol=0.02)
     plants.state.joint_qd[:] = np.random.default_rng(37).normal(size=plants.state.joint_qd.shape) * 3.0
     for _ in range(3000):
         plants.predict()
@@ -632,8 +638,8 @@ def test_a_whole_vine_is_one_tree_and_stands() -> None:
 
 
 def test_sag_of_an_arm_on_its_trunk() -> None:
-    """A stiff arm sideways on a trunk: its tip sinks by w L^4 / 8EI and by what the trunk's head turns, (w L^2 / 2) h /
-    EI L."""
+    """A stiff arm sideways on a trunk: its tip sinks by w L^4 / 8EI and by the rotation of the trunk's head,
+    (w L^2 / 2) h / EI L."""
     tree = TreeBuilder(frames.pose(np.zeros(3), frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.eye(3)[0])))
     trunk = tree.add_rod(-1, 1.5, (0.035, 0.035), RodMaterial(10e9, 900.0, 0.05), 12)
     arm = tree.add_rod(
@@ -669,12 +675,12 @@ def test_a_trunks_first_frequency() -> None:
     plants.wake(0)
     shape = (np.arange(12) + 0.5)[::-1]
     plants.state.joint_qd[:, 1] = 1e-3 * shape
-    seen = []
+    measured = []
     for _ in range(4000):
         plants.predict()
-        seen.append(plants.velocity_free[11, 0])
+        measured.append(plants.velocity_free[11, 0])
         plants.integrate()
-    spectrum = np.abs(np.fft.rfft(np.array(seen) * np.hanning(len(seen)), 1 << 18))
+    spectrum = np.abs(np.fft.rfft(np.array(measured) * np.hanning(len(measured)), 1 << 18))
     frequency = np.argmax(spectrum) * 1000.0 / (1 << 18)
     theory = 1.8751**2 / (2 * np.pi) * np.sqrt(10e9 * 0.035**2 / 4 / 900.0) / 1.5**2
     assert theory == pytest.approx(14.5, rel=0.01)

@@ -1,4 +1,4 @@
-"""Secured links with a real router: who writes under another's name, in another world, or without a certificate."""
+"""Access control with a real router: writing under another name, in another world, or without a certificate."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def server(certs):
         yield running
 
 
-def bus(name, server, certs, **more):
-    return ZenohBus(name, connect=server.endpoint, certificates=certs, **more)
+def bus(name, server, certs, **options):
+    return ZenohBus(name, connect=server.endpoint, certificates=certs, **options)
 
 
 def hello(name, digest="D1"):
@@ -51,7 +51,7 @@ def hello(name, digest="D1"):
 
 @contextlib.contextmanager
 def session(name, server, certs):
-    """What a program of its own making could do with a certificate."""
+    """A plain Zenoh session with a certificate: what any other program could do with it."""
     endpoint = parse(server.endpoint, secured=True)
     one = open_session(config("client", connect__endpoints=[endpoint.locator], **tls_config(certs, name)))
     try:
@@ -64,58 +64,66 @@ WRITTEN = ["a/{}", "a/{}/far", "c/0/-1/{}", "own/0/0/{}", "fact/3/4/{}", "force/
 
 
 @contextlib.contextmanager
-def ear(server, certs, pattern="**"):
-    """Everything that reaches bob."""
-    heard = []
+def subscription_of_bob(server, certs, pattern="**"):
+    """Keys of all samples that reach bob."""
+    received = []
     with session("bob", server, certs) as bob:
-        declared = bob.declare_subscriber(f"vs/1/vineyard/{pattern}", lambda sample: heard.append(str(sample.key_expr)))
-        yield heard
+        declared = bob.declare_subscriber(
+            f"vs/1/vineyard/{pattern}", lambda sample: received.append(str(sample.key_expr))
+        )
+        yield received
         declared.undeclare()
 
 
-def tried(certs, server, name, keys):
-    """Of puts under these keys by this certificate, those that reached bob."""
-    with ear(server, certs) as heard, session("ada", server, certs) as ada, session(name, server, certs) as writer:
+def keys_received(certs, server, name, keys):
+    """Put a sample under each of ``keys`` with the certificate of ``name``; return the keys that reached bob."""
+    with (
+        subscription_of_bob(server, certs) as received,
+        session("ada", server, certs) as ada,
+        session(name, server, certs) as writer,
+    ):
         end = ada.declare_publisher("vs/1/vineyard/own/9/9/ada")
-        wait(lambda: end.matching_status.matching, "bob's ear")
+        wait(lambda: end.matching_status.matching, "bob's subscription")
         for key in keys:
             writer.put(key, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
-        # what was put before in this session has arrived when the answer to a question has
+        # samples put before in this session have arrived when the reply to a query has
         list(writer.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
         end.put(b"end")
-        wait(lambda: "vs/1/vineyard/own/9/9/ada" in heard, "the end mark")
-        return [key for key in heard if key != "vs/1/vineyard/own/9/9/ada"]
+        wait(lambda: "vs/1/vineyard/own/9/9/ada" in received, "the end mark")
+        return [key for key in received if key != "vs/1/vineyard/own/9/9/ada"]
 
 
 def test_an_actor_writes_under_its_own_name_and_no_other(server, certs):
     own = [f"vs/1/vineyard/{key.format('ada')}" for key in WRITTEN]
-    foreign = [f"vs/1/vineyard/{key.format('bob')}" for key in WRITTEN if key != "force/bob/{}"]
-    strange = [
+    others = [f"vs/1/vineyard/{key.format('bob')}" for key in WRITTEN if key != "force/bob/{}"]
+    invalid = [
         "vs/1/vineyard/anything", "vs/1/vineyard/c/0/0/0/ada", "vs/1/vineyard/force/ada/bob",
         "vs/1/vineyard/clock", "vs/1/vineyard/hello/bob",
     ]  # fmt: skip
-    assert tried(certs, server, "ada", [*foreign, *own, *strange]) == own
+    assert keys_received(certs, server, "ada", [*others, *own, *invalid]) == own
 
 
-def test_a_spectator_says_where_its_eyes_are_and_nothing_else(server, certs):
+def test_a_spectator_writes_its_pose_and_nothing_else(server, certs):
     keys = [f"vs/1/vineyard/{key.format(name)}" for key in WRITTEN for name in ("guest", "ada")]
-    assert tried(certs, server, "guest", keys) == ["vs/1/vineyard/a/guest", "vs/1/vineyard/a/guest/far"]
+    assert keys_received(certs, server, "guest", keys) == ["vs/1/vineyard/a/guest", "vs/1/vineyard/a/guest/far"]
 
 
-def test_another_world_does_not_exist(server, certs):
+def test_another_world_is_inaccessible(server, certs):
     with session("ada", server, certs) as ada, session("bob", server, certs) as bob:
-        heard = []
-        elsewhere = bob.declare_subscriber("vs/1/other/**", lambda sample: heard.append(str(sample.key_expr)))
-        everywhere = bob.declare_subscriber("**", lambda sample: heard.append(str(sample.key_expr)))
-        ears = bob.declare_subscriber("vs/1/vineyard/own/9/9/*", lambda sample: heard.append(str(sample.key_expr)))
+        received = []
+        elsewhere = bob.declare_subscriber("vs/1/other/**", lambda sample: received.append(str(sample.key_expr)))
+        everywhere = bob.declare_subscriber("**", lambda sample: received.append(str(sample.key_expr)))
+        own_events = bob.declare_subscriber(
+            "vs/1/vineyard/own/9/9/*", lambda sample: received.append(str(sample.key_expr))
+        )
         end = ada.declare_publisher("vs/1/vineyard/own/9/9/ada")
-        wait(lambda: end.matching_status.matching, "bob's ear")
+        wait(lambda: end.matching_status.matching, "bob's subscription")
         ada.put("vs/1/other/c/0/0/ada", b"x")
         ada.put("vs/1/vineyard/c/0/0/ada", b"x")
         end.put(b"end")
-        wait(lambda: heard, "the end mark")
-        assert set(heard) == {"vs/1/vineyard/own/9/9/ada"}
-        for each in (elsewhere, everywhere, ears):
+        wait(lambda: received, "the end mark")
+        assert set(received) == {"vs/1/vineyard/own/9/9/ada"}
+        for each in (elsewhere, everywhere, own_events):
             each.undeclare()
     with (
         bus("ada", server, certs, world="other") as ada,
@@ -124,8 +132,8 @@ def test_another_world_does_not_exist(server, certs):
         ada.join(hello("ada"))
 
 
-def test_nobody_gets_in_without_a_certificate_of_this_authority(server, certs, tmp_path, monkeypatch):
-    monkeypatch.setattr(zenoh_session, "CONNECT_TIMEOUT", 0.7)  # Zenoh tries again for as long as it may
+def test_connecting_needs_a_certificate_of_the_servers_authority(server, certs, tmp_path, monkeypatch):
+    monkeypatch.setattr(zenoh_session, "CONNECT_TIMEOUT", 0.7)  # Zenoh retries until this timeout
     address = server.endpoint.partition("/")[2]
     with pytest.raises(ServerUnreachable):
         ZenohBus("ada", connect=f"tcp/{address}")
@@ -140,7 +148,7 @@ def test_nobody_gets_in_without_a_certificate_of_this_authority(server, certs, t
         bus("ada", server, tmp_path)
 
 
-def test_a_certificate_the_server_does_not_know_opens_nothing(server, certs):
+def test_a_certificate_newer_than_the_server_is_refused(server, certs):
     create(certs, "late")
     try:
         with (
@@ -153,8 +161,8 @@ def test_a_certificate_the_server_does_not_know_opens_nothing(server, certs):
             (certs / f"late{suffix}").unlink()
 
 
-def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
-    """The whole bus under access control: names, matching, poses, events, questions, snapshots."""
+def test_all_bus_functions_work_under_access_control(server, certs):
+    """The whole bus under access control: names, matching, poses, events, queries, snapshots."""
     with bus("ada", server, certs) as ada, bus("bob", server, certs) as bob, bus("guest", server, certs) as guest:
         for each in (ada, bob, guest):
             each.join(hello(each.name))
@@ -169,27 +177,27 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
             each.subscribe("own/0/0/*", KEEP_ALL)
         wait(lambda: pose.matching and event.matching, "their subscriptions")
         assert not alone.matching
-        heard: dict[str, set] = {"bob": set(), "guest": set()}
+        received: dict[str, set] = {"bob": set(), "guest": set()}
 
-        def both_heard_both():  # one of the two may have subscribed later than matching says
+        def both_received_both():  # one subscription may be newer than the matching status
             pose.put(b"pose")
             event.put(b"event")
             time.sleep(0.01)
             for each in (bob, guest):
-                heard[each.name].update(each.poll())
-            return all(found == {("a/ada", b"pose"), ("own/0/0/ada", b"event")} for found in heard.values())
+                received[each.name].update(each.poll())
+            return all(found == {("a/ada", b"pose"), ("own/0/0/ada", b"event")} for found in received.values())
 
-        wait(both_heard_both, "both samples")
-        fact = RetainedRecord(object_id(ObjectKind.BOX, 1), 1, 0, "ada")
-        says = ada.publisher("fact/0/0/ada", reliable=True)
-        wait(lambda: says.matching, "the server's ear")
-        says.put(messages.encode_records([fact]))
-        wait(lambda: server.store.count() == 1, "the fact to be kept")
+        wait(both_received_both, "both samples")
+        record = RetainedRecord(object_id(ObjectKind.BOX, 1), 1, 0, "ada")
+        publisher = ada.publisher("fact/0/0/ada", reliable=True)
+        wait(lambda: publisher.matching, "the server's subscription")
+        publisher.put(messages.encode_records([record]))
+        wait(lambda: server.store.count() == 1, "the record to be stored")
         ada.declare_queryable("hello/ada", lambda _: hello("ada"))
         guest.declare_queryable("hello/guest", lambda _: hello("guest"))
         answers: dict = {}
 
-        def all_answered():
+        def all_replied():
             for key in ("hello/ada", "clock", "snap/0/0"):
                 guest.query(key, messages.encode_time(1.0))
             ada.query("hello/guest")
@@ -197,12 +205,12 @@ def test_actors_meet_join_state_facts_and_know_who_listens(server, certs):
             answers.update({answer.key: answer.payload for answer in [*guest.replies(), *ada.replies()]})
             return len(answers) == 4
 
-        wait(all_answered, "four answers")
-        assert messages.decode_records(answers["snap/0/0"]) == [fact]
+        wait(all_replied, "four answers")
+        assert messages.decode_records(answers["snap/0/0"]) == [record]
         assert messages.decode_hello(answers["hello/guest"]).name == "guest"
 
 
-def test_nobody_says_that_another_is_there_or_answers_for_him(server, certs):
+def test_liveliness_and_replies_of_another_name_are_blocked(server, certs):
     with session("ada", server, certs) as ada, bus("bob", server, certs) as bob:
         forged = ada.liveliness().declare_token("vs/1/vineyard/live/carl/1")
         served = ada.declare_queryable("vs/1/vineyard/hello/carl", lambda query: query.reply(str(query.key_expr), b"x"))
@@ -220,7 +228,7 @@ def test_nobody_says_that_another_is_there_or_answers_for_him(server, certs):
             each.undeclare()
 
 
-def test_over_quic_poses_are_datagrams_and_events_a_stream(server, certs):
+def test_over_quic_poses_use_datagrams_and_events_a_stream(server, certs):
     port = server.endpoint.rpartition(":")[2]
     with (
         ZenohBus("ada", connect=f"quic/127.0.0.1:{port}", certificates=certs) as ada,
@@ -233,20 +241,20 @@ def test_over_quic_poses_are_datagrams_and_events_a_stream(server, certs):
         bob.subscribe("a/*")
         pose = ada.publisher("a/ada")
         wait(lambda: pose.matching, "bob's subscription")
-        heard: list = []
+        received: list = []
 
         def arrived():
             pose.put(b"pose")
             time.sleep(0.01)
-            heard.extend(bob.poll())
-            return heard
+            received.extend(bob.poll())
+            return received
 
         wait(arrived, "a pose")
-        assert heard[0] == ("a/ada", b"pose")
+        assert received[0] == ("a/ada", b"pose")
 
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])
-def test_linked_servers_know_each_other_and_each_its_own_actors(certs, protocol):
+def test_linked_servers_check_names_of_their_own_actors(certs, protocol):
     with (
         Server(("tls/127.0.0.1:0", "quic/127.0.0.1:0"), certificates=certs) as hub,
         Server(
@@ -254,33 +262,33 @@ def test_linked_servers_know_each_other_and_each_its_own_actors(certs, protocol)
         ) as relay,
         bus("ada", relay, certs) as ada,
         bus("bob", hub, certs) as bob,
-        session("ada", relay, certs) as thief,
+        session("ada", relay, certs) as impostor,
     ):
         wait(lambda: ada.alive() == bob.alive() == {"ada", "bob"}, "both to see each other")
 
-        def let_in():
+        def admitted():
             try:
                 ada.join(hello("ada"))
-            except JoinRejected:  # not yet linked well enough to ask
+            except JoinRejected:  # the link between the servers is not ready
                 return False
             return True
 
-        wait(let_in, "the server that keeps to answer over the one that carries")
+        wait(admitted, "the hub to reply over the relay")
         bob.subscribe("own/0/0/*", KEEP_ALL)
         event = ada.publisher("own/0/0/ada", reliable=True)
-        wait(lambda: event.matching, "bob's ear")
-        thief.put("vs/1/vineyard/own/0/0/bob", b"stolen", congestion_control=zenoh.CongestionControl.BLOCK)
-        list(thief.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
+        wait(lambda: event.matching, "bob's subscription")
+        impostor.put("vs/1/vineyard/own/0/0/bob", b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
+        list(impostor.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
         event.put(b"event")
-        heard: list = []
-        wait(lambda: heard.extend(bob.poll()) or heard, "the event")
-        assert heard == [("own/0/0/ada", b"event")]
+        received: list = []
+        wait(lambda: received.extend(bob.poll()) or received, "the event")
+        assert received == [("own/0/0/ada", b"event")]
 
 
-# ---------------------------------------------------------------- the folder
+# ---------------------------------------------------------------- folder of certificates
 
 
-def test_keys_are_private_and_roles_are_read(tmp_path):
+def test_key_files_are_private_and_roles_are_read(tmp_path):
     written = create(tmp_path / "pki", "guest", Role.SPECTATOR)
     assert [path.name for path in written] == [
         "ca.key", "ca.pem", "server.key", "server.pem", "guest.key", "guest.pem",
@@ -295,7 +303,7 @@ def test_keys_are_private_and_roles_are_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "role", "hosts", "words"),
+    ("name", "role", "hosts", "reason"),
     [
         ("a/b", Role.ROBOT, [], "letters, digits"),
         ("ca", Role.ROBOT, [], "not 'ca'"),
@@ -304,13 +312,13 @@ def test_keys_are_private_and_roles_are_read(tmp_path):
         ("ada", Role.ROBOT, ["host"], "only the server's certificate names hosts"),
     ],
 )
-def test_what_cannot_be_meant_is_refused_and_nothing_is_made(tmp_path, name, role, hosts, words):
-    with pytest.raises(ValueError, match=words):
+def test_an_invalid_certificate_request_is_refused_without_files(tmp_path, name, role, hosts, reason):
+    with pytest.raises(ValueError, match=reason):
         create(tmp_path / "pki", name, role, hosts)
     assert not (tmp_path / "pki").exists()
 
 
-def test_what_is_wrong_in_the_folder_is_one_line_with_a_remedy(tmp_path, certs):
+def test_errors_in_the_folder_are_one_line_with_a_remedy(tmp_path, certs):
     with pytest.raises(CertificateError, match="vinesim certs new server"):
         Server("tls/127.0.0.1:0", certificates=tmp_path)
     create(tmp_path, "ada")

@@ -1,4 +1,4 @@
-"""Laws of ownership: a total order, so every order, repetition and delay ends with one owner everywhere."""
+"""Laws of ownership: claims have a total order, so any order, repetition and delay ends with one owner."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vinesim.net.replication.authority import NOBODY, SEQUENCE_COUNT, UNTOUCHED,
 sequence = st.integers(0, SEQUENCE_COUNT - 1)
 name = st.sampled_from([NOBODY, "ada", "bob", "cleo"])
 claims = st.builds(Claim, sequence, sequence, name)
-# claims whose sequences lie within less than half of the circle of each other, somewhere on it: also across the wrap
+# claims whose sequence numbers differ by less than half of their range, anywhere in it: also across the wrap
 close = st.builds(
     lambda start, steps: [
         Claim((start + o) % SEQUENCE_COUNT, (start + a) % SEQUENCE_COUNT, owner) for o, a, owner in steps
@@ -24,8 +24,8 @@ close = st.builds(
 )
 
 
-def hold(heard: list[Claim], held: Claim) -> Claim:
-    for claim in heard:
+def winner(received: list[Claim], held: Claim) -> Claim:
+    for claim in received:
         held = claim if authority.wins(claim, held) else held
     return held
 
@@ -36,31 +36,31 @@ def test_of_two_claims_exactly_one_wins(a, b):
 
 
 @given(close)
-def test_winning_is_transitive(several):
-    for a, b, c in itertools.permutations(several, 3):
+def test_winning_is_transitive(many):
+    for a, b, c in itertools.permutations(many, 3):
         if authority.wins(a, b) and authority.wins(b, c):
             assert authority.wins(a, c)
 
 
 @given(close, st.data())
-def test_any_order_and_any_repetition_end_with_the_same_owner(several, data):
-    first, rest = several[0], several[1:]
+def test_any_order_and_any_repetition_end_with_the_same_owner(many, data):
+    first, rest = many[0], many[1:]
     shuffled = data.draw(st.permutations(rest))
-    repeated = shuffled + data.draw(st.lists(st.sampled_from(several), max_size=6))
-    assert hold(rest, first) == hold(repeated, first)
+    repeated = shuffled + data.draw(st.lists(st.sampled_from(many), max_size=6))
+    assert winner(rest, first) == winner(repeated, first)
 
 
 @given(close, st.data())
-def test_who_missed_something_agrees_after_hearing_one_holder(several, data):
+def test_a_client_that_lost_messages_agrees_after_receiving_the_winning_claim(many, data):
     """Loss, then resync: any part is lost, and the greatest claim arrives later."""
-    first, rest = several[0], several[1:]
-    heard = [claim for claim in rest if data.draw(st.booleans())]
-    everything = hold(rest, first)
-    assert hold([everything], hold(heard, first)) == everything
+    first, rest = many[0], many[1:]
+    received = [claim for claim in rest if data.draw(st.booleans())]
+    everything = winner(rest, first)
+    assert winner([everything], winner(received, first)) == everything
 
 
 @given(sequence, st.integers(1, SEQUENCE_COUNT // 2 - 1))
-def test_sequences_wrap(start, steps):
+def test_sequence_numbers_wrap(start, steps):
     later = (start + steps) % SEQUENCE_COUNT
     assert authority.is_newer(later, start)
     assert not authority.is_newer(start, later)
@@ -75,31 +75,31 @@ def test_ownership_before_authority_before_name():
 
 
 @given(claims, st.sampled_from(["ada", "bob"]))
-def test_a_touch_wins_over_what_was_held_and_rest_over_the_touch(held, me):
-    touch = authority.claim_by_touch(held, me, owner_touches=False)
-    assert touch.owner == me
+def test_a_touch_wins_over_the_held_claim_and_a_release_over_the_touch(held, name_):
+    touch = authority.claim_by_touch(held, name_, owner_touches=False)
+    assert touch.owner == name_
     assert touch == held or authority.wins(touch, held)
-    assert authority.wins(authority.claim_by_grab(held, me), held)
+    assert authority.wins(authority.claim_by_grab(held, name_), held)
     rest = authority.release(touch)
     assert rest.owner == NOBODY
     assert authority.wins(rest, touch)
     assert authority.wins(authority.claim_by_touch(rest, "zoe", owner_touches=True), rest)
 
 
-def test_who_presses_the_same_cane_does_not_take_it_back():
+def test_a_touch_does_not_take_a_tree_from_an_owner_that_touches_it():
     held = authority.claim_by_touch(UNTOUCHED, "bob", owner_touches=False)
     assert authority.claim_by_touch(held, "ada", owner_touches=True) == held
     assert authority.claim_by_touch(held, "ada", owner_touches=False) == Claim(0, 2, "ada")
 
 
 @given(claims, claims)
-def test_outdated_is_an_older_sequence_not_a_mere_tie(a, b):
+def test_a_tie_of_sequence_numbers_is_not_outdated(a, b):
     if authority.is_outdated(a, b):
         assert authority.wins(b, a)
     assert not authority.is_outdated(a, Claim(a.ownership, a.authority, "zoe"))
 
 
-def test_the_nearest_takes_over_then_the_lowest_name():
+def test_the_successor_is_the_nearest_then_the_lowest_name():
     where = {"zoe": np.array([1.0, 0, 0]), "bob": np.array([0, 2.0, 0]), "ada": np.array([0, -2.0, 9.0])}
     assert authority.choose_successor(np.zeros(3), where) == "zoe"
     del where["zoe"]

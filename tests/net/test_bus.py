@@ -1,4 +1,4 @@
-"""The bus in memory: what a network may and may not do, by an explicit clock."""
+"""The bus in memory: delivery, order, delay and loss, by an explicit clock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_patterns(pattern, key, covers):
 @given(
     st.lists(st.tuples(st.sampled_from([("a", KEEP_LAST_1), ("b", 3), ("e", KEEP_ALL)]), st.integers()), max_size=60)
 )
-def test_a_store_keeps_the_newest_of_each_key_in_order(samples):
+def test_a_sample_store_keeps_the_newest_of_each_key_in_order(samples):
     store = SampleStore()
     for number, ((key, depth), _) in enumerate(samples):
         store.put(depth, key, number)
@@ -42,7 +42,7 @@ def test_a_store_keeps_the_newest_of_each_key_in_order(samples):
     assert store.take() == []
 
 
-def test_a_flood_is_bounded_and_counted():
+def test_samples_beyond_the_depth_are_dropped_and_counted():
     store = SampleStore()
     for number in range(KEEP_ALL + 5):
         store.put(KEEP_ALL, "e", number)
@@ -50,7 +50,7 @@ def test_a_flood_is_bounded_and_counted():
     assert store.overflowed == 5
 
 
-def test_without_a_listener_nothing_leaves_and_nothing_is_counted():
+def test_without_a_subscriber_nothing_is_sent_or_counted():
     hub = MemoryHub()
     ada, bob = hub.bus("ada"), hub.bus("bob")
     publisher = ada.publisher("c/0/0/ada")
@@ -72,7 +72,7 @@ def test_a_publisher_needs_an_exact_key():
         MemoryHub().bus("ada").publisher("c/0/*/ada")
 
 
-def test_reliable_samples_arrive_all_and_in_order_whatever_the_network():
+def test_reliable_samples_all_arrive_in_order_despite_loss():
     hub = MemoryHub(delay=0.05, jitter=0.05, loss=0.5, seed=3)
     ada, bob = hub.bus("ada"), hub.bus("bob")
     bob.subscribe("own/**", KEEP_ALL)
@@ -83,24 +83,24 @@ def test_reliable_samples_arrive_all_and_in_order_whatever_the_network():
         stream.put(bytes([number]))
         hub.advance(0.001)
     hub.advance(1.0)
-    heard = bob.poll()
-    assert [p[0] for k, p in heard if k == "own/x"] == list(range(60))
-    unreliable = [p[0] for k, p in heard if k == "c/x"]
+    received = bob.poll()
+    assert [p[0] for k, p in received if k == "own/x"] == list(range(60))
+    unreliable = [p[0] for k, p in received if k == "c/x"]
     assert 15 < len(unreliable) < 45
     assert unreliable != sorted(unreliable)
 
 
-def test_the_same_seed_is_the_same_network():
+def test_the_same_seed_gives_the_same_network():
     def run() -> list:
         hub = MemoryHub(delay=0.02, jitter=0.02, loss=0.3, seed=11)
         ada, bob = hub.bus("ada"), hub.bus("bob")
         bob.subscribe("**", KEEP_ALL)
-        publisher, heard = ada.publisher("x"), []
+        publisher, received = ada.publisher("x"), []
         for number in range(100):
             publisher.put(bytes([number]))
             hub.advance(0.004)
-            heard.append(bob.poll())
-        return heard
+            received.append(bob.poll())
+        return received
 
     assert run() == run()
 
@@ -116,12 +116,12 @@ def test_nothing_arrives_before_its_time():
     assert bob.poll() == [("x", b"1")]
 
 
-def test_questions_are_answered_with_their_age():
+def test_replies_have_their_age():
     hub = MemoryHub(delay=0.01)
     ada, bob = hub.bus("ada"), hub.bus("bob")
-    bob.declare_queryable("hello/bob", lambda question: question + b"!")
+    bob.declare_queryable("hello/bob", lambda query: query + b"!")
     ada.query("hello/*", b"hi")
-    ada.query("nobody", b"hi")
+    ada.query("unknown", b"hi")
     hub.advance(0.015)
     assert ada.replies() == []
     hub.advance(0.035)
@@ -130,7 +130,7 @@ def test_questions_are_answered_with_their_age():
     assert answer.age == pytest.approx(0.03)
 
 
-def test_names_are_live_once():
+def test_a_name_is_live_once():
     hub = MemoryHub(delay=0.1)
     with hub.bus("ada") as ada:
         with pytest.raises(NameTaken, match="'ada' is already live"):
@@ -146,7 +146,7 @@ def test_names_are_live_once():
     hub.bus("ada").close()
 
 
-def test_a_hub_that_is_down_says_so_and_comes_back():
+def test_a_hub_that_is_down_is_reported_and_recovers():
     hub = MemoryHub()
     ada, bob = hub.bus("ada"), hub.bus("bob")
     bob.subscribe("x")
@@ -162,6 +162,6 @@ def test_a_hub_that_is_down_says_so_and_comes_back():
     assert ada.status_message == ""
 
 
-def test_impossible_networks_are_refused():
+def test_invalid_network_parameters_are_refused():
     with pytest.raises(ValueError, match="loss"):
         MemoryHub(loss=1.5)

@@ -1,4 +1,4 @@
-"""Endpoints in words, and which two ways lead to a server."""
+"""Parsing of endpoints, and the two links to a server."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vinesim.net.transport.endpoints import Endpoint, client_links, default_list
 
 
 @pytest.mark.parametrize(
-    ("text", "secured", "words"),
+    ("text", "secured", "reason"),
     [
         ("", False, "expected tcp/HOST:PORT or udp/HOST:PORT"),
         ("192.168.1.5:7447", False, "expected tcp/"),
@@ -24,14 +24,14 @@ from vinesim.net.transport.endpoints import Endpoint, client_links, default_list
         ("udp/host:7447", True, "expected tls/HOST:PORT or quic/HOST:PORT"),
     ],
 )
-def test_what_is_no_endpoint_is_refused_with_what_would_be_one(text, secured, words):
-    with pytest.raises(ValueError, match=words) as caught:
+def test_an_invalid_endpoint_is_refused_with_the_expected_form(text, secured, reason):
+    with pytest.raises(ValueError, match=reason) as caught:
         parse(text, secured=secured)
     assert repr(text) in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_an_endpoint_is_taken_apart_and_put_together():
+def test_an_endpoint_is_parsed_and_formatted():
     assert parse("tcp/[::1]:7447") == Endpoint("tcp", "[::1]", 7447)
     for text in ("tcp/host:1", "udp/10.0.0.1:7447"):
         assert str(parse(text)) == text
@@ -52,12 +52,12 @@ def test_an_endpoint_is_taken_apart_and_put_together():
         ("quic/localhost:7447", True, "tls/localhost:7447", "quic/localhost:7447"),
     ],
 )
-def test_datagrams_where_they_pay_or_are_asked_for(connect, secured, bulk, live):
-    way = client_links(connect, secured=secured)
-    assert (str(way.bulk), str(way.live)) == (bulk, live)
+def test_datagrams_are_used_beyond_loopback_or_on_request(connect, secured, bulk, live):
+    links = client_links(connect, secured=secured)
+    assert (str(links.bulk), str(links.live)) == (bulk, live)
 
 
-def test_port_0_is_one_free_number_for_both_ways():
+def test_port_0_is_one_free_number_for_both_protocols():
     stream, datagrams = resolve_ports(["tcp/127.0.0.1:0", "udp/127.0.0.1:0"])
     assert stream.port == datagrams.port > 1023
     assert resolve_ports(["tcp/127.0.0.1:7"]) == (Endpoint("tcp", "127.0.0.1", 7),)
@@ -65,6 +65,6 @@ def test_port_0_is_one_free_number_for_both_ways():
         resolve_ports([])
 
 
-def test_a_server_listens_both_ways_unless_told_otherwise():
+def test_a_server_listens_on_both_protocols_by_default():
     assert [str(one) for one in resolve_ports(default_listen())] == ["tcp/0.0.0.0:7447", "udp/0.0.0.0:7447"]
     assert [one.protocol for one in resolve_ports(default_listen(secured=True), secured=True)] == ["tls", "quic"]

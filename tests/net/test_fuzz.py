@@ -1,4 +1,4 @@
-"""Broken messages: nothing stops, everything is counted, and afterwards all agree as before."""
+"""Malformed messages: nothing stops, all are counted, and afterwards all clients agree as before."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from tests.support.live_server import Served, wait
+from tests.support.live_server import ServerProcess, wait
 from vinesim.bench import message_fuzz
 from vinesim.bench.message_fuzz import ATTACKER, storm
 from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, tree_row
@@ -24,11 +24,13 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
 
-def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
+def test_a_flood_of_malformed_messages_is_counted_logged_once_and_leaves_all_in_agreement(caplog):
     """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
     ada, bob, _, arrived = message_fuzz.run_storm(3_000, seed=11)
-    said = [record.message for record in caplog.records if ATTACKER in record.message and "dropped" in record.message]
-    assert len(said) == 2, "once by each of the two who hear it"
+    log_lines = [
+        record.message for record in caplog.records if ATTACKER in record.message and "dropped" in record.message
+    ]
+    assert len(log_lines) == 2, "once by each of the two receivers"
     counters = ada.replicator.counters
     assert arrived > 1_500
     assert counters.malformed > 0.3 * arrived
@@ -41,8 +43,8 @@ def test_a_storm_is_counted_and_said_once_and_afterwards_all_agree(caplog):
     assert bob.heard[2] > 0.0
 
 
-def test_one_record_from_the_far_future_does_not_silence_its_author_for_ever():
-    """Found by the storm: a time of 1e300 made every later record of that tree, or pose of that actor, an old one."""
+def test_a_message_from_the_far_future_does_not_block_its_sender():
+    """A time of 1e300 once made every later update of that tree or pose of that actor outdated."""
     hub = MemoryHub()
     model = tree_row()
     ada, bob = (FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0)))
@@ -56,14 +58,14 @@ def test_one_record_from_the_far_future_does_not_silence_its_author_for_ever():
     run(0.5)
     ada.touching = {0}
     run(0.5)
-    far = ada.replicator.bus
+    bus = ada.replicator.bus
     pose = ada.pose(hub.time)
-    far.publisher("a/ada").put(messages.encode_robot(type(pose)(**_fields(pose) | {"time": 1e300})))
+    bus.publisher("a/ada").put(messages.encode_robot(type(pose)(**_fields(pose) | {"time": 1e300})))
     q, qd = ada.read(0)
     claim = ada.replicator.claim(0)
-    one = np.array([0]), np.array([claim.ownership]), np.array([claim.authority]), np.array([messages.TOUCHED])
-    poison = messages.TreeStates(1e300, *one, np.array([len(q)]), q, qd)
-    far.publisher("c/0/0/ada").put(messages.encode_trees(poison)[0][0])
+    header = np.array([0]), np.array([claim.ownership]), np.array([claim.authority]), np.array([messages.TOUCHED])
+    invalid = messages.TreeStates(1e300, *header, np.array([len(q)]), q, qd)
+    bus.publisher("c/0/0/ada").put(messages.encode_trees(invalid)[0][0])
     hub.advance(0.01)
     bob.tick(hub.time)
     ada.place[0] = 1.5
@@ -78,8 +80,8 @@ def _fields(value: object) -> dict:
     return {name: getattr(value, name) for name in value.__slots__}  # type: ignore[attr-defined]
 
 
-def test_a_client_with_its_physics_lives_through_a_storm():
-    """What passes every check may still be nonsense: trees turned inside out, boxes in the sky. Nothing infinite."""
+def test_a_client_with_physics_survives_malformed_messages():
+    """Valid messages may still be absurd (trees turned inside out, boxes in the sky): the state stays finite."""
     scene = load_scene("demo")
     model = generate(scene)
     hub = MemoryHub()
@@ -88,7 +90,7 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     client = Client(
         scene, model, load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
     )  # fmt: skip
-    evil = FakeClient(hub.bus(ATTACKER), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
+    attacker = FakeClient(hub.bus(ATTACKER), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
 
     def tick() -> None:
         hub.advance(0.01)
@@ -97,15 +99,15 @@ def test_a_client_with_its_physics_lives_through_a_storm():
 
     for _ in range(60):
         tick()
-        evil.tick(now[0])
+        attacker.tick(now[0])
     assert ATTACKER in client.replicator.peers
-    wild = storm(model, evil, 3, now[0])
+    malformed = storm(model, attacker, 3, now[0])
     publishers: dict = {}
     for _ in range(60):
-        for key, payload in itertools.islice(wild, 20):
-            publishers.setdefault(key, evil.bus.publisher(key, reliable=True)).put(payload)
+        for key, payload in itertools.islice(malformed, 20):
+            publishers.setdefault(key, attacker.bus.publisher(key, reliable=True)).put(payload)
         tick()
-    evil.bus.close()
+    attacker.bus.close()
     for _ in range(40):
         tick()
     state = client.physics.state
@@ -117,40 +119,43 @@ def test_a_client_with_its_physics_lives_through_a_storm():
     assert client.replicator.peers == {}
 
 
-def test_real_sessions_and_the_server_live_through_a_storm():
+def test_zenoh_sessions_and_the_server_survive_malformed_messages():
     with (
-        Served("tcp/127.0.0.1:0") as server,
+        ServerProcess("tcp/127.0.0.1:0") as server,
         FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada,
     ):
         model = tree_row()
         with ZenohBus(ATTACKER, connect=server.endpoint) as bus:
-            evil = FakeClient(bus, model, (2.0, 0.0))
+            attacker = FakeClient(bus, model, (2.0, 0.0))
 
-            def met() -> bool:
-                evil.tick(time.monotonic())
-                return ATTACKER in ada.command()["others"] and "ada" in evil.robots
+            def joined() -> bool:
+                attacker.tick(time.monotonic())
+                return ATTACKER in ada.command()["others"] and "ada" in attacker.robots
 
-            wait(met, "the two to meet")
+            wait(joined, "the two to join")
             before, ticks = ada.command()["counters"], ada.command()["ticks"]
             publishers: dict = {}
-            for number, (key, payload) in enumerate(itertools.islice(storm(model, evil, 7), 1_500)):
+            for number, (key, payload) in enumerate(itertools.islice(storm(model, attacker, 7), 1_500)):
                 publisher = publishers.get(key) or publishers.setdefault(key, bus.publisher(key, reliable=True))
                 publisher.put(payload)
                 if number % 20 == 0:
                     bus.query("clock", payload)
                     time.sleep(0.005)
-            wait(lambda: ada.command()["counters"]["malformed"] > before["malformed"] + 100, "the broken ones to count")
+            wait(
+                lambda: ada.command()["counters"]["malformed"] > before["malformed"] + 100,
+                "the malformed ones to be counted",
+            )
             assert ada.command()["ticks"] > ticks
-        wait(lambda: ATTACKER in ada.command()["left_at"], "the storm to be over")
+        wait(lambda: ATTACKER in ada.command()["left_at"], "the attacker to leave")
         with FakeClientProcess(server.endpoint, [{"name": "bob", "place": [2.0, 0.0]}]) as bob:
-            wait(lambda: "ada" in bob.command()["poses"], "another to be let in as ever")
+            wait(lambda: "ada" in bob.command()["poses"], "another client to be admitted")
             ada.command(touch=[3])
-            wait(lambda: bob.command()["owner"].get("3") == "ada", "the stream to go on")
+            wait(lambda: bob.command()["owner"].get("3") == "ada", "the stream to continue")
         assert server.process.poll() is None
 
 
-def test_noise_that_speaks_no_protocol_does_not_stop_the_server():
-    """What a port scanner or a web browser says."""
+def test_bytes_of_other_protocols_do_not_stop_the_server():
+    """Bytes of a port scanner or a web browser."""
     code = """
 import os, socket, sys
 for say in (b"GET / HTTP/1.1\\r\\n\\r\\n", os.urandom(4000), b"", b"\\xff" * 70000):
@@ -160,7 +165,7 @@ for say in (b"GET / HTTP/1.1\\r\\n\\r\\n", os.urandom(4000), b"", b"\\xff" * 700
         except OSError:
             pass
 """
-    with Served("tcp/127.0.0.1:0") as server:
+    with ServerProcess("tcp/127.0.0.1:0") as server:
         host, port = server.endpoint.removeprefix("tcp/").split(":")
         subprocess.run([sys.executable, "-c", code, host, port], check=True, timeout=300)
         with FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:

@@ -1,4 +1,4 @@
-"""Pushes between clients: said while somebody touches, believed for a tenth of a second, and silence otherwise."""
+"""Wrenches between clients: sent during contact, valid for a tenth of a second, and no traffic otherwise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TICK = 0.01
 
 
 class Pair:
-    """A person who touches a robot."""
+    """A human and a robot of two clients."""
 
     def __init__(self, delay: float = 0.02) -> None:
         self.hub = MemoryHub(delay=delay)
@@ -31,39 +31,41 @@ class Pair:
         return self.robot.net_wrenches(now)
 
 
-def test_a_touch_is_told_sixty_times_a_second_and_its_end_once():
+def test_a_contact_wrench_is_sent_at_60_hz_and_its_end_once():
     pair = Pair()
     for _ in range(100):
         assert pair.tick() == {}
     assert pair.person_bus.bytes_out == 0
     for _ in range(100):
-        felt = pair.tick({"arm": PUSH})
-    np.testing.assert_allclose(felt["arm"], PUSH, rtol=1e-6)
+        received = pair.tick({"arm": PUSH})
+    np.testing.assert_allclose(received["arm"], PUSH, rtol=1e-6)
     assert len(pair.left) == pytest.approx(60, abs=2)
     before = len(pair.left)
     for _ in range(10):
-        felt = pair.tick()
-    assert felt == {}
-    assert len(pair.left) == before + 1 or len(pair.left) == before + 2  # what the last ticks still felt, and the end
-    told = pair.person_bus.bytes_out
+        received = pair.tick()
+    assert received == {}
+    assert (
+        len(pair.left) == before + 1 or len(pair.left) == before + 2
+    )  # the mean of the last ticks in contact, and the end
+    sent = pair.person_bus.bytes_out
     for _ in range(100):
         pair.tick()
-    assert pair.person_bus.bytes_out == told, "silence"
+    assert pair.person_bus.bytes_out == sent, "no traffic without contact"
 
 
-def test_the_impulse_arrives_whole():
-    """Messages hold means: a push that changes every tick gives the robot the same impulse."""
-    pair, given, felt = Pair(), 0.0, 0.0
+def test_the_received_impulse_equals_the_applied_one():
+    """Messages hold mean wrenches: a force that changes every tick gives the robot the same impulse."""
+    pair, applied, received = Pair(), 0.0, 0.0
     rng = np.random.default_rng(1)
     for tick in range(600):
         force = float(rng.uniform(0.0, 100.0)) if tick < 500 else 0.0
-        given += force
-        arrived = pair.tick({"arm": np.array([force, 0, 0, 0, 0, 0.0])} if force else None)
-        felt += float(arrived["arm"][0]) if arrived else 0.0
-    assert felt == pytest.approx(given, rel=0.03)
+        applied += force
+        net = pair.tick({"arm": np.array([force, 0, 0, 0, 0, 0.0])} if force else None)
+        received += float(net["arm"][0]) if net else 0.0
+    assert received == pytest.approx(applied, rel=0.03)
 
 
-def test_who_falls_silent_pushes_no_more():
+def test_a_wrench_expires_when_its_sender_disconnects():
     pair = Pair()
     for _ in range(20):
         pair.tick({"arm": PUSH})
@@ -79,16 +81,16 @@ def test_who_falls_silent_pushes_no_more():
     assert stale * TICK <= MAX_AGE + 0.04
 
 
-def test_two_people_add_up_and_an_old_message_counts_for_nothing():
+def test_wrenches_of_two_humans_add_up_and_repeated_messages_are_ignored():
     pair = Pair()
     other = WrenchSync(pair.hub.bus("ida"), "ida")
     first = other.publish({"anna": {"arm": PUSH, "base": PUSH}}, 0.0, 5.0)
-    assert first, "somebody listens"
+    assert first, "the robot subscribes"
     pair.robot.receive(first[0], "ida", 0.0)
     pair.robot.receive(first[0], "eva", 0.0)
     assert not pair.robot.receive(first[0], "eva", 0.0)
-    felt = pair.robot.net_wrenches(0.0)
-    np.testing.assert_allclose(felt["arm"], 2.0 * PUSH, rtol=1e-6)
-    assert set(felt) == {"arm", "base"}
+    received = pair.robot.net_wrenches(0.0)
+    np.testing.assert_allclose(received["arm"], 2.0 * PUSH, rtol=1e-6)
+    assert set(received) == {"arm", "base"}
     pair.robot.remove_peer("ida")
     np.testing.assert_allclose(pair.robot.net_wrenches(0.0)["base"], PUSH, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""What crosses the network of people: to the byte, to the last step, and nothing that cannot be."""
+"""Messages of human poses and wrenches: size, quantisation, and refusal of invalid values."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from vinesim.scene.values import HumanUpdate, RobotUpdate
 HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.from_yaw(2.0))
 
 
-def somebody(seed: int = 0) -> HumanUpdate:
+def random_human(seed: int = 0) -> HumanUpdate:
     rng = np.random.default_rng(seed)
     pose = standing_pose(HERE, 1.8)
     points = pose.points
@@ -37,99 +37,99 @@ def somebody(seed: int = 0) -> HumanUpdate:
     return HumanUpdate("eva", 12.5, pose, rng.normal(size=(7, 6)))
 
 
-def same_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def rotation_cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs((a * b).sum(-1))
 
 
-def test_a_person_is_root_three_inputs_hips_and_feet_in_161_bytes():
-    """F88: the four poses that say where a person is, and F89's hips and feet."""
-    told = somebody()
-    payload = encode_pose(told)
+def test_a_human_pose_is_root_three_inputs_hips_and_feet_in_161_bytes():
+    """F88: root, head and two hands; F89: hips and feet."""
+    sent = random_human()
+    payload = encode_pose(sent)
     assert len(payload) == 161
-    heard = decode_pose(payload, "eva")
-    assert isinstance(heard, HumanUpdate)
-    assert (heard.actor, heard.time) == ("eva", 12.5)
+    received = decode_pose(payload, "eva")
+    assert isinstance(received, HumanUpdate)
+    assert (received.actor, received.time) == ("eva", 12.5)
     for name in ("root", "head", "left", "right", "hips", "left_foot", "right_foot"):
-        one, other = getattr(told.pose, name), getattr(heard.pose, name)
+        one, other = getattr(sent.pose, name), getattr(received.pose, name)
         np.testing.assert_allclose(other[:3], one[:3], atol=1.01e-4)
-        assert same_turn(one[3:], other[3:]) > np.cos(0.5 * np.radians(0.006))
-    fastest = np.abs(told.velocity.reshape(7, 2, 3)).max(axis=(0, 2))
-    wrong = np.abs(heard.velocity - told.velocity).reshape(7, 2, 3).max(axis=(0, 2))
-    assert (wrong < fastest / 127).all()
-    assert (heard.pose.left_closed, heard.pose.right_closed) == (True, False)
-    assert (heard.pose.left_busy, heard.pose.right_busy) == (False, True)
-    np.testing.assert_allclose(heard.pose.right_fingers, told.pose.right_fingers, atol=0.5 / 255 + 1e-9)
-    assert heard.pose.left_fingers == (0.0,) * 5
+        assert rotation_cosine(one[3:], other[3:]) > np.cos(0.5 * np.radians(0.006))
+    fastest = np.abs(sent.velocity.reshape(7, 2, 3)).max(axis=(0, 2))
+    error = np.abs(received.velocity - sent.velocity).reshape(7, 2, 3).max(axis=(0, 2))
+    assert (error < fastest / 127).all()
+    assert (received.pose.left_closed, received.pose.right_closed) == (True, False)
+    assert (received.pose.left_busy, received.pose.right_busy) == (False, True)
+    np.testing.assert_allclose(received.pose.right_fingers, sent.pose.right_fingers, atol=0.5 / 255 + 1e-9)
+    assert received.pose.left_fingers == (0.0,) * 5
 
 
 @given(st.integers(0, 1 << 32))
 @settings(max_examples=30, deadline=None)
-def test_what_copies_hold_is_what_they_would_be_told_again(seed):
-    once = quantise_pose(somebody(seed).pose)
+def test_quantisation_is_idempotent(seed):
+    once = quantise_pose(random_human(seed).pose)
     assert quantise_pose(once).points.tobytes() == once.points.tobytes()
 
 
-def test_robots_go_the_same_way():
+def test_robot_poses_use_the_same_functions():
     update = RobotUpdate("anna", 1.0, HERE, np.zeros(6), np.array([0.1, 0.2]), np.zeros(2))
     assert decode_pose(encode_pose(update), "anna").position == pytest.approx([0.1, 0.2])
 
 
 @pytest.mark.parametrize("point", [0, 3])
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_a_pose_that_cannot_be_does_not_leave(point, wrong):
-    told = somebody()
-    points = told.pose.points
-    points[point, 1] = wrong
+@pytest.mark.parametrize("error", [np.nan, np.inf])
+def test_an_invalid_pose_is_not_encoded(point, error):
+    sent = random_human()
+    points = sent.pose.points
+    points[point, 1] = error
     with pytest.raises(MessageError, match="not finite"):
-        encode_human(dataclasses.replace(told, pose=told.pose.with_points(points)))
+        encode_human(dataclasses.replace(sent, pose=sent.pose.with_points(points)))
     points[point] = 0.0
     with pytest.raises(MessageError, match="unit quaternion"):
-        encode_human(dataclasses.replace(told, pose=told.pose.with_points(points)))
+        encode_human(dataclasses.replace(sent, pose=sent.pose.with_points(points)))
 
 
-def test_messagees_arrive_as_they_left():
+def test_wrenches_are_decoded_as_encoded():
     message = WrenchMessage(
         3.0, {"arm_left_3_link": np.array([1.0, -2.5, 30.0, 0.5, 0.0, -0.25]), "chassis": np.zeros(6)}
     )
     payload = encode_wrenches(message)
     assert len(payload) == 14 + 25 + 15 + 25 + 7
-    heard = decode_wrenches(payload)
-    assert heard.time == 3.0
-    assert heard.wrenches.keys() == message.wrenches.keys()
+    received = decode_wrenches(payload)
+    assert received.time == 3.0
+    assert received.wrenches.keys() == message.wrenches.keys()
     for link, wrench in message.wrenches.items():
-        np.testing.assert_array_equal(heard.wrenches[link], wrench)
+        np.testing.assert_array_equal(received.wrenches[link], wrench)
     assert decode_wrenches(encode_wrenches(WrenchMessage(4.0, {}))).wrenches == {}
     with pytest.raises(MessageError, match="too strong"):
         encode_wrenches(WrenchMessage(0.0, {"arm": np.full(6, 1e4)}))
 
 
-MESSAGES = [encode_human(somebody()), encode_wrenches(WrenchMessage(1.0, {"arm": np.ones(6), "hand": np.ones(6)}))]
+MESSAGES = [encode_human(random_human()), encode_wrenches(WrenchMessage(1.0, {"arm": np.ones(6), "hand": np.ones(6)}))]
 
 
 @pytest.mark.parametrize("payload", MESSAGES)
 @given(data=st.data())
 @settings(max_examples=150, deadline=None)
-def test_whatever_arrives_is_read_or_refused_in_words(payload, data):
-    """Cut off, longer, or with other bytes in it."""
+def test_damaged_messages_are_decoded_or_refused(payload, data):
+    """Truncated, longer, or with changed bytes."""
     damaged = bytearray(payload[: data.draw(st.integers(0, len(payload)))] + data.draw(st.binary(max_size=8)))
     for _ in range(data.draw(st.integers(0, 4))):
         if damaged:
             damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
     for decode in (lambda raw: decode_human(raw, "eva"), decode_wrenches, lambda raw: decode_pose(raw, "eva")):
         try:
-            heard = decode(bytes(damaged))
+            received = decode(bytes(damaged))
         except MessageError:
             continue
-        if isinstance(heard, HumanUpdate):
-            assert np.isfinite(heard.pose.points).all()
-            np.testing.assert_allclose(np.linalg.norm(heard.pose.points[:, 3:], axis=1), 1.0, atol=1e-9)
-            assert np.isfinite(heard.velocity).all()
-        elif isinstance(heard, WrenchMessage):
-            assert all(np.isfinite(wrench).all() for wrench in heard.wrenches.values())
+        if isinstance(received, HumanUpdate):
+            assert np.isfinite(received.pose.points).all()
+            np.testing.assert_allclose(np.linalg.norm(received.pose.points[:, 3:], axis=1), 1.0, atol=1e-9)
+            assert np.isfinite(received.velocity).all()
+        elif isinstance(received, WrenchMessage):
+            assert all(np.isfinite(wrench).all() for wrench in received.wrenches.values())
 
 
 @pytest.mark.parametrize("payload", MESSAGES)
-def test_a_message_that_is_cut_off_is_refused(payload):
+def test_a_truncated_message_is_refused(payload):
     read = (
         decode_wrenches
         if messages.kind_of(payload) == messages.MessageKind.WRENCHES

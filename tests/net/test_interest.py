@@ -1,4 +1,4 @@
-"""Interest: the window always covers what is near, and only what is near counts."""
+"""Interest: the cell window always covers the interest radius, and listeners are counted by distance."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ metres = st.floats(-200, 200)
 points = st.tuples(metres, metres)
 
 
-def test_cells_have_a_name_on_both_sides_of_the_origin():
+def test_cell_indices_on_both_sides_of_the_origin():
     assert interest.cell_of(np.array([0.0, 0.0, 5.0])) == (0, 0)
     assert interest.cell_of(np.array([-0.1, 8.0])) == (-1, 1)
     many = np.array([[0.0, 0.0, 5.0], [-0.1, 8.0, 0.0]])
@@ -21,21 +21,21 @@ def test_cells_have_a_name_on_both_sides_of_the_origin():
 
 
 @given(st.lists(points, min_size=1, max_size=30), points)
-def test_wherever_one_walks_the_window_covers_the_reach(walk, direction):
+def test_the_window_covers_the_interest_radius_on_any_path(walk, direction):
     middle = None
     for here in walk:
         middle = interest.move_window(middle, np.array(here))
-        away = np.array(direction) / max(np.hypot(*direction), 1e-9) * (interest.MAX_INTEREST_RADIUS - 1e-6)
-        assert interest.cell_of(np.array(here) + away) in interest.cell_window(middle)
+        offset = np.array(direction) / max(np.hypot(*direction), 1e-9) * (interest.MAX_INTEREST_RADIUS - 1e-6)
+        assert interest.cell_of(np.array(here) + offset) in interest.cell_window(middle)
 
 
-def test_the_window_does_not_flicker_at_an_edge():
+def test_the_window_has_hysteresis_at_a_cell_edge():
     middle = interest.move_window(None, np.array([5.9, 4.0]))
-    seen = {middle}
+    middles = {middle}
     for k in range(100):
         middle = interest.move_window(middle, np.array([6.0 + 0.9 * (-1) ** k, 4.0]))
-        seen.add(middle)
-    assert seen == {(0, 0)}
+        middles.add(middle)
+    assert middles == {(0, 0)}
     assert interest.move_window(middle, np.array([7.1, 4.0])) == (1, 0)
 
 
@@ -45,20 +45,20 @@ def test_a_window_is_nine_cells():
 
 
 @given(st.lists(points, max_size=6), st.lists(points, max_size=6), st.floats(0.1, 5.0))
-def test_listeners_are_counted_by_the_exact_distance(trees, actors, near):
+def test_listeners_are_counted_by_the_exact_distance(trees, actors, radius):
     tree, actor = (np.array([(*p, 1.0) for p in ps]).reshape(-1, 3) for ps in (trees, actors))
-    expected = [sum((t[0] - a[0]) ** 2 + (t[1] - a[1]) ** 2 <= near * near for a in actor) for t in tree]
-    assert interest.count_listeners(tree, actor, near).tolist() == expected
+    expected = [sum((t[0] - a[0]) ** 2 + (t[1] - a[1]) ** 2 <= radius * radius for a in actor) for t in tree]
+    assert interest.count_listeners(tree, actor, radius).tolist() == expected
 
 
 def test_height_does_not_count():
     assert interest.count_listeners(np.array([[0.0, 0.0, 2.0]]), np.array([[0.0, 4.9, -30.0]]), 5.0).tolist() == [1]
 
 
-@pytest.mark.parametrize("near", [0.0, -1.0, 5.01, float("nan")])
-def test_a_near_that_cells_cannot_cover_is_refused(near):
+@pytest.mark.parametrize("radius", [0.0, -1.0, 5.01, float("nan")])
+def test_a_radius_that_cells_cannot_cover_is_refused(radius):
     with pytest.raises(ValueError, match=r"at most 5\.0 m"):
-        interest.check_radius(near)
+        interest.check_radius(radius)
 
 
 def test_full_rate_has_hysteresis():

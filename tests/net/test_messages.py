@@ -1,4 +1,4 @@
-"""Messages: round trips within their stated error, and nothing but MessageError whatever arrives."""
+"""Messages: round trips within their stated error, and only MessageError for any bytes."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def cut(batch: TreeStates, roots: list[int], rng: np.random.Generator) -> TreeSt
     return dataclasses.replace(batch, roots=np.array(roots), root=np.concatenate(where), root_x=x, root_xd=xd)
 
 
-def things(rng: np.random.Generator, count: int, cell=(0, 0), speed: float = 3.0) -> messages.ObjectStates:
+def objects(rng: np.random.Generator, count: int, cell=(0, 0), speed: float = 3.0) -> messages.ObjectStates:
     kinds = rng.choice([ids.ObjectKind.BUNCH, ids.ObjectKind.BOX], count) * ids.OBJECT_STRIDE
     numbers = np.sort(kinds + rng.choice(10000, count, replace=False))
     at = rng.uniform([0.0, 0.0, -0.5], [6.0, 6.0, 5.5], (count, 3)) + 6.0 * np.array([*cell, 0.0])
@@ -51,7 +51,7 @@ def things(rng: np.random.Generator, count: int, cell=(0, 0), speed: float = 3.0
     )
 
 
-def between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(frames.log(frames.multiply(a, frames.conjugate(b))), axis=-1)
 
 
@@ -61,80 +61,80 @@ def one_message(batch: TreeStates) -> bytes:
 
 
 @pytest.mark.parametrize("joints", [0, 1, 14, 256])
-def test_robot_comes_back_within_quantisation(joints):
+def test_a_robot_pose_is_decoded_within_quantisation(joints):
     sent = robot(np.random.default_rng(joints), joints)
     payload = messages.encode_robot(sent)
-    heard = messages.decode_robot(payload, "tiago")
+    received = messages.decode_robot(payload, "tiago")
     assert len(payload) == 46 + 3 * joints
-    assert (heard.actor, heard.time) == ("tiago", 12.5)
-    np.testing.assert_allclose(heard.base_q[:3], sent.base_q[:3], atol=1e-5)
-    assert between(heard.base_q[3:], sent.base_q[3:]) < np.radians(0.005)
-    np.testing.assert_allclose(heard.base_qd, sent.base_qd, atol=0.5e-3 + 1e-9)
-    np.testing.assert_allclose(heard.position, sent.position, atol=1e-4 + 1e-9)
+    assert (received.actor, received.time) == ("tiago", 12.5)
+    np.testing.assert_allclose(received.base_q[:3], sent.base_q[:3], atol=1e-5)
+    assert angle_between(received.base_q[3:], sent.base_q[3:]) < np.radians(0.005)
+    np.testing.assert_allclose(received.base_qd, sent.base_qd, atol=0.5e-3 + 1e-9)
+    np.testing.assert_allclose(received.position, sent.position, atol=1e-4 + 1e-9)
     fastest = np.abs(sent.velocity).max(initial=0.0)
-    np.testing.assert_allclose(heard.velocity, sent.velocity, atol=0.004 * fastest + 1e-5)
+    np.testing.assert_allclose(received.velocity, sent.velocity, atol=0.004 * fastest + 1e-5)
 
 
-def test_a_wheel_that_has_rolled_far_keeps_its_turns():
+def test_joint_angles_beyond_a_turn_are_decoded():
     sent = robot(np.random.default_rng(3), 5)
     sent.position[[1, 4]] = 6.6, -1234.5678
     payload = messages.encode_robot(sent)
-    heard = messages.decode_robot(payload, "tiago")
+    received = messages.decode_robot(payload, "tiago")
     assert len(payload) == 46 + 3 * 5 + 4 * 2
-    np.testing.assert_allclose(heard.position[[1, 4]], [6.6, -1234.5678], rtol=1e-7)
-    np.testing.assert_allclose(heard.position[[0, 2, 3]], sent.position[[0, 2, 3]], atol=1e-4 + 1e-9)
+    np.testing.assert_allclose(received.position[[1, 4]], [6.6, -1234.5678], rtol=1e-7)
+    np.testing.assert_allclose(received.position[[0, 2, 3]], sent.position[[0, 2, 3]], atol=1e-4 + 1e-9)
     with pytest.raises(MessageError, match="2 wide joints and 4 B"):
         messages.decode_robot(payload[:-4], "tiago")
 
 
-def test_what_was_decoded_encodes_to_the_same_bytes():
+def test_a_decoded_message_encodes_to_the_same_bytes():
     payload = messages.encode_robot(robot(np.random.default_rng(1)))
     assert messages.encode_robot(messages.decode_robot(payload, "tiago")) == payload
 
 
 @pytest.mark.parametrize("rate", [0.0, 1e-3, 5.0, 60.0])
-def test_trees_come_back_within_quantisation(rate):
+def test_trees_are_decoded_within_quantisation(rate):
     sent = trees(np.random.default_rng(7), [5, 1, 12], rate)
     payload = one_message(sent)
-    heard = messages.decode_trees(payload)
-    assert heard.time == sent.time
+    received = messages.decode_trees(payload)
+    assert received.time == sent.time
     for field in ("tree", "ownership", "authority", "flags", "bodies"):
-        np.testing.assert_array_equal(getattr(heard, field), getattr(sent, field))
-    assert between(heard.joint_q, sent.joint_q).max() < np.radians(0.005)
+        np.testing.assert_array_equal(getattr(received, field), getattr(sent, field))
+    assert angle_between(received.joint_q, sent.joint_q).max() < np.radians(0.005)
     for part in (slice(0, 5), slice(5, 6), slice(6, 18)):
         fastest = np.abs(sent.joint_qd[part]).max()
-        assert np.abs(heard.joint_qd[part] - sent.joint_qd[part]).max() <= 0.004 * fastest + 1.3e-3
+        assert np.abs(received.joint_qd[part] - sent.joint_qd[part]).max() <= 0.004 * fastest + 1.3e-3
     assert len(payload) == 14 + 3 * 13 + 18 * 9
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(1, 20), min_size=1, max_size=40))
 @settings(max_examples=60, deadline=None)
-def test_owner_and_copies_agree_to_the_bit_in_messages_of_a_datagram(seed, sizes):
+def test_owner_and_receivers_hold_the_same_bits_and_messages_fit_a_datagram(seed, sizes):
     sent = trees(np.random.default_rng(seed), sizes)
-    payloads, foretold = messages.encode_trees(sent)
+    payloads, quantised = messages.encode_trees(sent)
     parts = [messages.decode_trees(payload) for payload in payloads]
     assert all(len(payload) <= messages.MAX_DATAGRAM for payload in payloads)
     for field in ("tree", "ownership", "authority", "flags", "bodies"):
         np.testing.assert_array_equal(np.concatenate([getattr(part, field) for part in parts]), getattr(sent, field))
     for field in ("joint_q", "joint_qd"):
-        heard = np.concatenate([getattr(part, field) for part in parts])
-        assert heard.tobytes() == getattr(foretold, field).tobytes()
+        received = np.concatenate([getattr(part, field) for part in parts])
+        assert received.tobytes() == getattr(quantised, field).tobytes()
     first = slice(0, sizes[0])
     q, qd = messages.quantise_tree(sent.joint_q[first], sent.joint_qd[first])
-    assert q.tobytes() == foretold.joint_q[first].tobytes()
-    assert qd.tobytes() == foretold.joint_qd[first].tobytes()
+    assert q.tobytes() == quantised.joint_q[first].tobytes()
+    assert qd.tobytes() == quantised.joint_qd[first].tobytes()
 
 
 @given(st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3))
-def test_lean_rotations_are_those_of_frames(vector):
+def test_fast_rotation_functions_equal_those_of_frames(vector):
     v = np.array(vector)
     np.testing.assert_allclose(rotation.quaternion(v), frames.exp(v), atol=1e-12)
     q = frames.exp(v)
     # at half a turn both signs of the axis are right: compare the rotations, not the vectors
-    assert between(frames.exp(rotation.rotation_vector(q)), q) < 1e-6
+    assert angle_between(frames.exp(rotation.rotation_vector(q)), q) < 1e-6
 
 
-def test_one_update_per_tree_with_its_own_joints():
+def test_updates_split_a_batch_by_tree():
     batch = trees(np.random.default_rng(3), [2, 3])
     first, second = batch.updates("ada")
     assert (first.tree, first.owner, len(first.joint_q), len(second.joint_qd)) == (int(batch.tree[0]), "ada", 2, 3)
@@ -142,7 +142,7 @@ def test_one_update_per_tree_with_its_own_joints():
 
 
 @pytest.mark.parametrize(
-    ("change", "word"),
+    ("change", "reason"),
     [
         ({"time": float("nan")}, "finite"),
         ({"base_q": np.array([0, 0, np.nan, 0, 0, 0, 1.0])}, "finite"),
@@ -153,24 +153,24 @@ def test_one_update_per_tree_with_its_own_joints():
         ({"position": np.zeros(300), "velocity": np.zeros(300)}, "at most 256"),
     ],
 )
-def test_what_is_not_sound_is_not_sent(change, word):
+def test_an_invalid_robot_pose_is_not_encoded(change, reason):
     update = dataclasses.replace(robot(np.random.default_rng(0)), **change)
-    with pytest.raises(MessageError, match=word):
+    with pytest.raises(MessageError, match=reason):
         messages.encode_robot(update)
 
 
-def test_trees_that_are_not_sound_are_not_sent():
+def test_invalid_trees_are_not_encoded():
     batch = trees(np.random.default_rng(0), [4, 4])
     poisoned = batch.joint_q.copy()
     poisoned[2, 1] = np.nan
-    for wrong in (
+    for invalid in (
         dataclasses.replace(batch, joint_q=poisoned),
         dataclasses.replace(batch, tree=batch.tree[::-1]),
         dataclasses.replace(batch, bodies=np.array([4, 5])),
         dataclasses.replace(batch, time=float("inf")),
     ):
         with pytest.raises(MessageError):
-            messages.encode_trees(wrong)
+            messages.encode_trees(invalid)
 
 
 @pytest.mark.parametrize("cut", [0, 3, 4, 13, 14, 30, -1])
@@ -185,7 +185,7 @@ def test_truncated_messages_are_refused(cut):
         messages.decode_trees(batch + b"\0")
 
 
-def test_other_versions_kinds_and_programs_are_named():
+def test_errors_name_other_versions_kinds_and_programs():
     payload = messages.encode_robot(robot(np.random.default_rng(0)))
     with pytest.raises(WrongVersion, match=r"version 9.*speaks 1"):
         messages.decode_robot(payload[:2] + b"\x09" + payload[3:], "tiago")
@@ -197,7 +197,7 @@ def test_other_versions_kinds_and_programs_are_named():
         messages.kind_of(bytes(messages.MAX_MESSAGE + 1))
 
 
-def test_records_are_held_against_the_vineyard():
+def test_tree_numbers_and_sizes_are_checked_against_the_scene():
     batch = dataclasses.replace(trees(np.random.default_rng(0), [4, 6]), tree=np.array([1, 2]))
     payload = one_message(batch)
     messages.decode_trees(payload, np.array([9, 4, 6]))
@@ -207,7 +207,7 @@ def test_records_are_held_against_the_vineyard():
         messages.decode_trees(payload, np.array([9, 4, 5]))
 
 
-def test_a_pose_that_is_not_finite_or_turns_too_far_is_refused():
+def test_a_pose_that_is_not_finite_or_rotated_by_more_than_a_half_turn_is_refused():
     payload = bytearray(messages.encode_robot(robot(np.random.default_rng(0))))
     nan = payload.copy()
     nan[14:18] = np.float32(np.nan).tobytes()
@@ -219,7 +219,7 @@ def test_a_pose_that_is_not_finite_or_turns_too_far_is_refused():
         messages.decode_robot(bytes(turned), "tiago")
 
 
-def test_greeting_comes_back_and_strangers_are_refused():
+def test_a_hello_is_decoded_and_invalid_ones_are_refused():
     hello = Hello("robot-1.a", "robot", "tiago", "<robot/>", "tendone", "0123456789abcdef", index=3, joints=14)
     assert messages.decode_hello(messages.encode_hello(hello)) == hello
     for name in ("", "a/b", "a*", "ä", "x" * 49):
@@ -231,20 +231,20 @@ def test_greeting_comes_back_and_strangers_are_refused():
         messages.encode_hello(Hello("a", urdf="x" * messages.MAX_MESSAGE))
 
 
-def test_claims_come_back_and_impossible_ones_are_refused():
+def test_claims_are_decoded_and_invalid_ones_are_refused():
     claims = [(3, Claim(1, 65535, "ada"), True), (4, Claim(0, 7, ""), False)]
     assert messages.decode_claims(messages.encode_claims(claims), (5, 0, 0)) == claims
-    for wrong in (
+    for invalid in (
         (5, Claim(), False),
         (-1, Claim(), False),
         (0, Claim(65536, 0, "a"), False),
         (0, Claim(0, 0, "a/b"), True),
     ):
         with pytest.raises(MessageError):
-            messages.decode_claims(messages.encode_claims([wrong]), (5, 0, 0))
+            messages.decode_claims(messages.encode_claims([invalid]), (5, 0, 0))
 
 
-def test_clock_messages_come_back():
+def test_clock_messages_are_decoded():
     assert messages.decode_time(messages.encode_time(1.5, 2.5)) == (1.5, 2.5)
     with pytest.raises(MessageError, match="finite"):
         messages.decode_time(messages.encode_time(float("nan")))
@@ -263,8 +263,8 @@ DECODERS = (
 )
 
 
-def hold(payload: bytes) -> None:
-    """Every decoder either understands or raises MessageError."""
+def decode_with_all(payload: bytes) -> None:
+    """Every decoder returns a value or raises MessageError."""
     for decode in DECODERS:
         with contextlib.suppress(MessageError):
             decode(payload)
@@ -272,20 +272,20 @@ def hold(payload: bytes) -> None:
 
 @given(st.binary(max_size=200), st.sampled_from([1, 2, 3, 4, 5, 16, 17]), st.booleans())
 @settings(max_examples=1500, deadline=None)
-def test_arbitrary_bytes_raise_nothing_else(tail, kind, framed):
-    hold((b"VS\x01" + bytes([kind]) if framed else b"") + tail)
+def test_arbitrary_bytes_raise_only_message_errors(tail, kind, framed):
+    decode_with_all((b"VS\x01" + bytes([kind]) if framed else b"") + tail)
 
 
 @given(st.data())
 @settings(max_examples=1500, deadline=None)
-def test_damaged_messages_raise_nothing_else(data):
+def test_damaged_messages_raise_only_message_errors(data):
     rng = np.random.default_rng(5)
     sound = [
         messages.encode_robot(robot(rng, 3)),
         one_message(trees(rng, [3, 4])),
         one_message(cut(trees(rng, [3, 4]), [1, 2], rng)),
-        messages.encode_objects(things(rng, 3), (0, 0))[0][0],
-        messages.encode_records([fact(), fact(object=3)]),
+        messages.encode_objects(objects(rng, 3), (0, 0))[0][0],
+        messages.encode_records([record(), record(object=3)]),
         messages.encode_hello(Hello("a", urdf="<robot/>")),
         messages.encode_claims([(1, Claim(1, 2, "a"), True)]),
         messages.encode_time(1.0, 2.0),
@@ -293,33 +293,35 @@ def test_damaged_messages_raise_nothing_else(data):
     payload = bytearray(data.draw(st.sampled_from(sound)))
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
-    hold(bytes(payload[: data.draw(st.integers(0, len(payload)))]) if data.draw(st.booleans()) else bytes(payload))
+    decode_with_all(
+        bytes(payload[: data.draw(st.integers(0, len(payload)))]) if data.draw(st.booleans()) else bytes(payload)
+    )
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 100), st.integers(-9, 9), st.sampled_from([0.0, 1e-3, 0.3, 4.0, 60.0]))
 @settings(max_examples=100, deadline=None)
-def test_things_come_back_within_quantisation(seed, count, where, speed):
-    sent, cell = things(np.random.default_rng(seed), count, (where, -where), speed), (where, -where)
-    payloads, heard = messages.encode_objects(sent, cell)
+def test_objects_are_decoded_within_quantisation(seed, count, where, speed):
+    sent, cell = objects(np.random.default_rng(seed), count, (where, -where), speed), (where, -where)
+    payloads, received = messages.encode_objects(sent, cell)
     assert max(len(payload) for payload in payloads) <= messages.MAX_DATAGRAM
     assert sum(len(payload) - 14 for payload in payloads) == 26 * count
     parts = [messages.decode_objects(payload, cell) for payload in payloads]
     for field in dataclasses.fields(messages.ObjectStates)[1:]:
         decoded = np.concatenate([getattr(part, field.name) for part in parts])
-        assert decoded.tobytes() == getattr(heard, field.name).tobytes(), "owner and copies hold the same bits"
+        assert decoded.tobytes() == getattr(received, field.name).tobytes(), "owner and copies hold the same bits"
         if field.name not in ("pose", "velocity"):
             np.testing.assert_array_equal(decoded, getattr(sent, field.name))
-    assert np.abs(heard.pose[:, :3] - sent.pose[:, :3]).max() <= 0.5e-4 + 1e-9
-    assert between(heard.pose[:, 3:], sent.pose[:, 3:]).max() < np.radians(0.28)
-    np.testing.assert_allclose(np.linalg.norm(heard.pose[:, 3:], axis=1), 1.0, atol=1e-12)
+    assert np.abs(received.pose[:, :3] - sent.pose[:, :3]).max() <= 0.5e-4 + 1e-9
+    assert angle_between(received.pose[:, 3:], sent.pose[:, 3:]).max() < np.radians(0.28)
+    np.testing.assert_allclose(np.linalg.norm(received.pose[:, 3:], axis=1), 1.0, atol=1e-12)
     for part, least in ((slice(0, 3), 2.0**-11), (slice(3, 6), 2.0**-9)):
         fastest = np.abs(sent.velocity[:, part]).max(1)
-        assert (np.abs(heard.velocity - sent.velocity)[:, part].max(1) <= np.maximum(fastest / 126.0, least)).all()
+        assert (np.abs(received.velocity - sent.velocity)[:, part].max(1) <= np.maximum(fastest / 126.0, least)).all()
 
 
 @pytest.mark.parametrize("number", [5, 3 * ids.OBJECT_STRIDE])
-def test_a_thing_that_is_none_is_refused(number):
-    batch = things(np.random.default_rng(0), 1)
+def test_an_invalid_object_id_is_refused(number):
+    batch = objects(np.random.default_rng(0), 1)
     (payload,), _ = messages.encode_objects(dataclasses.replace(batch, object=np.array([number])), (0, 0))
     with pytest.raises(MessageError, match="of no kind"):
         messages.decode_objects(payload, (0, 0))
@@ -329,14 +331,14 @@ def test_a_thing_that_is_none_is_refused(number):
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.tuples(st.integers(1, 20), st.integers(0, 4)), min_size=1, max_size=40))
 @settings(max_examples=60, deadline=None)
-def test_trees_come_back_with_what_was_cut_off_them(seed, shapes):
+def test_trees_are_decoded_with_their_cut_bodies(seed, shapes):
     rng = np.random.default_rng(seed)
     sent = trees(rng, [size for size, _ in shapes])
     sent = cut(sent, [min(k, size) for size, k in shapes], rng)
-    payloads, heard = messages.encode_trees(sent)
+    payloads, received = messages.encode_trees(sent)
     parts = [update for payload in payloads for update in messages.decode_trees(payload).updates("ada")]
     ends = np.cumsum(sent.roots)
-    for update, here, end, count in zip(parts, heard.updates("ada"), ends, sent.roots, strict=True):
+    for update, here, end, count in zip(parts, received.updates("ada"), ends, sent.roots, strict=True):
         assert update.joint_q.tobytes() == here.joint_q.tobytes()
         assert update.root.tolist() == sent.root[end - count : end].tolist()
         np.testing.assert_allclose(update.root_x, sent.root_x[end - count : end], atol=1e-5)
@@ -344,24 +346,24 @@ def test_trees_come_back_with_what_was_cut_off_them(seed, shapes):
         np.testing.assert_allclose(update.root_xd, sent.root_xd[end - count : end], atol=0.51e-3)
 
 
-def fact(**change) -> messages.RetainedRecord:
+def record(**change) -> messages.RetainedRecord:
     usual = {"object": ids.object_id(ids.ObjectKind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
     return messages.RetainedRecord(
         **{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change}
     )
 
 
-def test_facts_come_back_as_they_were_said():
-    told = [fact(), fact(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
-    heard = messages.decode_records(messages.encode_records(told))
-    assert heard == told
-    assert heard[0].claim == Claim(3, 65535, "picker")
-    assert ids.split_object_id(heard[0].object) == (ids.ObjectKind.BUNCH, 17)
-    assert messages.kind_of(messages.encode_records(told)) == messages.MessageKind.RETAINED
+def test_records_are_decoded_as_encoded():
+    sent = [record(), record(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
+    received = messages.decode_records(messages.encode_records(sent))
+    assert received == sent
+    assert received[0].claim == Claim(3, 65535, "picker")
+    assert ids.split_object_id(received[0].object) == (ids.ObjectKind.BUNCH, 17)
+    assert messages.kind_of(messages.encode_records(sent)) == messages.MessageKind.RETAINED
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "reason"),
     [
         ({"object": 3 * ids.OBJECT_STRIDE}, "of no kind"),
         ({"object": -1}, "of no kind"),
@@ -374,11 +376,11 @@ def test_facts_come_back_as_they_were_said():
         ({"parent": "x" * 201}, "impossible"),
     ],
 )
-def test_a_fact_that_cannot_be_is_refused_in_words(change, words):
-    with pytest.raises(MessageError, match=words):
-        messages.decode_records(messages.encode_records([fact(**change)]))
+def test_an_invalid_record_is_refused_with_the_reason(change, reason):
+    with pytest.raises(MessageError, match=reason):
+        messages.decode_records(messages.encode_records([record(**change)]))
 
 
-def test_too_many_facts_are_refused():
+def test_too_many_records_are_refused():
     with pytest.raises(MessageError, match="at most 4096"):
-        messages.decode_records(messages.encode_records([fact()] * 4097))
+        messages.decode_records(messages.encode_records([record()] * 4097))

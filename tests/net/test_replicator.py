@@ -1,4 +1,4 @@
-"""Exchanges over a bus in memory: who hears what, who owns what, and what it costs, with delay, jitter and loss."""
+"""The replicator over a bus in memory: interest, ownership and traffic, with delay, jitter and loss."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def vineyard() -> Model:
 
 
 class Client:
-    """The least client: a robot that stands somewhere, touches trees, and takes over what it hears."""
+    """A minimal client: a robot at ``x`` that touches trees and applies the updates it receives."""
 
     def __init__(self, hub: MemoryHub, name: str, x: float, *, digest: str = "same", **hello) -> None:
         self.hub, self.name = hub, name
@@ -55,7 +55,7 @@ class Client:
         self.swinging: set[int] = set()
         self.grabbed: set[int] = set()
         self.inbox = Inbox()
-        self.heard: list[TreeUpdate] = []
+        self.received: list[TreeUpdate] = []
         self.released: list[int] = []
         self.joined: list[str] = []
         self.left: list[str] = []
@@ -64,7 +64,7 @@ class Client:
     def tick(self) -> None:
         now = self.hub.time
         self.inbox = inbox = self.replicator.receive(now)
-        self.heard += inbox.trees
+        self.received += inbox.trees
         self.released += inbox.released
         self.joined += [hello.name for hello in inbox.joined]
         self.left += inbox.left
@@ -106,20 +106,20 @@ def owners(clients: list[Client], tree: int) -> set[str | None]:
     return {client.replicator.owner(tree) for client in clients}
 
 
-# ---------------------------------------------------------------- meeting
+# ---------------------------------------------------------------- joining and leaving
 
 
-def test_actors_meet_see_each_other_and_part():
+def test_actors_join_receive_poses_and_leave():
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0, urdf="<robot/>", index=4)
     run(hub, [ada, bob], 0.5)
     assert (ada.joined, bob.joined) == (["bob"], ["ada"])
     assert ada.replicator.peers["bob"].urdf == "<robot/>"
     assert ada.replicator.peers["bob"].index == 4
-    seen = ada.inbox.robots["bob"]
-    np.testing.assert_allclose(seen.base_q, bob.robot.base_q, atol=1e-4)
-    np.testing.assert_allclose(seen.position, [0.1, -0.2], atol=1e-4)
-    assert seen.time == pytest.approx(hub.time)
+    pose = ada.inbox.robots["bob"]
+    np.testing.assert_allclose(pose.base_q, bob.robot.base_q, atol=1e-4)
+    np.testing.assert_allclose(pose.position, [0.1, -0.2], atol=1e-4)
+    assert pose.time == pytest.approx(hub.time)
     bob.bus.close()
     run(hub, [ada], 0.1)
     assert ada.left == ["bob"]
@@ -127,17 +127,17 @@ def test_actors_meet_see_each_other_and_part():
 
 
 @pytest.mark.parametrize(("x", "low", "high"), [(3.0, 63, 67), (60.0, 4, 6)])
-def test_poses_come_at_60_hz_from_near_and_at_5_hz_from_far(x, low, high):
+def test_poses_arrive_at_60_hz_near_and_at_5_hz_far(x, low, high):
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", x)
     run(hub, [ada, bob], 1.0)
     before = ada.replicator.counters.actor.messages_in
     run(hub, [ada, bob], 2.0)
-    # near: 60 Hz and the 5 Hz that everybody hears
+    # near: the 60 Hz stream and the 5 Hz stream of every actor
     assert low <= (ada.replicator.counters.actor.messages_in - before) / 2 <= high
 
 
-def test_a_driving_robot_is_seen_where_it_is_now_not_where_it_was():
+def test_a_driving_robot_is_extrapolated_to_the_current_time():
     hub = MemoryHub(delay=0.08)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
     bob.robot = dataclasses.replace(bob.robot, base_qd=np.array([1.0, 0, 0, 0, 0, 0.5]), velocity=np.array([0.3, 0.0]))
@@ -149,21 +149,21 @@ def test_a_driving_robot_is_seen_where_it_is_now_not_where_it_was():
             position=np.array([0.1 + 0.3 * t, -0.2]),
         )
         run(hub, [ada, bob], TICK)
-    seen = ada.inbox.robots["bob"]
-    np.testing.assert_allclose(seen.base_q, bob.robot.base_q, atol=2e-3)
-    np.testing.assert_allclose(seen.position, bob.robot.position, atol=2e-3)
-    np.testing.assert_allclose(seen.base_qd, bob.robot.base_qd, atol=1e-3)
+    pose = ada.inbox.robots["bob"]
+    np.testing.assert_allclose(pose.base_q, bob.robot.base_q, atol=2e-3)
+    np.testing.assert_allclose(pose.position, bob.robot.position, atol=2e-3)
+    np.testing.assert_allclose(pose.base_qd, bob.robot.base_qd, atol=1e-3)
     hub.down = True
-    where = []
+    poses = []
     for _ in range(60):
         hub.advance(TICK)
-        where.append(ada.replicator._state.peers.known["bob"].sample(hub.time, hub.time))
-    assert where[-1].base_q[0] == pytest.approx(where[-20].base_q[0], abs=1e-9)
-    assert not where[-1].base_qd.any()
-    assert not where[-1].velocity.any()
+        poses.append(ada.replicator._state.peers.known["bob"].sample(hub.time, hub.time))
+    assert poses[-1].base_q[0] == pytest.approx(poses[-20].base_q[0], abs=1e-9)
+    assert not poses[-1].base_qd.any()
+    assert not poses[-1].velocity.any()
 
 
-def test_a_correction_of_a_pose_is_blended_but_its_velocity_taken_at_once():
+def test_a_pose_correction_is_blended_and_its_velocity_applied_at_once():
     hub = MemoryHub()
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.5)
@@ -175,14 +175,14 @@ def test_a_correction_of_a_pose_is_blended_but_its_velocity_taken_at_once():
         bob.goto(2.5 + 0.2 * TICK * (len(shown) + 1))
         shown.append((ada.inbox.robots["bob"].base_q[0], ada.inbox.robots["bob"].base_qd[0]))
     x = np.array(shown)
-    heard = int(np.argmax(x[:, 1] > 0.1))
-    assert x[heard, 0] < 2.2
+    received = int(np.argmax(x[:, 1] > 0.1))
+    assert x[received, 0] < 2.2
     assert np.abs(np.diff(x[:, 0])).max() < 0.15
     assert x[-1, 0] == pytest.approx(2.5 + 0.2 * 20 * TICK, abs=0.02)
 
 
 @pytest.mark.parametrize("change", ["digest", "protocol"])
-def test_a_newcomer_of_another_vineyard_or_protocol_is_refused_with_both_values(change):
+def test_another_scene_or_protocol_is_refused_with_both_values(change):
     hub = MemoryHub()
     ada = Client(hub, "ada", 1.0)
     run(hub, [ada], 0.1)
@@ -196,7 +196,7 @@ def test_a_newcomer_of_another_vineyard_or_protocol_is_refused_with_both_values(
     assert ada.inbox.robots == {}
 
 
-def test_the_protocols_of_both_are_named():
+def test_a_protocol_mismatch_names_both_versions():
     hub = MemoryHub()
     old = hub.bus("old")
     old.declare_queryable(
@@ -210,7 +210,7 @@ def test_the_protocols_of_both_are_named():
 # ---------------------------------------------------------------- interest
 
 
-def test_far_from_everybody_not_one_byte_of_environment_leaves():
+def test_far_from_all_peers_no_environment_byte_is_sent():
     hub = MemoryHub(delay=0.02)
     ada, bob, cleo = Client(hub, "ada", 1.0), Client(hub, "bob", 60.0), Client(hub, "cleo", -40.0)
     run(hub, [ada, bob, cleo], 1.0)
@@ -227,7 +227,7 @@ def test_far_from_everybody_not_one_byte_of_environment_leaves():
     assert ada.reads == 0
 
 
-def test_in_the_same_window_of_cells_but_not_near_not_one_byte_leaves():
+def test_within_the_cell_window_but_beyond_the_radius_no_byte_is_sent():
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 7.5)
     run(hub, [ada, bob], 1.0)
@@ -237,19 +237,19 @@ def test_in_the_same_window_of_cells_but_not_near_not_one_byte_leaves():
     assert ada.environment_bytes() == 0
 
 
-def test_of_the_trees_one_moves_only_those_near_somebody_leave():
+def test_only_trees_near_a_peer_are_sent():
     hub = MemoryHub()
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 7.0)
     run(hub, [ada, bob], 0.5)
     ada.touched = {0, 3}
     run(hub, [ada, bob], 1.5)
-    assert {update.tree for update in bob.heard} == {3}
+    assert {update.tree for update in bob.received} == {3}
     assert ada.replicator.counters.environment.bytes_out == bob.replicator.counters.environment.bytes_in
     assert bob.replicator.claim(0) == Claim()
     assert ada.replicator.counters.environment.bytes_out == 2 * (14 + 13 + 6 * 9)
 
 
-def test_near_the_state_arrives_within_quantisation():
+def test_tree_state_arrives_within_quantisation():
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 0.5)
@@ -260,14 +260,14 @@ def test_near_the_state_arrives_within_quantisation():
     assert owners([ada, bob], 0) == owners([ada, bob], 2) == {"ada"}
     for tree in (0, 2):
         bodies = ada.model.bodies_of(tree)
-        wrong = dead_reckoning.angle_between(
+        error = dead_reckoning.angle_between(
             ada.state.joint_q[bodies].astype(float), bob.state.joint_q[bodies].astype(float)
         )
-        assert wrong.max() < np.radians(0.02)
-    assert {update.owner for update in bob.heard} == {"ada"}
+        assert error.max() < np.radians(0.02)
+    assert {update.owner for update in bob.received} == {"ada"}
 
 
-def test_a_steady_touch_costs_a_heartbeat_and_a_moving_one_what_extrapolation_misses():
+def test_a_steady_touch_sends_heartbeats_and_a_moving_one_when_extrapolation_fails():
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 0.5)
@@ -284,16 +284,20 @@ def test_a_steady_touch_costs_a_heartbeat_and_a_moving_one_what_extrapolation_mi
         ada.bend(0, 0.2 + 0.1 * np.sin(3 * t), 0.3 * np.cos(3 * t))
         run(hub, [ada, bob], TICK)
         if k > 20:
-            late = ada.replicator._state.tree_stream
+            stream = ada.replicator._state.tree_stream
             silence = dead_reckoning.clamp_age(hub.time - ada.replicator._state.ownership[0].published_at)
-            said = dead_reckoning.extrapolate(late._published_q[bodies], late._published_rate[bodies], silence)
-            worst = max(worst, dead_reckoning.angle_between(ada.state.joint_q[bodies].astype(float), said).max())
+            extrapolated = dead_reckoning.extrapolate(
+                stream._published_q[bodies], stream._published_rate[bodies], silence
+            )
+            worst = max(
+                worst, dead_reckoning.angle_between(ada.state.joint_q[bodies].astype(float), extrapolated).max()
+            )
     moved = ada.replicator.counters.environment.messages_out - before - 10
     assert 20 < moved < 200
     assert worst <= dead_reckoning.ANGLE_ERROR
 
 
-def test_several_trees_of_a_cell_travel_in_one_message():
+def test_trees_of_one_cell_share_a_message():
     hub = MemoryHub()
     ada, bob = Client(hub, "ada", 2.0), Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 0.5)
@@ -304,7 +308,7 @@ def test_several_trees_of_a_cell_travel_in_one_message():
     assert ada.replicator.counters.event.messages_out == 1
 
 
-def test_who_comes_near_hears_at_once_and_who_goes_costs_nothing():
+def test_a_peer_that_comes_near_receives_at_once_and_one_that_leaves_costs_nothing():
     hub = MemoryHub(delay=0.01)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 30.0)
     ada.touched = {0}
@@ -313,7 +317,7 @@ def test_who_comes_near_hears_at_once_and_who_goes_costs_nothing():
     bob.goto(3.0)
     run(hub, [ada, bob], 0.3)
     assert bob.replicator.owner(0) == "ada"
-    assert {update.tree for update in bob.heard} == {0}
+    assert {update.tree for update in bob.received} == {0}
     bob.goto(30.0)
     run(hub, [ada, bob], 0.5)
     before = ada.replicator.counters.environment.bytes_out
@@ -323,7 +327,7 @@ def test_who_comes_near_hears_at_once_and_who_goes_costs_nothing():
     assert bob.released == [0]
 
 
-def test_rest_is_said_once_reliably_and_then_there_is_silence():
+def test_rest_is_sent_once_reliably_and_nothing_after_it():
     hub = MemoryHub(delay=0.02, jitter=0.02, loss=0.3, seed=1)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 1.0)
@@ -342,8 +346,8 @@ def test_rest_is_said_once_reliably_and_then_there_is_silence():
     run(hub, [ada, bob], 0.3)
     assert owners([ada, bob], 0) == {None}
     assert bob.released == [0]
-    assert bob.heard[-1].resting
-    assert bob.heard[-1].joint_q.tobytes() == rest.joint_q.tobytes()
+    assert bob.received[-1].resting
+    assert bob.received[-1].joint_q.tobytes() == rest.joint_q.tobytes()
     before = ada.environment_bytes()
     run(hub, [ada, bob], 3.0)
     assert ada.environment_bytes() == before
@@ -352,7 +356,7 @@ def test_rest_is_said_once_reliably_and_then_there_is_silence():
 # ---------------------------------------------------------------- authority
 
 
-def test_both_touch_and_one_owns_everywhere_soon():
+def test_two_that_touch_agree_on_one_owner():
     hub = MemoryHub(delay=0.03)
     ada, bob, cleo = clients = [Client(hub, "ada", 1.0), Client(hub, "bob", 2.0), Client(hub, "cleo", 3.0)]
     run(hub, clients, 0.5)
@@ -361,7 +365,7 @@ def test_both_touch_and_one_owns_everywhere_soon():
     assert owners(clients, 1) == {"ada"}
     claims = {client.replicator.claim(1) for client in clients}
     run(hub, clients, 2.0)
-    # they go on pressing and do not take it from each other
+    # both keep pressing, and ownership does not alternate
     assert {client.replicator.claim(1) for client in clients} == claims
     ada.touched = set()
     ada.swinging = {1}
@@ -373,7 +377,7 @@ def test_both_touch_and_one_owns_everywhere_soon():
     assert owners(clients, 1) == {"cleo"}
 
 
-def test_who_knows_nothing_of_a_long_story_is_told_and_takes_its_turn():
+def test_a_late_joiner_receives_the_current_claim_and_can_take_ownership():
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.5)
@@ -392,7 +396,7 @@ def test_who_knows_nothing_of_a_long_story_is_told_and_takes_its_turn():
     assert cy.replicator.claim(0) == Claim(0, 7, "cy")
 
 
-def test_touches_of_which_nobody_hears_use_no_sequence_numbers():
+def test_touches_without_peers_use_no_sequence_numbers():
     hub = MemoryHub()
     ada = Client(hub, "ada", 1.0)
     for _ in range(5):
@@ -404,7 +408,7 @@ def test_touches_of_which_nobody_hears_use_no_sequence_numbers():
     assert ada.replicator.claim(0) == Claim()
 
 
-def test_an_owner_leaves_and_the_nearest_takes_over():
+def test_when_an_owner_leaves_the_nearest_takes_over():
     hub = MemoryHub(delay=0.02)
     ada, bob, cleo = clients = [Client(hub, "ada", 1.0), Client(hub, "bob", 4.0), Client(hub, "cleo", 2.0)]
     run(hub, clients, 0.5)
@@ -420,7 +424,7 @@ def test_an_owner_leaves_and_the_nearest_takes_over():
     assert owners([bob, cleo], 0) == {None}
 
 
-def test_an_owner_that_was_not_heard_for_long_is_followed_again_at_its_next_word():
+def test_an_owner_is_followed_again_after_a_long_loss_of_its_messages():
     hub = MemoryHub(delay=0.02)
     ada, bob = clients = [Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)]
     run(hub, clients, 0.5)
@@ -433,11 +437,11 @@ def test_an_owner_that_was_not_heard_for_long_is_followed_again_at_its_next_word
     hub.loss = 0.0
     run(hub, clients, 1.1)
     assert owners(clients, 0) == {"ada"}
-    # bob did not argue: not hearing is no reason to say that it rests
+    # bob published no claim: a silent owner does not mean that the tree is at rest
     assert ada.replicator.claim(0) == bob.replicator.claim(0) == claim
 
 
-def test_a_restarted_owner_is_told_how_far_the_story_went():
+def test_a_restarted_owner_receives_the_current_sequence_numbers():
     hub = MemoryHub(delay=0.02)
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.5)
@@ -461,7 +465,7 @@ def test_a_restarted_owner_is_told_how_far_the_story_went():
     assert again.replicator.claim(0) == bob.replicator.claim(0)
 
 
-def test_the_server_goes_and_comes_and_everybody_agrees_again():
+def test_all_agree_again_after_a_server_outage():
     hub = MemoryHub(delay=0.02)
     ada, bob = clients = [Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)]
     run(hub, clients, 0.5)
@@ -469,7 +473,7 @@ def test_the_server_goes_and_comes_and_everybody_agrees_again():
     run(hub, clients, 0.3)
     hub.down = True
     run(hub, clients, 1.0)
-    # alone, everybody owns what it touches
+    # without a server each client owns what it touches
     assert bob.left == ["ada"]
     bob.touched = {0}
     run(hub, clients, 0.5)
@@ -493,38 +497,38 @@ actions = st.lists(
 
 @given(actions, st.integers(0, 2**31), st.sampled_from([0.0, 0.02, 0.3]))
 @settings(max_examples=25, deadline=None)
-def test_after_any_story_on_any_network_there_is_one_owner_everywhere(story, seed, loss):
+def test_any_sequence_of_actions_on_any_network_ends_with_one_owner(scenario, seed, loss):
     hub = MemoryHub(delay=0.03, jitter=0.02, loss=loss, seed=seed)
     clients = {name: Client(hub, name, x) for name, x in (("ada", 1.0), ("bob", 2.0), ("cleo", 3.0))}
-    everybody = list(clients.values())
-    run(hub, everybody, 0.5)
-    for name, action, tree, ticks in story:
+    all_clients = list(clients.values())
+    run(hub, all_clients, 0.5)
+    for name, action, tree, ticks in scenario:
         client = clients[name]
         if action == "let":
             client.touched.discard(tree)
         else:
             client.touched.add(tree)
             client.grabbed |= {tree} if action == "grab" else set()
-        run(hub, everybody, ticks * TICK)
-    # once nothing is lost any more: one heartbeat repeats what was lost, and a lost argument is corrected within 0.2 s
+        run(hub, all_clients, ticks * TICK)
+    # without further loss, one heartbeat repeats what was lost, and an outdated claim is corrected within 0.2 s
     hub.loss = 0.0
-    run(hub, everybody, 1.5)
+    run(hub, all_clients, 1.5)
     for tree in range(3):
-        assert len(owners(everybody, tree)) == 1, [client.replicator.claim(tree) for client in everybody]
-        touching = {client.name for client in everybody if tree in client.touched}
-        assert owners(everybody, tree) <= (touching or {None})
+        assert len(owners(all_clients, tree)) == 1, [client.replicator.claim(tree) for client in all_clients]
+        touching = {client.name for client in all_clients if tree in client.touched}
+        assert owners(all_clients, tree) <= (touching or {None})
 
 
-# ---------------------------------------------------------------- what must not be believed
+# ---------------------------------------------------------------- invalid input
 
 
-def test_malformed_messages_are_counted_said_once_and_the_tick_goes_on(caplog):
+def test_malformed_messages_are_counted_logged_once_and_do_not_stop_the_tick(caplog):
     hub = MemoryHub()
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.3)
-    evil = [bob.bus.publisher(key, reliable=True) for key in ("a/bob", "c/0/0/bob", "own/0/0/bob")]
+    publishers = [bob.bus.publisher(key, reliable=True) for key in ("a/bob", "c/0/0/bob", "own/0/0/bob")]
     for k in range(20):
-        for publisher in evil:
+        for publisher in publishers:
             publisher.put(b"VS\x01" + bytes([k]) + bytes(k))
         run(hub, [ada, bob], TICK)
     assert ada.replicator.counters.malformed == 60
@@ -532,12 +536,12 @@ def test_malformed_messages_are_counted_said_once_and_the_tick_goes_on(caplog):
     assert "bob" in ada.inbox.robots
 
 
-def test_a_stranger_another_tree_and_a_replay_change_nothing():
+def test_an_unknown_peer_an_invalid_tree_and_a_repeated_message_are_ignored():
     hub = MemoryHub()
     ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.3)
-    stranger = hub.bus("stranger")
-    stranger.publisher("own/0/0/stranger", True).put(messages.encode_claims([(0, Claim(5, 5, "stranger"), True)]))
+    unknown = hub.bus("unknown")
+    unknown.publisher("own/0/0/unknown", True).put(messages.encode_claims([(0, Claim(5, 5, "unknown"), True)]))
     bob.bus.publisher("own/0/0/bob", True).put(messages.encode_claims([(TREES, Claim(5, 5, "bob"), True)]))
     run(hub, [ada, bob], 0.2)
     assert ada.replicator.claim(0) == Claim()
@@ -545,16 +549,16 @@ def test_a_stranger_another_tree_and_a_replay_change_nothing():
     assert ada.replicator.counters.dropped >= 1
     bob.touched = {0}
     bob.bend(0, 0.3)
-    eve = hub.bus("eve")
-    eve.subscribe("c/**", 100)
+    eavesdropper = hub.bus("eavesdropper")
+    eavesdropper.subscribe("c/**", 100)
     run(hub, [ada, bob], 0.1)
-    (_, recorded), *_ = eve.poll()
+    (_, recorded), *_ = eavesdropper.poll()
     bob.bend(0, -0.3)
     run(hub, [ada, bob], 0.1)
-    held, heard = ada.state.joint_q.copy(), len(ada.heard)
+    held, received = ada.state.joint_q.copy(), len(ada.received)
     bob.bus.publisher("c/0/0/bob").put(recorded)
     run(hub, [ada, bob], 0.1)
-    assert len(ada.heard) == heard
+    assert len(ada.received) == received
     np.testing.assert_array_equal(ada.state.joint_q, held)
 
 
@@ -568,7 +572,7 @@ def test_a_pose_with_another_number_of_joints_is_malformed():
     assert len(ada.inbox.robots["bob"].position) == 2
 
 
-def test_the_clock_of_the_server_is_found():
+def test_the_clock_offset_to_the_server_is_estimated():
     hub = MemoryHub(delay=0.02, jitter=0.01)
     server = hub.bus("server")
     server.declare_queryable(
@@ -580,7 +584,7 @@ def test_the_clock_of_the_server_is_found():
     assert ada.replicator.offset == pytest.approx(1000.0, abs=0.012)
 
 
-def test_one_actor_has_one_name_and_near_has_a_bound():
+def test_the_actor_name_must_match_the_bus_and_the_radius_is_bounded():
     hub = MemoryHub()
     with pytest.raises(ValueError, match="one actor has one name"):
         Replicator(hub.bus("ada"), Hello("bob"), vineyard())
@@ -588,8 +592,8 @@ def test_one_actor_has_one_name_and_near_has_a_bound():
         Replicator(hub.bus("bob"), Hello("bob"), vineyard(), interest_radius=9.0)
 
 
-def test_a_run_is_the_same_twice():
-    def story() -> bytes:
+def test_two_runs_are_identical():
+    def scenario() -> bytes:
         hub = MemoryHub(delay=0.03, jitter=0.02, loss=0.1, seed=5)
         ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
         ada.touched, bob.touched = {0, 1}, {1, 2}
@@ -598,4 +602,4 @@ def test_a_run_is_the_same_twice():
             run(hub, [ada, bob], TICK)
         return ada.state.joint_q.tobytes() + bob.state.joint_q.tobytes() + str(bob.replicator.counters).encode()
 
-    assert story() == story()
+    assert scenario() == scenario()

@@ -1,4 +1,4 @@
-"""What the server keeps: in whatever order facts come, however many answers they take, and when the disk is full."""
+"""The server's retained store: order of records, size of replies, quotas, and a full disk."""
 
 from __future__ import annotations
 
@@ -17,141 +17,141 @@ from vinesim.net.server.admission import SceneId
 from vinesim.net.server.retained_store import Quota, RetainedStore
 from vinesim.scene.ids import ObjectKind, object_id
 
-PLAN = SceneId("vsp", "D1")
-PLENTY = Quota(1e9, 1e12)
+SCENE = SceneId("vsp", "D1")
+UNLIMITED = Quota(1e9, 1e12)
 
 
-def fact(index=0, ownership=1, author="ada", cut=()):
+def record(index=0, ownership=1, author="ada", cut=()):
     kind = ObjectKind.TREE if cut else ObjectKind.BOX
     return RetainedRecord(object_id(kind, index), ownership, 0, author, cut=cut)
 
 
-def hear(kept, fact, cell=(0, 0), world="w"):
-    kept.submit(f"{world}/fact/{cell[0]}/{cell[1]}/{fact.author}", messages.encode_records([fact]))
+def submit(store, record, cell=(0, 0), world="w"):
+    store.submit(f"{world}/fact/{cell[0]}/{cell[1]}/{record.author}", messages.encode_records([record]))
 
 
-def told(kept, world="w"):
-    """All facts of a world as its snapshots tell them, with their cells."""
-    parts = kept.snapshot(world, kept.cells(world))
-    found = [(cell, fact) for cell, payload in parts for fact in messages.decode_records(payload)]
+def all_records(store, world="w"):
+    """All records of a world with their cells, from its snapshots."""
+    parts = store.snapshot(world, store.cells(world))
+    found = [(cell, record) for cell, payload in parts for record in messages.decode_records(payload)]
     return sorted(found, key=lambda row: row[1].object)
 
 
-facts = st.builds(
-    fact, st.integers(0, 3), st.integers(0, 4), st.sampled_from(["ada", "bob"]), st.sampled_from([(), (1,), (2, 3)])
+records = st.builds(
+    record, st.integers(0, 3), st.integers(0, 4), st.sampled_from(["ada", "bob"]), st.sampled_from([(), (1,), (2, 3)])
 )
-said = st.lists(st.tuples(st.tuples(st.integers(-2, 2), st.just(0)), facts), max_size=30)
+submission_lists = st.lists(st.tuples(st.tuples(st.integers(-2, 2), st.just(0)), records), max_size=30)
 
 
 @settings(max_examples=25, deadline=None)
-@given(said, st.randoms())
-def test_in_any_order_and_from_disk_the_same_is_told(tmp_path_factory, sayings, random):
+@given(submission_lists, st.randoms())
+def test_any_order_and_reloading_give_the_same_snapshot(tmp_path_factory, submissions, random):
     folder = tmp_path_factory.mktemp("kept")
-    # an author says one thing under one claim, in one cell
-    once = {(one.claim, one.object): (cell, one) for cell, one in sayings}
-    sayings = list(once.values())
+    # under one claim an author publishes one record of an object, in one cell
+    unique = {(one.claim, one.object): (cell, one) for cell, one in submissions}
+    submissions = list(unique.values())
     expected = RetainedState()
-    for cell, one in sayings:
+    for cell, one in submissions:
         expected.merge(cell, one)
-    shuffled = sayings * 2
+    shuffled = submissions * 2
     random.shuffle(shuffled)
-    kept = RetainedStore(folder, PLENTY)
-    kept.open("w", PLAN)
+    store = RetainedStore(folder, UNLIMITED)
+    store.open("w", SCENE)
     for cell, one in shuffled:
-        hear(kept, one, cell)
-    kept.close()
-    again = RetainedStore(folder, PLENTY)
-    again.close()
-    assert told(kept) == told(again) == list(expected)
-    assert again.scene_of("w") == (PLAN if sayings else None)
+        submit(store, one, cell)
+    store.close()
+    reloaded = RetainedStore(folder, UNLIMITED)
+    reloaded.close()
+    assert all_records(store) == all_records(reloaded) == list(expected)
+    assert reloaded.scene_of("w") == (SCENE if submissions else None)
 
 
-def test_a_cell_with_nothing_is_answered_with_nothing():
-    kept = RetainedStore()
-    kept.close()
-    ((cell, payload),) = kept.snapshot("w", [(7, 7)])
+def test_an_empty_cell_gives_an_empty_reply():
+    store = RetainedStore()
+    store.close()
+    ((cell, payload),) = store.snapshot("w", [(7, 7)])
     assert (cell, messages.decode_records(payload)) == ((7, 7), [])
 
 
-def test_answers_are_cut_to_what_may_be_sent(monkeypatch):
+def test_replies_are_split_at_the_size_limit(monkeypatch):
     monkeypatch.setattr(retained_store, "MAX_REPLY", 500)
-    kept = RetainedStore(quota=PLENTY)
-    kept.open("w", PLAN)
+    store = RetainedStore(quota=UNLIMITED)
+    store.open("w", SCENE)
     for index in range(100):
-        hear(kept, fact(index))
-    kept.close()
-    parts = kept.snapshot("w", [(0, 0)])
+        submit(store, record(index))
+    store.close()
+    parts = store.snapshot("w", [(0, 0)])
     assert max(len(payload) for _, payload in parts) <= 500
-    assert told(kept) == [((0, 0), fact(index)) for index in range(100)]
+    assert all_records(store) == [((0, 0), record(index)) for index in range(100)]
 
 
-def test_there_is_an_end_to_what_is_kept(monkeypatch):
+def test_the_number_of_stored_objects_is_limited(monkeypatch):
     monkeypatch.setattr(retained_store, "MAX_OBJECTS", 3)
-    kept = RetainedStore(quota=PLENTY)
-    kept.open("w", PLAN)
+    store = RetainedStore(quota=UNLIMITED)
+    store.open("w", SCENE)
     for index in range(5):
-        hear(kept, fact(index))
-    hear(kept, fact(1, ownership=2))  # of what is known, news is always taken
-    kept.close()
-    assert told(kept) == [((0, 0), fact(0)), ((0, 0), fact(1, 2)), ((0, 0), fact(2))]
-    assert kept.counters.rejected == 2
+        submit(store, record(index))
+    submit(store, record(1, ownership=2))  # updates of a known object are always accepted
+    store.close()
+    assert all_records(store) == [((0, 0), record(0)), ((0, 0), record(1, 2)), ((0, 0), record(2))]
+    assert store.counters.rejected == 2
 
 
-def test_a_quota_fills_again_with_time(monkeypatch):
+def test_a_quota_refills_with_time(monkeypatch):
     now = 100.0
     monkeypatch.setattr(retained_store.time, "monotonic", lambda: now)
-    purse = retained_store._TokenBucket(Quota(2.0, 1000.0), now)
-    assert [purse.spend(1, now) for _ in range(11)] == [True] * 10 + [False]
-    assert [purse.spend(1, now + 1.0) for _ in range(3)] == [True, True, False]
-    assert not purse.spend(5001, now + 100.0)
-    assert purse.spend(4999, now + 100.0)
+    bucket = retained_store._TokenBucket(Quota(2.0, 1000.0), now)
+    assert [bucket.spend(1, now) for _ in range(11)] == [True] * 10 + [False]
+    assert [bucket.spend(1, now + 1.0) for _ in range(3)] == [True, True, False]
+    assert not bucket.spend(5001, now + 100.0)
+    assert bucket.spend(4999, now + 100.0)
 
 
-def test_when_the_disk_is_full_nothing_is_forgotten_and_when_it_is_not_all_is_written(tmp_path, monkeypatch, caplog):
+def test_records_stay_in_memory_while_the_disk_is_full_and_are_written_afterwards(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(retained_store, "RETRY_PERIOD", 0.05)
-    kept = RetainedStore(tmp_path, PLENTY)
-    kept.open("w", PLAN)
-    hear(kept, fact(0))
-    wait(lambda: kept.count() == 1 and (tmp_path / "w.facts").exists(), "a fact on disk")
-    real = journal._packed
+    store = RetainedStore(tmp_path, UNLIMITED)
+    store.open("w", SCENE)
+    submit(store, record(0))
+    wait(lambda: store.count() == 1 and (tmp_path / "w.facts").exists(), "a record on disk")
+    original = journal._packed
 
-    def full(record):
+    def fail(content):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(journal, "_packed", full)
-    hear(kept, fact(1))
-    wait(lambda: kept.status_message, "the disk to be full")
-    assert "No space left" in kept.status_message
-    hear(kept, fact(2))
-    wait(lambda: kept.count() == 3, "all in memory")
-    monkeypatch.setattr(journal, "_packed", real)
-    wait(lambda: not kept.status_message, "the disk to be well")
-    hear(kept, fact(3))
-    kept.close()
-    again = RetainedStore(tmp_path)
-    again.close()
-    assert told(again) == told(kept) == [((0, 0), fact(index)) for index in range(4)]
+    monkeypatch.setattr(journal, "_packed", fail)
+    submit(store, record(1))
+    wait(lambda: store.status_message, "the disk to be full")
+    assert "No space left" in store.status_message
+    submit(store, record(2))
+    wait(lambda: store.count() == 3, "all in memory")
+    monkeypatch.setattr(journal, "_packed", original)
+    wait(lambda: not store.status_message, "the disk to be writable")
+    submit(store, record(3))
+    store.close()
+    reloaded = RetainedStore(tmp_path)
+    reloaded.close()
+    assert all_records(reloaded) == all_records(store) == [((0, 0), record(index)) for index in range(4)]
     assert len([line for line in caplog.messages if "kept in memory only" in line]) == 1
 
 
 @pytest.mark.parametrize(
     "key", ["w/fact/ada", "w/fact/0/ada", "w/fact/x/0/ada", "w/fact/0/0/0/ada", "w/fact/99999999999/0/ada"]
 )
-def test_a_key_that_names_no_cell_is_malformed(key):
-    kept = RetainedStore()
-    kept.open("w", PLAN)
-    kept.submit(key, messages.encode_records([fact()]))
-    kept.close()
-    assert (kept.counters.malformed, kept.count()) == (1, 0)
+def test_a_key_without_a_valid_cell_is_malformed(key):
+    store = RetainedStore()
+    store.open("w", SCENE)
+    store.submit(key, messages.encode_records([record()]))
+    store.close()
+    assert (store.counters.malformed, store.count()) == (1, 0)
 
 
-def test_a_flood_is_dropped_not_hoarded(monkeypatch):
+def test_records_beyond_the_queue_limit_are_rejected(monkeypatch):
     monkeypatch.setattr(retained_store, "MAX_QUEUED", 10)
-    kept = RetainedStore(quota=PLENTY)
-    kept.open("w", PLAN)
-    with kept._lock:  # while the archive cannot go on
+    store = RetainedStore(quota=UNLIMITED)
+    store.open("w", SCENE)
+    with store._lock:  # while the writer thread is blocked
         for index in range(100):
-            hear(kept, fact(index))
-    kept.close()
-    assert 10 <= kept.count() <= 12
-    assert kept.counters.rejected == 100 - kept.count()
+            submit(store, record(index))
+    store.close()
+    assert 10 <= store.count() <= 12
+    assert store.counters.rejected == 100 - store.count()

@@ -1,4 +1,4 @@
-"""Facts on their way: once to each who listens, again to a server that was gone, asked for where one comes to."""
+"""Synchronisation of retained records: sent once, sent again after a server outage, queried per cell."""
 
 from __future__ import annotations
 
@@ -13,88 +13,88 @@ from vinesim.scene.ids import ObjectKind, object_id
 HERE, THERE = (0, 0), (7, 7)
 
 
-def fact(box: int, x: float = 0.0, author: str = "ada", authority: int = 1) -> RetainedRecord:
+def record(box: int, x: float = 0.0, author: str = "ada", authority: int = 1) -> RetainedRecord:
     return RetainedRecord(object_id(ObjectKind.BOX, box), 0, authority, author, (x, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
 
 
-def heard(bus) -> list[tuple[str, int]]:
+def received(bus) -> list[tuple[str, int]]:
     return [(key, len(messages.decode_records(payload))) for key, payload in bus.poll()]
 
 
-def speak(hub: MemoryHub, telling: RetainedSync, ticks: int = 3) -> None:
+def run(hub: MemoryHub, sync: RetainedSync, ticks: int = 3) -> None:
     for _ in range(ticks):
-        telling.update_window([HERE], 0, hub.time)
-        telling.flush()
+        sync.update_window([HERE], 0, hub.time)
+        sync.flush()
         hub.advance(0.01)
 
 
-def test_a_fact_waits_until_somebody_listens_and_leaves_once():
+def test_a_record_waits_for_a_subscriber_and_is_sent_once():
     hub = MemoryHub()
     ada = RetainedSync(hub.bus("ada"), Counters())
-    ada.publish(HERE, fact(0))
-    speak(hub, ada, 10)
+    ada.publish(HERE, record(0))
+    run(hub, ada, 10)
     assert ada.counters.retained.messages_out == 0
     server = hub.bus("server")
     server.subscribe("fact/**", KEEP_ALL)
-    speak(hub, ada, 10)
-    assert heard(server) == [("fact/0/0/ada", 1)]
-    # also far from where one is oneself, and what was overtaken is not said at all
-    ada.publish(THERE, fact(1, 40.0))
-    ada.publish(THERE, fact(1, 41.0, authority=2))
-    speak(hub, ada)
+    run(hub, ada, 10)
+    assert received(server) == [("fact/0/0/ada", 1)]
+    # also in a cell outside the window; an outdated record is not sent
+    ada.publish(THERE, record(1, 40.0))
+    ada.publish(THERE, record(1, 41.0, authority=2))
+    run(hub, ada)
     ((_, payload),) = server.poll()
     assert [one.pose[0] for one in messages.decode_records(payload)] == [41.0]
 
 
-def test_many_facts_travel_together_in_messages_below_a_datagram():
+def test_many_records_share_messages_below_the_datagram_size():
     hub = MemoryHub()
     ada, server = RetainedSync(hub.bus("ada"), Counters()), hub.bus("server")
     server.subscribe("fact/**", KEEP_ALL)
     for box in range(40):
-        ada.publish(HERE, fact(box))
-    speak(hub, ada, 10)
-    came = server.poll()
-    assert sum(len(messages.decode_records(payload)) for _, payload in came) == 40
-    assert max(len(payload) for _, payload in came) <= messages.MAX_DATAGRAM
-    assert len(came) <= 5
+        ada.publish(HERE, record(box))
+    run(hub, ada, 10)
+    messages_received = server.poll()
+    assert sum(len(messages.decode_records(payload)) for _, payload in messages_received) == 40
+    assert max(len(payload) for _, payload in messages_received) <= messages.MAX_DATAGRAM
+    assert len(messages_received) <= 5
 
 
-def test_what_i_said_last_is_said_again_when_the_server_was_gone():
+def test_own_latest_records_are_sent_again_after_a_server_outage():
     hub = MemoryHub()
     ada, server = RetainedSync(hub.bus("ada"), Counters()), hub.bus("server")
     server.subscribe("fact/**", KEEP_ALL)
-    ada.publish(HERE, fact(0))
-    ada.publish(HERE, fact(1))
-    speak(hub, ada)
-    # another one has moved box 1 since: that is for it to repeat
-    assert ada.merge(HERE, fact(1, 5.0, "bob", 2))
+    ada.publish(HERE, record(0))
+    ada.publish(HERE, record(1))
+    run(hub, ada)
+    # bob has moved box 1 since: bob sends that record again
+    assert ada.merge(HERE, record(1, 5.0, "bob", 2))
     server.poll()
     hub.down = True
-    speak(hub, ada)
+    run(hub, ada)
     hub.down = False
-    speak(hub, ada)
+    run(hub, ada)
     ((_, payload),) = server.poll()
     assert [one.object for one in messages.decode_records(payload)] == [object_id(ObjectKind.BOX, 0)]
-    speak(hub, ada, 100)
+    run(hub, ada, 100)
     assert server.poll() == []
 
 
-def test_the_server_is_asked_once_for_each_cell_and_again_only_if_it_is_silent():
-    hub, asked = MemoryHub(), []
+def test_each_cell_is_queried_once_and_again_when_it_is_entered_again():
+    hub, queries = MemoryHub(), []
     ada, server = RetainedSync(hub.bus("ada"), Counters()), hub.bus("server")
     server.declare_queryable(
-        "snap/0/0", lambda _: asked.append(hub.time) or messages.encode_records([fact(3, 1.0, "bob")])
+        "snap/0/0", lambda _: queries.append(hub.time) or messages.encode_records([record(3, 1.0, "bob")])
     )
-    speak(hub, ada)
-    assert len(asked) == 1
+    run(hub, ada)
+    assert len(queries) == 1
     ((key, payload, _),) = ada.bus.replies()
     ada.mark_answered(HERE)
     assert (key, messages.decode_records(payload)[0].object) == ("snap/0/0", object_id(ObjectKind.BOX, 3))
-    speak(hub, ada, 500)
-    assert len(asked) == 1
+    run(hub, ada, 500)
+    assert len(queries) == 1
     for _ in range(2000):
         ada.update_window([THERE], 1, hub.time)
         hub.advance(0.01)
     ada.update_window([HERE], 2, hub.time)
     hub.advance(0.01)
-    assert len(asked) == 2
+    assert len(queries) == 2

@@ -1,4 +1,4 @@
-"""The server: carries, counts, tells the time, and says clearly when it cannot."""
+"""The server: routing, counters, clock, admission and retained records, and errors in one clear line."""
 
 from __future__ import annotations
 
@@ -49,28 +49,28 @@ def test_a_taken_port_is_one_clear_line():
 
 
 @pytest.mark.parametrize("endpoint", ["", "7447", "tls/127.0.0.1:0", "tcp/127.0.0.1", "tcp/:x", "tcp/1.2.3.4:99999"])
-def test_what_is_no_endpoint_is_refused(endpoint):
+def test_an_invalid_endpoint_is_refused(endpoint):
     with pytest.raises(ValueError, match=r"expected tcp/HOST:PORT"):
         Server(endpoint)
 
 
-def test_the_roster_follows_who_comes_and_goes():
+def test_the_list_of_actors_follows_joins_and_leaves():
     with Server("tcp/127.0.0.1:0") as server:
         with ZenohBus("ada", connect=server.endpoint), ZenohBus("bob", connect=server.endpoint, world="row-2"):
             wait(lambda: server.actors == ["row-2/bob", "vineyard/ada"], "two actors")
-        wait(lambda: server.actors == [], "nobody")
+        wait(lambda: server.actors == [], "no actors")
         assert server.joined == 2
 
 
-def test_the_clock_answers_with_the_time_of_day():
+def test_a_clock_query_returns_the_time_of_day():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.query("clock", b"nonsense")
         ada.query("clock", messages.encode_time(12.5))
         answers: list = []
         wait(lambda: answers.extend(ada.replies()) or answers, "the time")
-        asked, told = messages.decode_time(answers[0].payload)
-        assert asked == 12.5
-        assert abs(told - time.time()) < 10.0
+        sent, server_time = messages.decode_time(answers[0].payload)
+        assert sent == 12.5
+        assert abs(server_time - time.time()) < 10.0
         assert (server.pings, server.malformed) == (1, 1)
 
 
@@ -99,7 +99,7 @@ def hello(name, digest="D1", scene="vsp"):
     return messages.encode_hello(Hello(name, scene=scene, digest=digest))
 
 
-def test_another_scene_is_refused_by_both_names():
+def test_another_scene_is_refused_with_both_names():
     with Server("tcp/127.0.0.1:0") as server:
         with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
             ada.join(hello("ada"))
@@ -108,11 +108,11 @@ def test_another_scene_is_refused_by_both_names():
             bob.join(hello("bob"))
         wait(lambda: server.actors == [], "both to leave")
         with ZenohBus("bob", connect=server.endpoint) as bob:
-            bob.join(hello("bob", "D2"))  # nobody is there and nothing is kept: a new world
+            bob.join(hello("bob", "D2"))  # no actor and no record is left: a new world
         assert server.figures()["refused"] == 1
 
 
-def test_the_servers_scene_protocol_and_room_are_held():
+def test_scene_protocol_and_actor_limit_of_the_server_are_enforced():
     with Server("tcp/127.0.0.1:0", scene=SceneId("vsp", "D1"), max_actors=1) as server, contextlib.ExitStack() as stack:
         ada, bob = (stack.enter_context(ZenohBus(name, connect=server.endpoint)) for name in ("ada", "bob"))
         with pytest.raises(JoinRejected, match="the server was started for 'vsp' with 'D1'"):
@@ -128,12 +128,12 @@ def test_the_servers_scene_protocol_and_room_are_held():
             bob.join(b"junk")
 
 
-def test_an_answer_of_another_protocol_is_refused_by_both_numbers():
+def test_a_reply_of_another_protocol_is_refused_with_both_versions():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         newer = bytearray(messages.encode_welcome(Welcome()))
         newer[2] = 9
         for answer, words in ((bytes(newer), "protocol version 9"), (b"junk", "cannot be decoded")):
-            # what answers is another program
+            # another program answers
             server._declared[1].undeclare()
             server._declared[1] = server._session.declare_queryable(
                 "vs/1/*/join/*/*", lambda query, answer=answer: query.reply(str(query.key_expr), answer)
@@ -142,7 +142,7 @@ def test_an_answer_of_another_protocol_is_refused_by_both_numbers():
                 ada.join(hello("ada"))
 
 
-def test_a_plain_router_lets_everybody_in_and_the_log_says_so(caplog):
+def test_a_stock_router_admits_every_client_and_this_is_logged(caplog):
     (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
     router = open_session(config("router", listen__endpoints=[endpoint.locator]))
     with caplog.at_level("INFO"), ZenohBus("ada", connect=str(endpoint)) as ada:
@@ -151,22 +151,22 @@ def test_a_plain_router_lets_everybody_in_and_the_log_says_so(caplog):
     assert len([line for line in caplog.messages if "no vinesim server keeps world" in line]) == 1
 
 
-def test_who_is_in_says_so_again_to_a_server_that_was_started_anew():
+def test_a_client_announces_itself_again_to_a_restarted_server():
     first = Server("tcp/127.0.0.1:0")
     with first, ZenohBus("ada", connect=first.endpoint) as ada:
         ada.join(hello("ada"))
         endpoint = first.endpoint
         first.close()
-        wait(lambda: ada.status_message, "ada to miss the server")
+        wait(lambda: ada.status_message, "ada to notice the lost server")
         with Server(endpoint) as second:
-            wait(lambda: second._admission.scene_of("vineyard") == SceneId("vsp", "D1"), "ada to say who she is")
-            wait(lambda: not ada.status_message, "ada to be well")
+            wait(lambda: second._admission.scene_of("vineyard") == SceneId("vsp", "D1"), "ada to announce herself")
+            wait(lambda: not ada.status_message, "ada to be connected")
             second.close()
         with Server(endpoint, scene=SceneId("tendone", "D2")):
-            wait(lambda: "'tendone'" in ada.status_message, "ada to be told that she is in another vineyard now")
+            wait(lambda: "'tendone'" in ada.status_message, "ada to be refused for another scene")
 
 
-# ---------------------------------------------------------------- facts
+# ---------------------------------------------------------------- retained records
 
 
 def box(index=0, ownership=1, author="ada", x=0.0):
@@ -174,7 +174,7 @@ def box(index=0, ownership=1, author="ada", x=0.0):
 
 
 def snapshot(bus, cell, count):
-    """The facts of a cell as soon as there are so many."""
+    """The retained records of a cell, as soon as there are ``count``."""
     found, answered = {}, False
 
     def complete():
@@ -184,27 +184,27 @@ def snapshot(bus, cell, count):
         for answer in bus.replies():
             answered = True
             assert answer.key == f"snap/{cell[0]}/{cell[1]}"
-            found.update({fact.object: fact for fact in messages.decode_records(answer.payload)})
+            found.update({record.object: record for record in messages.decode_records(answer.payload)})
         return answered and len(found) >= count
 
-    wait(complete, f"{count} facts of cell {cell}")
+    wait(complete, f"{count} records of cell {cell}")
     return [found[number] for number in sorted(found)]
 
 
-def say(bus, cell, *facts):
+def publish(bus, cell, *records):
     publisher = bus.publisher(f"fact/{cell[0]}/{cell[1]}/{bus.name}", reliable=True)
-    wait(lambda: publisher.matching, "the server's ear")
-    assert publisher.put(messages.encode_records(list(facts)))
+    wait(lambda: publisher.matching, "the server's subscription")
+    assert publisher.put(messages.encode_records(list(records)))
     publisher.close()
 
 
-def test_the_winning_fact_of_every_thing_is_told_to_who_comes_later():
+def test_a_late_joiner_receives_the_winning_record_of_every_object():
     with Server("tcp/127.0.0.1:0") as server:
         with ZenohBus("ada", connect=server.endpoint) as ada:
             ada.join(hello("ada"))
-            say(ada, (0, -1), box(0), box(1))
-            say(ada, (4, 4), box(1, ownership=3))
-            say(ada, (5, 5), box(1, ownership=2))
+            publish(ada, (0, -1), box(0), box(1))
+            publish(ada, (4, 4), box(1, ownership=3))
+            publish(ada, (5, 5), box(1, ownership=2))
             wait(lambda: server.store.counters.received == 3, "three messages")
         with ZenohBus("bob", connect=server.endpoint) as bob:
             assert snapshot(bob, (4, 4), 1) == [box(1, 3)]
@@ -214,11 +214,11 @@ def test_the_winning_fact_of_every_thing_is_told_to_who_comes_later():
                 bob.join(hello("bob", "D2"))
 
 
-def test_a_large_snapshot_comes_in_several_answers():
+def test_a_large_snapshot_arrives_in_several_replies():
     with Server("tcp/127.0.0.1:0", quota=Quota(1e6, 1e9)) as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.join(hello("ada"))
-        say(ada, (0, 0), *[box(number) for number in range(1000)])
-        say(ada, (0, 0), *[box(number) for number in range(1000, 2000)])
+        publish(ada, (0, 0), *[box(number) for number in range(1000)])
+        publish(ada, (0, 0), *[box(number) for number in range(1000, 2000)])
         assert snapshot(ada, (0, 0), 2000) == [box(number) for number in range(2000)]
         ada.query("snap/0/0")
         answers: list = []
@@ -226,11 +226,11 @@ def test_a_large_snapshot_comes_in_several_answers():
         assert max(len(answer.payload) for answer in answers) <= 64_000
 
 
-def test_one_question_for_many_cells_names_each():
+def test_a_wildcard_query_returns_one_reply_per_cell():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.join(hello("ada"))
         for x in range(3):
-            say(ada, (x, 0), box(x))
+            publish(ada, (x, 0), box(x))
         snapshot(ada, (2, 0), 1)
         ada.query("snap/*/0")
         answers: list = []
@@ -238,13 +238,13 @@ def test_one_question_for_many_cells_names_each():
         assert sorted(answer.key for answer in answers) == ["snap/0/0", "snap/1/0", "snap/2/0"]
 
 
-def test_what_cannot_be_believed_is_dropped_counted_and_said_once(caplog):
+def test_invalid_records_are_dropped_counted_and_logged_once(caplog):
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.join(hello("ada"))
         good = messages.encode_records([box()])
         publisher = ada.publisher("fact/0/0/ada", reliable=True)
         nowhere = ada.publisher("fact/0/ada", reliable=True)
-        wait(lambda: publisher.matching and nowhere.matching, "the server's ear")
+        wait(lambda: publisher.matching and nowhere.matching, "the server's subscription")
         for payload in (b"", b"junk", good[:-2], b"VS\x09\x04" + good[4:], bytes(messages.MAX_MESSAGE + 1)):
             publisher.put(payload)
         nowhere.put(good)
@@ -255,10 +255,10 @@ def test_what_cannot_be_believed_is_dropped_counted_and_said_once(caplog):
         assert len([line for line in caplog.messages if "cannot be believed" in line]) == 1
         for question in ("snap/x/0", "snap/1/1.5"):
             ada.query(question)
-        wait(lambda: server.malformed == 9, "two questions that name no cell")
+        wait(lambda: server.malformed == 9, "two queries without a valid cell")
 
 
-def test_who_says_too_much_is_cut_off_and_nobody_else(caplog):
+def test_a_quota_limits_only_the_client_that_exceeds_it(caplog):
     with (
         Server("tcp/127.0.0.1:0", quota=Quota(1.0, 1e6)) as server,
         ZenohBus("ada", connect=server.endpoint) as ada,
@@ -266,23 +266,23 @@ def test_who_says_too_much_is_cut_off_and_nobody_else(caplog):
     ):
         ada.join(hello("ada"))
         flood = ada.publisher("fact/0/0/ada", reliable=True)
-        wait(lambda: flood.matching, "the server's ear")
+        wait(lambda: flood.matching, "the server's subscription")
         for number in range(50):
             flood.put(messages.encode_records([box(number)]))
-        say(bob, (1, 1), box(99, author="bob"))
+        publish(bob, (1, 1), box(99, author="bob"))
         assert snapshot(bob, (1, 1), 1) == [box(99, author="bob")]
         wait(lambda: server.store.counters.received == 51, "all to arrive")
-        wait(lambda: server.store.count() + server.store.counters.over_quota == 51, "all to be judged")
+        wait(lambda: server.store.count() + server.store.counters.over_quota == 51, "all to be processed")
         assert 5 <= server.store.count() <= 10
         assert len([line for line in caplog.messages if "quota" in line]) == 1
 
 
-def test_facts_wait_until_somebody_is_let_into_their_world(monkeypatch):
+def test_records_wait_until_an_actor_is_admitted_to_their_world(monkeypatch):
     monkeypatch.setattr(retained_store, "MAX_EARLY", 2)
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         for number in range(3):
-            say(ada, (0, 0), box(number))
-        wait(lambda: server.store.counters.rejected == 1, "the oldest to be given up")
+            publish(ada, (0, 0), box(number))
+        wait(lambda: server.store.counters.rejected == 1, "the oldest to be rejected")
         assert server.store.count() == 0
         ada.join(hello("ada"))
         assert snapshot(ada, (0, 0), 2) == [box(1), box(2)]
@@ -310,13 +310,13 @@ def serving(endpoint, folder):
         process.stdout.close()
 
 
-def test_a_server_killed_in_full_flight_has_lost_nothing_it_told(tmp_path):
+def test_a_killed_server_loses_no_record_that_it_published(tmp_path):
     with serving("tcp/127.0.0.1:0", tmp_path) as (process, endpoint), ZenohBus("ada", connect=endpoint) as ada:
         ada.join(hello("ada"))
-        say(ada, (0, 0), *[box(number) for number in range(50)])
-        told = snapshot(ada, (0, 0), 50)
+        publish(ada, (0, 0), *[box(number) for number in range(50)])
+        expected = snapshot(ada, (0, 0), 50)
         flood = ada.publisher("fact/0/0/ada", reliable=True)
-        wait(lambda: flood.matching, "the server's ear")
+        wait(lambda: flood.matching, "the server's subscription")
         for number in range(50, 150):
             flood.put(messages.encode_records([box(number)]))
         process.kill()
@@ -324,50 +324,52 @@ def test_a_server_killed_in_full_flight_has_lost_nothing_it_told(tmp_path):
         with serving(endpoint, tmp_path):
             wait(lambda: not ada.status_message, "ada to be back")
             again = snapshot(ada, (0, 0), 50)
-            assert again[:50] == told
-            assert again == [box(number) for number in range(len(again))]  # and of the rest the first that came
+            assert again[:50] == expected
+            assert again == [box(number) for number in range(len(again))]  # of the rest a prefix is kept
 
 
-def test_what_was_picked_is_said_again_to_a_server_that_forgot_it(tmp_path):
-    """Those who are there are its memory."""
+def test_records_are_published_again_to_a_server_that_lost_them(tmp_path):
+    """Connected clients publish their records again."""
     with (
         serving("tcp/127.0.0.1:0", tmp_path / "one") as (first, endpoint),
         ZenohBus("ada", connect=endpoint) as ada,
         ZenohBus("late", connect=endpoint) as late,
     ):
         ada.join(hello("ada"))
-        telling = RetainedSync(ada, Counters())
-        told: list = []
+        sync = RetainedSync(ada, Counters())
+        received: list = []
 
-        def ticking(condition):
+        def while_syncing(condition):
             def check():
-                telling.update_window([(0, 0)], 0, time.monotonic())
-                telling.flush()
+                sync.update_window([(0, 0)], 0, time.monotonic())
+                sync.flush()
                 time.sleep(0.005)
                 return condition()
 
             return check
 
-        def known():
+        def complete():
             late.query("snap/0/0")
-            told[:] = [fact for answer in late.replies() for fact in messages.decode_records(answer.payload)] or told
-            return told == [box(number) for number in range(30)]
+            received[:] = [
+                record for answer in late.replies() for record in messages.decode_records(answer.payload)
+            ] or received
+            return received == [box(number) for number in range(30)]
 
         for number in range(30):
-            telling.publish((0, 0), box(number))
-        wait(ticking(known), "thirty facts")
+            sync.publish((0, 0), box(number))
+        wait(while_syncing(complete), "thirty records")
         first.kill()
         first.wait()
-        wait(ticking(lambda: ada.status_message), "ada to miss the server")
-        with serving(endpoint, tmp_path / "another"):  # a folder with nothing in it
-            told.clear()
-            wait(ticking(known), "the same facts again")
+        wait(while_syncing(lambda: ada.status_message), "ada to notice the lost server")
+        with serving(endpoint, tmp_path / "another"):  # an empty folder
+            received.clear()
+            wait(while_syncing(complete), "the same records again")
 
 
-def test_the_scene_is_kept_with_the_facts(tmp_path):
+def test_the_scene_is_stored_with_the_records(tmp_path):
     with Server("tcp/127.0.0.1:0", state_folder=tmp_path) as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.join(hello("ada"))
-        say(ada, (0, 0), box())
+        publish(ada, (0, 0), box())
         snapshot(ada, (0, 0), 1)
     assert [path.name for path in tmp_path.iterdir()] == ["vineyard.facts"]
     with Server("tcp/127.0.0.1:0", state_folder=tmp_path) as server, ZenohBus("bob", connect=server.endpoint) as bob:
@@ -381,8 +383,8 @@ def test_the_scene_is_kept_with_the_facts(tmp_path):
 # ---------------------------------------------------------------- several servers
 
 
-def meet(one, other):
-    """Poses and events of each reach the other, over however many routers, and what may be lost stays what it is."""
+def assert_connected(one, other):
+    """Poses and events of each reach the other over any number of routers."""
     for sender, receiver in ((one, other), (other, one)):
         receiver.subscribe(f"a/{sender.name}")
         receiver.subscribe(f"own/0/0/{sender.name}", KEEP_ALL)
@@ -390,19 +392,19 @@ def meet(one, other):
         event = sender.publisher(f"own/0/0/{sender.name}", reliable=True)
         wait(lambda pose=pose, event=event: pose.matching and event.matching, "the other's subscriptions")
         assert event.put(b"event")
-        heard: set = set()
+        received: set = set()
 
-        def arrived(pose=pose, receiver=receiver, heard=heard):
+        def arrived(pose=pose, receiver=receiver, received=received):
             pose.put(b"pose")
             time.sleep(0.002)
-            heard.update(receiver.poll())
-            return len(heard) == 2
+            received.update(receiver.poll())
+            return len(received) == 2
 
         wait(arrived, "a pose and an event")
 
 
 @pytest.mark.parametrize("protocol", ["tcp", "udp"])
-def test_of_two_linked_servers_one_decides_and_keeps_for_both(protocol):
+def test_of_two_linked_servers_one_admits_and_stores_for_both(protocol):
     with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as hub:
         address = hub.endpoint.partition("/")[2]
         with (
@@ -416,9 +418,9 @@ def test_of_two_linked_servers_one_decides_and_keeps_for_both(protocol):
             with pytest.raises(JoinRejected, match="'D2', world 'vineyard' has 'vsp' with 'D1'"):
                 ada.join(hello("ada", "D2"))
             ada.join(hello("ada"))
-            meet(ada, bob)
-            say(bob, (0, 0), box(0, author="bob"))
-            say(ada, (0, 0), box(1))
+            assert_connected(ada, bob)
+            publish(bob, (0, 0), box(0, author="bob"))
+            publish(ada, (0, 0), box(1))
             assert snapshot(ada, (0, 0), 2) == snapshot(bob, (0, 0), 2) == [box(0, author="bob"), box(1)]
             with pytest.raises(NameTaken):
                 ZenohBus("ada", connect=relay.endpoint)
@@ -428,7 +430,7 @@ def test_of_two_linked_servers_one_decides_and_keeps_for_both(protocol):
             assert (hub.pings, relay.pings) == (1, 0)
 
 
-def test_linked_servers_have_a_way_for_what_may_be_lost():
+def test_linked_servers_have_a_best_effort_and_a_reliable_link():
     with Server("udp/127.0.0.1:0") as hub, Server("tcp/127.0.0.1:0", connect=[hub.endpoint]) as relay:
         wait(lambda: len(relay._session.info.links()) == 2, "both links")
         kinds = [link.reliability for link in relay._session.info.links()]
@@ -436,29 +438,29 @@ def test_linked_servers_have_a_way_for_what_may_be_lost():
         assert zenoh.Reliability.RELIABLE in kinds
 
 
-def test_a_server_that_carries_waits_for_the_one_that_keeps():
+def test_a_relay_waits_for_its_hub():
     (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
     with Server("tcp/127.0.0.1:0", connect=[str(endpoint)]) as relay, ZenohBus("ada", connect=relay.endpoint) as ada:
-        ada.join(hello("ada"))  # nobody decides yet
+        ada.join(hello("ada"))  # no server decides yet
         assert not ada.status_message
         with Server(str(endpoint)) as hub:
-            wait(lambda: hub._admission.scene_of("vineyard") == SceneId("vsp", "D1"), "ada to say who she is")
+            wait(lambda: hub._admission.scene_of("vineyard") == SceneId("vsp", "D1"), "ada to announce herself")
         wait(
             lambda: "the server that keeps world 'vineyard' is gone" in ada.status_message,
-            "ada to miss the one that keeps",
+            "ada to notice the lost hub",
         )
         with Server(str(endpoint)) as hub:
-            wait(lambda: not ada.status_message and hub.actors == ["vineyard/ada"], "ada to be well")
+            wait(lambda: not ada.status_message and hub.actors == ["vineyard/ada"], "ada to be connected")
 
 
-def test_a_server_that_carries_is_not_asked_to_keep(tmp_path):
+def test_a_relay_refuses_options_of_the_hub(tmp_path):
     with pytest.raises(
         ValueError, match=r"only carries: give --state-dir, --scene and --max-clients to the one server"
     ):
         Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], state_folder=tmp_path)
 
 
-def test_the_configuration_for_stock_routers_is_true():
+def test_the_documented_configuration_for_stock_routers_works():
     text = (pathlib.Path(__file__).parents[2] / "docs/network-routers.md").read_text()
     snippet = re.search(r"```json5\n(.*?)```", text, re.S).group(1)
     stream, datagrams = resolve_ports(["tcp/127.0.0.1:0", "udp/127.0.0.1:0"])
@@ -473,5 +475,5 @@ def test_the_configuration_for_stock_routers_is_true():
             with pytest.raises(JoinRejected, match="'D2'"):
                 bob.join(hello("bob", "D2"))
             bob.join(hello("bob"))
-            meet(ada, bob)
+            assert_connected(ada, bob)
         close_session(router)

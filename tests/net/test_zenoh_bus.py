@@ -1,4 +1,4 @@
-"""The bus over real Zenoh on loopback: tcp, free ports, no multicast; waits for conditions, never for time alone."""
+"""The bus over real Zenoh on loopback: tcp, free ports, no multicast; tests wait for conditions, not for times."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def server() -> Iterator[Server]:
         yield running
 
 
-class Wire:
-    """A relay between a client and the router that counts every byte each way, framing and all."""
+class CountingRelay:
+    """A TCP relay between a client and the router that counts all bytes each way."""
 
     def __init__(self, endpoint: str) -> None:
         host, _, port = endpoint.removeprefix("tcp/").rpartition(":")
@@ -55,26 +55,26 @@ class Wire:
                 client, _ = self._listener.accept()
                 router = socket.create_connection(self._target)
                 self._sockets += [client, router]
-                for source, target, way in ((client, router, "up"), (router, client, "down")):
-                    threading.Thread(target=self._carry, args=(source, target, way), daemon=True).start()
+                for source, target, direction in ((client, router, "up"), (router, client, "down")):
+                    threading.Thread(target=self._forward, args=(source, target, direction), daemon=True).start()
 
-    def _carry(self, source: socket.socket, target: socket.socket, way: str) -> None:
+    def _forward(self, source: socket.socket, target: socket.socket, direction: str) -> None:
         with contextlib.suppress(OSError):
             while data := source.recv(65536):
-                setattr(self, way, getattr(self, way) + len(data))
+                setattr(self, direction, getattr(self, direction) + len(data))
                 target.sendall(data)
         with contextlib.suppress(OSError):
             target.shutdown(socket.SHUT_RDWR)
 
-    def __enter__(self) -> Wire:
+    def __enter__(self) -> CountingRelay:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for each in self._sockets:
-            each.close()
+        for socket_ in self._sockets:
+            socket_.close()
 
 
-def test_samples_cross_and_depths_hold(server):
+def test_samples_arrive_with_the_depth_of_their_subscription(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
         bob.subscribe("c/0/0/*")
         bob.subscribe("own/0/0/*", KEEP_ALL)
@@ -84,19 +84,19 @@ def test_samples_cross_and_depths_hold(server):
             assert pose.put(bytes([number]))
             assert event.put(bytes([number]))
         wait(lambda: bob.bytes_in == 200, "all samples")
-        heard = bob.poll()
-        assert [payload[0] for key, payload in heard if key == "own/0/0/ada"] == list(range(100))
-        assert [payload[0] for key, payload in heard if key == "c/0/0/ada"] == [99]
+        received = bob.poll()
+        assert [payload[0] for key, payload in received if key == "own/0/0/ada"] == list(range(100))
+        assert [payload[0] for key, payload in received if key == "c/0/0/ada"] == [99]
         assert (ada.bytes_out, bob.bytes_in) == (200, 200)
 
 
-def test_without_a_listener_not_one_byte_is_on_the_wire(server):
+def test_without_a_subscriber_zenoh_sends_no_byte(server):
     with (
-        Wire(server.endpoint) as wire,
-        ZenohBus("ada", connect=wire.endpoint) as ada,
+        CountingRelay(server.endpoint) as relay,
+        ZenohBus("ada", connect=relay.endpoint) as ada,
         ZenohBus("bob", connect=server.endpoint) as bob,
     ):
-        # both hear the neighbouring cell, ada also her own: neither may make her send
+        # both subscribe to a neighbouring cell, ada also to her own: neither may make her send
         bob.subscribe("c/1/0/*")
         ada.subscribe("c/0/0/*")
         here, there = ada.publisher("c/0/0/ada"), ada.publisher("c/1/0/ada")
@@ -105,14 +105,14 @@ def test_without_a_listener_not_one_byte_is_on_the_wire(server):
         payload = bytes(200)
 
         def cost(publisher, count: int) -> int:
-            before, heard = wire.up, bob.bytes_in
+            before, received = relay.up, bob.bytes_in
             for _ in range(count):
-                # past the bus's own look at matching: it is Zenoh that must not send
+                # bypasses the bus's check of matching: Zenoh itself must not send
                 publisher._publisher.put(payload)
-            ended = heard + 3 + (200 * count if publisher is there else 0)
+            ended = received + 3 + (200 * count if publisher is there else 0)
             assert there.put(b"end")
             wait(lambda: bob.bytes_in == ended, "the sample that ends the count")
-            return wire.up - before
+            return relay.up - before
 
         assert cost(there, 50) > 50 * 200
         # the end mark, and perhaps a keepalive of a few bytes
@@ -121,64 +121,64 @@ def test_without_a_listener_not_one_byte_is_on_the_wire(server):
         assert ada.bytes_out == 6  # the two end marks, put through the bus
 
 
-def test_payload_bytes_are_what_crosses_the_wire(server):
+def test_counted_payload_bytes_equal_the_traffic(server):
     with (
-        Wire(server.endpoint) as wire,
-        ZenohBus("ada", connect=wire.endpoint) as ada,
+        CountingRelay(server.endpoint) as relay,
+        ZenohBus("ada", connect=relay.endpoint) as ada,
         ZenohBus("bob", connect=server.endpoint) as bob,
     ):
         bob.subscribe("c/0/0/*", KEEP_ALL)
         publisher = ada.publisher("c/0/0/ada")
         wait(lambda: publisher.matching, "bob's subscription")
-        before = wire.up
+        before = relay.up
         for _ in range(50):
             publisher.put(bytes(1000))
             time.sleep(0.001)
         wait(lambda: bob.bytes_in == 50_000, "all samples")
         assert ada.bytes_out == 50_000
-        assert 50_000 <= wire.up - before < 50_000 + 50 * 80
+        assert 50_000 <= relay.up - before < 50_000 + 50 * 80
 
 
-def test_a_name_is_live_once_and_free_again_after_leaving(server):
+def test_a_name_is_live_once_and_free_after_leaving(server):
     with ZenohBus("ada", connect=server.endpoint):
         with pytest.raises(NameTaken, match="'ada' is already live in world 'vineyard'"):
             ZenohBus("ada", connect=server.endpoint)
         with ZenohBus("ada", connect=server.endpoint, world="other") as elsewhere:
             assert elsewhere.alive() == {"ada"}
-    with ZenohBus("ada", connect=server.endpoint) as again:
-        assert again.alive() == {"ada"}
+    with ZenohBus("ada", connect=server.endpoint) as reset:
+        assert reset.alive() == {"ada"}
 
 
-def test_of_two_who_come_at_once_not_both_stay(server):
-    found: list[object] = []
+def test_at_most_one_of_simultaneous_joins_keeps_the_name(server):
+    outcomes: list[object] = []
 
     def join() -> None:
         try:
-            found.append(ZenohBus("ada", connect=server.endpoint))
+            outcomes.append(ZenohBus("ada", connect=server.endpoint))
         except NameTaken as error:
-            found.append(error)
+            outcomes.append(error)
 
     threads = [threading.Thread(target=join) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    buses = [each for each in found if isinstance(each, ZenohBus)]
+    buses = [socket_ for socket_ in outcomes if isinstance(socket_, ZenohBus)]
     for bus in buses:
         bus.close()
-    assert len(found) == 4
+    assert len(outcomes) == 4
     assert len(buses) <= 1
 
 
-def test_who_is_there_is_known_at_once_and_who_leaves_is_missed(server):
+def test_actors_are_known_at_once_and_leaving_is_noticed(server):
     with ZenohBus("ada", connect=server.endpoint) as ada:
         with ZenohBus("bob", connect=server.endpoint) as bob:
             assert bob.alive() == {"ada", "bob"}
-            wait(lambda: ada.alive() == {"ada", "bob"}, "bob to be seen")
-        wait(lambda: ada.alive() == {"ada"}, "bob to be missed")
+            wait(lambda: ada.alive() == {"ada", "bob"}, "bob to join")
+        wait(lambda: ada.alive() == {"ada"}, "bob to leave")
 
 
-def test_without_a_server_there_is_one_clear_line():
+def test_an_unreachable_server_is_one_clear_line():
     with socket.create_server(("127.0.0.1", 0)) as reserved:
         endpoint = f"tcp/127.0.0.1:{reserved.getsockname()[1]}"
     with pytest.raises(ServerUnreachable, match="vinesim server") as caught:
@@ -188,41 +188,41 @@ def test_without_a_server_there_is_one_clear_line():
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "*", "vs 1"])
-def test_a_name_that_is_no_key_is_refused(name):
+def test_an_invalid_actor_name_is_refused(name):
     with pytest.raises(ValueError, match="letters, digits"):
         ZenohBus(name)
 
 
-def test_questions_find_their_answers(server):
+def test_a_query_returns_its_reply(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
-        bob.declare_queryable("hello/bob", lambda question: question + b"!")
+        bob.declare_queryable("hello/bob", lambda query: query + b"!")
         answers: list = []
 
-        def asked() -> bool:
+        def reply_arrived() -> bool:
             ada.query("hello/bob", b"hi")
             time.sleep(0.02)
             answers.extend(ada.replies())
             return bool(answers)
 
-        wait(asked, "bob's answer")
+        wait(reply_arrived, "bob's answer")
         assert answers[0][:2] == ("hello/bob", b"hi!")
         assert 0.0 <= answers[0].age < TIMEOUT
 
 
-def test_a_huge_sample_is_not_kept(server):
+def test_an_oversized_sample_is_dropped(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
         bob.subscribe("own/0/0/*", KEEP_ALL)
         event = ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: event.matching, "bob's subscription")
         event.put(bytes(messages.MAX_MESSAGE + 1))
-        event.put(bytes(5 * messages.MAX_MESSAGE))  # the router does not even put this together
+        event.put(bytes(5 * messages.MAX_MESSAGE))  # the router does not even reassemble this
         event.put(b"small")
         wait(lambda: bob.bytes_in == messages.MAX_MESSAGE + 6, "both samples")
         assert bob.poll() == [("own/0/0/ada", b"small")]
         assert bob.dropped == 1
 
 
-def test_a_session_left_open_does_not_hang_at_exit(server):
+def test_an_open_session_does_not_block_exit(server):
     code = (
         "from vinesim.net.transport.zenoh_bus import ZenohBus\n"
         f"bus = ZenohBus('ada', connect={server.endpoint!r})\nprint('in')"
@@ -249,13 +249,13 @@ class Client:
         self.robot = RobotUpdate(bus.name, 0.0, frames.pose(np.array([x, 0, 0])), np.zeros(6), np.zeros(1), np.zeros(1))
         self.touched: set[int] = set()
         self.robots: dict[str, RobotUpdate] = {}
-        self.heard: list = []
+        self.received: list = []
 
     def tick(self) -> None:
         now = time.monotonic()
         inbox = self.replicator.receive(now)
         self.robots = inbox.robots
-        self.heard += inbox.trees
+        self.received += inbox.trees
         self.replicator.send(now, self.robot, touched=self.touched, read=self.read)
 
     def read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -263,7 +263,7 @@ class Client:
         return self.state.joint_q[bodies], self.state.joint_qd[bodies]
 
 
-def together(*clients: Client) -> Callable[[Callable[[], object]], Callable[[], object]]:
+def ticking_all(*clients: Client) -> Callable[[Callable[[], object]], Callable[[], object]]:
     def ticking(condition: Callable[[], object]) -> Callable[[], object]:
         def check() -> object:
             for client in clients:
@@ -275,14 +275,14 @@ def together(*clients: Client) -> Callable[[Callable[[], object]], Callable[[], 
     return ticking
 
 
-def test_two_clients_exchange_what_is_touched_near_and_nothing_far(server):
+def test_touched_trees_are_exchanged_near_and_not_far(server):
     with (
-        Wire(server.endpoint) as wire,
-        ZenohBus("ada", connect=wire.endpoint) as a,
+        CountingRelay(server.endpoint) as relay,
+        ZenohBus("ada", connect=relay.endpoint) as a,
         ZenohBus("bob", connect=server.endpoint) as b,
     ):
         ada, bob = Client(a, 1.0), Client(b, 60.0)
-        ticking = together(ada, bob)
+        ticking = ticking_all(ada, bob)
         wait(ticking(lambda: "bob" in ada.robots and "ada" in bob.robots), "both to see each other")
         wait(ticking(lambda: abs(ada.replicator.offset + time.monotonic() - time.time()) < 0.1), "the server's clock")
         ada.touched = {0}
@@ -292,21 +292,21 @@ def test_two_clients_exchange_what_is_touched_near_and_nothing_far(server):
         poses = counters.actor.messages_out
         wait(ticking(lambda: counters.actor.messages_out > poses + 5), "a second of far poses")
         assert (counters.environment.messages_out, counters.event.messages_out) == (0, 0)
-        # all that left is poses and upkeep: were trees among it, thousands of bytes would be
+        # only poses and upkeep were sent: trees would cost thousands of bytes
         assert a.bytes_out == counters.actor.bytes_out
         assert ada.replicator.owner(0) == "ada"
         assert bob.replicator.owner(0) is None
         bob.robot = RobotUpdate("bob", 0.0, frames.pose(np.array([2.0, 0, 0])), np.zeros(6), np.zeros(1), np.zeros(1))
-        wait(ticking(lambda: bob.heard), "the touched tree")
-        update = bob.heard[0]
+        wait(ticking(lambda: bob.received), "the touched tree")
+        update = bob.received[0]
         assert (update.tree, update.owner) == (0, "ada")
         np.testing.assert_allclose(update.joint_q, ada.read(0)[0], atol=1e-4)
         ada.touched = set()
         wait(ticking(lambda: bob.replicator.owner(0) is None), "the rest record")
-        assert wire.up > 0
+        assert relay.up > 0
 
 
-def test_a_router_that_is_killed_and_restarted_resumes():
+def test_replication_resumes_after_a_router_restart():
     code = (
         "import sys\nfrom vinesim.net.server.server import Server\n"
         "with Server(sys.argv[1]) as server:\n    print('up', flush=True)\n    server.run()"
@@ -324,14 +324,14 @@ def test_a_router_that_is_killed_and_restarted_resumes():
     try:
         with ZenohBus("ada", connect=endpoint) as a, ZenohBus("bob", connect=endpoint) as b:
             ada, bob = Client(a, 1.0), Client(b, 2.0)
-            ticking = together(ada, bob)
+            ticking = ticking_all(ada, bob)
             ada.touched = {1}
             wait(ticking(lambda: bob.replicator.owner(1) == "ada"), "the first touch")
             router.kill()
             router.wait()
             wait(ticking(lambda: a.status_message and b.status_message), "both to notice that the server is gone")
             assert endpoint in a.status_message
-            wait(ticking(lambda: a.alive() == {"ada"} and not bob.robots), "each to be alone")
+            wait(ticking(lambda: a.alive() == {"ada"} and not bob.robots), "both to be without peers")
             assert ada.replicator.owner(1) == "ada"
             router = start()
             wait(ticking(lambda: bob.replicator.owner(1) == "ada" and "ada" in bob.robots), "the stream again")
@@ -344,8 +344,8 @@ def test_a_router_that_is_killed_and_restarted_resumes():
 # ---------------------------------------------------------------- links
 
 
-class Pump:
-    """Sends a pose and an event each time it is asked whether both have arrived by now."""
+class PoseAndEvent:
+    """A condition for ``wait``: sends a pose and an event at each call, true when both have arrived."""
 
     def __init__(self, sender: ZenohBus, receiver: ZenohBus) -> None:
         receiver.subscribe(f"a/{sender.name}")
@@ -353,24 +353,24 @@ class Pump:
         self._pose = sender.publisher(f"a/{sender.name}")
         self._event = sender.publisher(f"own/0/0/{sender.name}", reliable=True)
         self._receiver = receiver
-        self._heard: set[str] = set()
+        self._received: set[str] = set()
 
-    def again(self) -> None:
+    def reset(self) -> None:
         self._receiver.poll()
-        self._heard.clear()
+        self._received.clear()
 
     def __call__(self) -> bool:
         self._pose.put(bytes(1000))
         self._event.put(b"event")
         time.sleep(0.002)
-        self._heard.update(key for key, _ in self._receiver.poll())
-        return len(self._heard) == 2
+        self._received.update(key for key, _ in self._receiver.poll())
+        return len(self._received) == 2
 
 
-def test_poses_are_datagrams_beside_the_stream_of_events(server):
-    with Wire(server.endpoint) as wire:
-        port = wire.endpoint.rpartition(":")[2]
-        # datagrams at the relay's port number, past the relay
+def test_poses_use_datagrams_and_events_the_stream(server):
+    with CountingRelay(server.endpoint) as relay:
+        port = relay.endpoint.rpartition(":")[2]
+        # a datagram server at the relay's port number, so datagrams bypass the relay
         with (
             Server(f"udp/127.0.0.1:{port}", connect=[server.endpoint]),
             ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada,
@@ -382,36 +382,38 @@ def test_poses_are_datagrams_beside_the_stream_of_events(server):
             bob.subscribe("own/0/0/ada", KEEP_ALL)
             pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
             wait(lambda: pose.matching and event.matching, "bob's subscriptions")
-            before = wire.up
+            before = relay.up
             wait(lambda: (pose.put(bytes(1000)) and time.sleep(0.001)) or bob.bytes_in >= 50_000, "fifty poses")
-            assert wire.up - before < 5_000
+            assert relay.up - before < 5_000
             for _ in range(20):
                 event.put(bytes(1000))
-            heard: list = []
-            wait(lambda: heard.extend(bob.poll()) or sum(k[0] == "o" for k, _ in heard) == 20, "all events")
-            assert wire.up - before > 20_000
+            received: list = []
+            wait(lambda: received.extend(bob.poll()) or sum(k[0] == "o" for k, _ in received) == 20, "all events")
+            assert relay.up - before > 20_000
 
 
-def test_where_no_datagrams_pass_poses_take_the_stream_and_the_log_says_so(server, caplog):
+def test_poses_use_the_stream_if_datagrams_are_blocked_and_this_is_logged(server, caplog):
     port = server.endpoint.rpartition(":")[2]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:  # takes every handshake and answers none
-        silent.bind(("127.0.0.1", int(port)))
+    with socket.socket(
+        socket.AF_INET, socket.SOCK_DGRAM
+    ) as unresponsive:  # receives every handshake and replies to none
+        unresponsive.bind(("127.0.0.1", int(port)))
         with ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada, ZenohBus("bob", connect=server.endpoint) as bob:
             assert len([line for line in caplog.messages if "no datagrams pass" in line]) == 1
             assert [link.partition(" ")[2] for link in ada.links] == ["reliable"]
-            wait(Pump(ada, bob), "a pose and an event")
+            wait(PoseAndEvent(ada, bob), "a pose and an event")
 
 
-class DatagramWire:
-    """A relay of datagrams between one client and the router, until it is closed."""
+class DatagramRelay:
+    """A UDP relay between one client and the router, until it is closed."""
 
     def __init__(self, port: int, target: int) -> None:
         self._outer, self._inner = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
         self._outer.bind(("127.0.0.1", port))
         self._inner.connect(("127.0.0.1", target))
         self._client: tuple[str, int] | None = None
-        for carry in (self._there, self._back):
-            threading.Thread(target=carry, daemon=True).start()
+        for forward in (self._there, self._back):
+            threading.Thread(target=forward, daemon=True).start()
 
     def _there(self) -> None:
         with contextlib.suppress(OSError):
@@ -427,23 +429,23 @@ class DatagramWire:
                 self._outer.sendto(data, self._client)
 
     def close(self) -> None:
-        for each in (self._outer, self._inner):
-            each.close()
+        for socket_ in (self._outer, self._inner):
+            socket_.close()
 
 
-def test_when_datagrams_pass_no_more_poses_take_the_stream(caplog, monkeypatch):
+def test_poses_move_to_the_stream_when_datagrams_stop(caplog, monkeypatch):
     monkeypatch.setattr(zenoh_bus, "SILENCE_TIMEOUT", 1.0)
-    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, Wire(server.endpoint) as wire:
-        port = int(wire.endpoint.rpartition(":")[2])
-        datagrams = DatagramWire(port, server.endpoints[1].port)
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, CountingRelay(server.endpoint) as relay:
+        port = int(relay.endpoint.rpartition(":")[2])
+        datagrams = DatagramRelay(port, server.endpoints[1].port)
         with ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada, ZenohBus("bob", connect=server.endpoint) as bob:
             assert len(ada.links) == 3
-            there, back = Pump(ada, bob), Pump(bob, ada)
+            there, back = PoseAndEvent(ada, bob), PoseAndEvent(bob, ada)
             wait(lambda: there() and back(), "poses each way")
             datagrams.close()
-            wait(lambda: "udp/" in ada.status_message, "ada to miss the datagrams")
-            there.again()
-            back.again()
+            wait(lambda: "udp/" in ada.status_message, "ada to notice the lost datagrams")
+            there.reset()
+            back.reset()
             wait(lambda: there() and back(), "poses over the stream")
             assert ada.status_message == ""
             assert [link.partition(" ")[2] for link in ada.links] == ["reliable"]
@@ -459,30 +461,32 @@ with ZenohBus("ada", connect=sys.argv[1]):
 """
 
 
-@pytest.mark.parametrize("way", [0, 1], ids=["tcp", "udp"])
-def test_a_frozen_client_is_missed(way):
+@pytest.mark.parametrize("direction", [0, 1], ids=["tcp", "udp"])
+def test_a_frozen_client_is_removed(direction):
     with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, ZenohBus("bob", connect=server.endpoint) as bob:
         process = subprocess.Popen(
-            [sys.executable, "-c", JOIN, str(server.endpoints[way])], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            [sys.executable, "-c", JOIN, str(server.endpoints[direction])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
         )
         try:
             assert process.stdout is not None
             assert process.stdout.readline() == b"in\n"
             wait(lambda: "ada" in bob.alive() and "vineyard/ada" in server.actors, "ada")
             process.send_signal(signal.SIGSTOP)
-            wait(lambda: "ada" not in bob.alive() and "vineyard/ada" not in server.actors, "ada to be missed")
+            wait(lambda: "ada" not in bob.alive() and "vineyard/ada" not in server.actors, "ada to leave")
         finally:
             process.kill()
             process.communicate()
 
 
 @pytest.mark.parametrize("protocols", ["tcp udp", "tls quic"])
-def test_after_a_kill_streams_come_again_over_every_link(protocols, tmp_path):
+def test_all_links_resume_after_a_server_restart(protocols, tmp_path):
     stream, datagrams = protocols.split()
     secure = stream == "tls"
     for name in ("ada", "bob") if secure else ():
         create(tmp_path, name)
-    wanted = resolve_ports([f"{stream}/127.0.0.1:0", f"{datagrams}/127.0.0.1:0"], secured=secure)
+    endpoints = resolve_ports([f"{stream}/127.0.0.1:0", f"{datagrams}/127.0.0.1:0"], secured=secure)
     code = (
         "import pathlib, sys\nfrom vinesim.net.server.server import Server\n"
         f"with Server(sys.argv[1:], certificates={f'pathlib.Path({str(tmp_path)!r})' if secure else None}) as server:\n"
@@ -490,7 +494,9 @@ def test_after_a_kill_streams_come_again_over_every_link(protocols, tmp_path):
     )
 
     def start() -> subprocess.Popen:
-        process = subprocess.Popen([sys.executable, "-c", code, *map(str, wanted)], stdout=subprocess.PIPE, text=True)
+        process = subprocess.Popen(
+            [sys.executable, "-c", code, *map(str, endpoints)], stdout=subprocess.PIPE, text=True
+        )
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         return process
@@ -499,19 +505,22 @@ def test_after_a_kill_streams_come_again_over_every_link(protocols, tmp_path):
     certificates = tmp_path if secure else None
     try:
         with (
-            ZenohBus("ada", connect=str(wanted[1]), certificates=certificates) as ada,
-            ZenohBus("bob", connect=str(wanted[1]), certificates=certificates) as bob,
+            ZenohBus("ada", connect=str(endpoints[1]), certificates=certificates) as ada,
+            ZenohBus("bob", connect=str(endpoints[1]), certificates=certificates) as bob,
         ):
             assert len(ada.links) == len(bob.links) == 3
-            both = Pump(ada, bob)
+            both = PoseAndEvent(ada, bob)
             wait(both, "a pose and an event")
             router.kill()
             router.wait()
             wait(lambda: ada.status_message and bob.status_message, "both to notice")
             router = start()
-            both.again()
+            both.reset()
             wait(both, "both streams again")
-            wait(lambda: not ada.status_message and not bob.status_message and len(ada.links) == 3, "both to be well")
+            wait(
+                lambda: not ada.status_message and not bob.status_message and len(ada.links) == 3,
+                "both to be connected",
+            )
     finally:
         router.kill()
         router.wait()

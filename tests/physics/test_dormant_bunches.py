@@ -1,4 +1,4 @@
-"""Picked bunches without bodies: many at once for nothing, and whole when somebody comes."""
+"""Dormant bunches: many at once without bodies, activated with their full mass near actors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vinesim import frames
 from vinesim.physics.step import Physics
 
 
-def test_many_are_laid_down_at_once_and_have_no_body():
+def test_many_dormant_bunches_are_added_without_bodies():
     physics = Physics(vineyard(40, 2, 0.5))
     trees = physics.model.body_tree[physics.model.bunch_body]
     poses = np.array([frames.pose([3.0, 0.2 * i, 0.05]) for i in range(40)])
@@ -20,19 +20,19 @@ def test_many_are_laid_down_at_once_and_have_no_body():
     assert physics.rigid.generation == generation
     assert physics.rigid.free_bunches == ()
     assert not physics.state.bunch_attached.any()
-    assert len(physics.plants.awake) == 0, f"{trees}: nobody wakes for it"
-    view = physics.snapshot()
-    assert [link.name for link in view.visuals][-40:] == [f"bunch/{i}" for i in range(40)]
-    np.testing.assert_allclose(view.visual_q[-40:-1], poses[:-1])
+    assert len(physics.plants.awake) == 0, f"{trees}: no tree wakes"
+    snapshot = physics.snapshot()
+    assert [link.name for link in snapshot.visuals][-40:] == [f"bunch/{i}" for i in range(40)]
+    np.testing.assert_allclose(snapshot.visual_q[-40:-1], poses[:-1])
     box = physics.support_tracker.object_state(BOX(1))[0]
-    np.testing.assert_allclose(view.visual_q[-1], frames.compose(box, poses[-1]), atol=1e-9)
-    assert physics.snapshot().visuals is view.visuals
-    # drawn with the shapes it had on its vine
-    assert len(view.visuals[-1].shapes) > 2
+    np.testing.assert_allclose(snapshot.visual_q[-1], frames.compose(box, poses[-1]), atol=1e-9)
+    assert physics.snapshot().visuals is snapshot.visuals
+    # drawn with the shapes it had on the vine
+    assert len(snapshot.visuals[-1].shapes) > 2
 
 
-def test_who_is_near_gets_a_body_with_the_weight_it_had():
-    physics, fallen = Physics(vineyard(3)), Physics(vineyard(3))
+def test_an_activated_bunch_has_the_mass_of_a_picked_one():
+    physics, picked = Physics(vineyard(3)), Physics(vineyard(3))
     physics.dormant_bunches.add([0, 1, 2], [""] * 3, np.array([frames.pose([x, 0.0, 0.05]) for x in (0.0, 1.0, 9.0)]))
     assert physics.dormant_bunches.nearest(np.array([[0.2, 0.0, 0.0]]), 5) == [0, 1]
     assert physics.dormant_bunches.nearest(np.array([[0.2, 0.0, 0.0]]), 1) == [0]
@@ -42,8 +42,8 @@ def test_who_is_near_gets_a_body_with_the_weight_it_had():
     assert physics.visuals() is not before
     assert physics.rigid.free_bunches == (0, 1)
     assert len(physics.dormant_bunches) == 1
-    fallen.pick(0)
-    world, other = physics.rigid.mj_model, fallen.rigid.mj_model
+    picked.pick(0)
+    world, other = physics.rigid.mj_model, picked.rigid.mj_model
     assert world.body("free_bunch/0").mass == pytest.approx(other.body("free_bunch/0").mass)
     np.testing.assert_allclose(world.body("free_bunch/0").inertia, other.body("free_bunch/0").inertia, rtol=1e-4)
     np.testing.assert_allclose(
@@ -55,7 +55,7 @@ def test_who_is_near_gets_a_body_with_the_weight_it_had():
         )
 
 
-def test_a_tree_whose_bunch_was_laid_down_moves_without_it_when_it_wakes():
+def test_a_tree_moves_without_its_dormant_bunch():
     physics, other = Physics(vineyard(1)), Physics(vineyard(1))
     physics.dormant_bunches.add([0], [""], frames.pose([3.0, 0.0, 0.05])[None])
     other.pick(0)
@@ -63,22 +63,22 @@ def test_a_tree_whose_bunch_was_laid_down_moves_without_it_when_it_wakes():
     for _ in range(30):
         physics.step()
         other.step()
-    for one in (physics, other):
-        one.update_kinematics()
+    for each in (physics, other):
+        each.update_kinematics()
     body = physics.model.bunch_body[0]
-    assert physics.state.body_q[body, 2] > 1.33, "it springs up"
+    assert physics.state.body_q[body, 2] > 1.33, "the cane rises"
     np.testing.assert_allclose(physics.state.body_q[body, :3], other.state.body_q[body, :3], atol=1e-3)
 
 
-def test_trees_rest_as_others_say_without_waking():
+def test_a_remote_rest_pose_is_applied_without_waking():
     physics, other = Physics(vineyard(2)), Physics(vineyard(2))
     other.pick(0)
     for _ in range(200):
         other.step()
-    here = other.model.bodies_of(0)
-    physics.apply_remote_rest([0], [other.state.joint_q[here]])
+    bodies = other.model.bodies_of(0)
+    physics.apply_remote_rest([0], [other.state.joint_q[bodies]])
     assert len(physics.plants.awake) == 0
     assert physics.remotely_posed.tolist() == [0]
     assert physics.snapshot().moved_trees.tolist() == [0]
     other.update_kinematics()
-    np.testing.assert_allclose(physics.state.body_q[here], other.state.body_q[here], atol=1e-5)
+    np.testing.assert_allclose(physics.state.body_q[bodies], other.state.body_q[bodies], atol=1e-5)

@@ -29,8 +29,10 @@ def row(count: int) -> ArticulationSolver:
     return ArticulationSolver(model, State.at_rest(model))
 
 
-@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e9])
-def test_a_poisoned_tree_is_rolled_back_and_the_others_go_on(poison: float, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("bad_value", [np.nan, np.inf, 1e9])
+def test_a_faulty_tree_is_rolled_back_and_the_others_continue(
+    bad_value: float, caplog: pytest.LogCaptureFixture
+) -> None:
     plants, clean = row(3), row(3)
     guard = FaultGuard(plants)
     for each in (plants, clean):
@@ -45,7 +47,7 @@ def test_a_poisoned_tree_is_rolled_back_and_the_others_go_on(poison: float, capl
             assert guard.stop_faulty_trees().size == 0
             continue
         before = plants.state.joint_q.copy()
-        plants.integrate(np.array([8]), np.array([[poison, 0.0, 0.0, 0.0, 0.0, 0.0]]))
+        plants.integrate(np.array([8]), np.array([[bad_value, 0.0, 0.0, 0.0, 0.0, 0.0]]))
         assert guard.stop_faulty_trees().tolist() == [1]
         assert not caplog.records
     bad, good = plants.model.bodies_of(1), np.delete(np.arange(18), plants.model.bodies_of(1))
@@ -61,7 +63,7 @@ def test_a_poisoned_tree_is_rolled_back_and_the_others_go_on(poison: float, capl
     assert guard.report() == []
 
 
-def test_a_stopped_tree_wakes_sound() -> None:
+def test_a_stopped_tree_wakes_in_a_valid_state() -> None:
     plants = row(1)
     guard = FaultGuard(plants)
     plants.wake(0)
@@ -81,67 +83,67 @@ def test_a_stopped_tree_wakes_sound() -> None:
 
 @functools.cache
 def clean_run(count: int) -> tuple[np.ndarray, ...]:
-    """Joints after each of forty ticks of a row in which nothing goes wrong."""
+    """Joint rotations after each of forty ticks of a row without faults."""
     plants = row(count)
     plants.wake(np.arange(count))
     plants.state.joint_qd[:, 1] = 0.3
-    seen = []
+    joints = []
     for _ in range(40):
         plants.predict()
         plants.integrate()
-        seen.append(plants.state.joint_q.copy())
-    return tuple(seen)
+        joints.append(plants.state.joint_q.copy())
+    return tuple(joints)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     tick=st.integers(0, 30),
-    body=st.integers(7, 11),  # not the root: a force on what is clamped moves nothing
+    body=st.integers(7, 11),  # not the root: a force on a clamped body moves nothing
     entry=st.integers(0, 2),
     value_in=st.one_of(
         st.tuples(st.sampled_from([np.nan, np.inf, -np.inf, 3e38]), st.sampled_from(["joint_q", "joint_qd", "wrench"])),
         st.tuples(st.sampled_from([np.nan, np.inf, -np.inf]), st.just("body_load")),
     ),
 )
-def test_no_bad_number_survives_a_tick(tick: int, body: int, entry: int, value_in: tuple[float, str]) -> None:
-    """Written anywhere, at any time: its tree sleeps, finite, reported, wakeable; the others are equal to the bit."""
-    value, what = value_in
+def test_no_non_finite_value_survives_a_tick(tick: int, body: int, entry: int, value_in: tuple[float, str]) -> None:
+    """A bad value in any array at any time: its tree sleeps, finite, reported, wakeable; the others are unchanged."""
+    value, array_name = value_in
     plants = row(3)
     guard = FaultGuard(plants)
     plants.wake(np.arange(3))
     plants.state.joint_qd[:, 1] = 0.3
     others = np.r_[0:6, 12:18]
-    for now in range(40):
+    for current in range(40):
         wrench = None
-        if now == tick and what == "wrench":
+        if current == tick and array_name == "wrench":
             wrench = np.zeros((1, 6))
             wrench[0, entry] = value
-        elif now == tick:
-            array = plants.body_load if what == "body_load" else getattr(plants.state, what)
+        elif current == tick:
+            array = plants.body_load if array_name == "body_load" else getattr(plants.state, array_name)
             array[body, entry] = value
         plants.predict()
         plants.integrate(None if wrench is None else np.array([body]), wrench)
         stopped = guard.stop_faulty_trees()
-        assert stopped.tolist() == ([1] if now == tick else [])
-        everything_is_finite(plants)
-        np.testing.assert_array_equal(plants.state.joint_q[others], clean_run(3)[now][others])
-        if now == tick:
+        assert stopped.tolist() == ([1] if current == tick else [])
+        assert_finite(plants)
+        np.testing.assert_array_equal(plants.state.joint_q[others], clean_run(3)[current][others])
+        if current == tick:
             assert plants.awake.tolist() == [0, 2]
-        if now == tick + 1:
+        if current == tick + 1:
             plants.wake(1)
     assert [fault.tree for fault in guard.report()] == [1]
     assert plants.awake.tolist() == [0, 1, 2]
     assert np.isfinite(plants.tree_rate).all()
 
 
-def everything_is_finite(plants: ArticulationSolver) -> None:
+def assert_finite(plants: ArticulationSolver) -> None:
     plants.forward_kinematics()
     state = plants.state
     for array in (state.joint_q, state.joint_qd, state.body_q, state.body_qd, plants.body_load, plants.acceleration):
         assert np.isfinite(array).all()
 
 
-def test_a_tree_woken_at_once_after_a_bad_wrench_is_sound() -> None:
+def test_a_tree_woken_at_once_after_a_bad_wrench_is_valid() -> None:
     plants = row(1)
     guard = FaultGuard(plants)
     plants.wake(0)
@@ -154,7 +156,7 @@ def test_a_tree_woken_at_once_after_a_bad_wrench_is_sound() -> None:
     assert guard.stop_faulty_trees().size == 0
 
 
-def test_a_cut_body_without_a_place_is_put_back_where_it_grew() -> None:
+def test_a_cut_body_with_a_non_finite_position_is_reset() -> None:
     plants = row(2)
     state = plants.state
     drawn = state.body_q[9, :3].copy()
@@ -167,8 +169,8 @@ def test_a_cut_body_without_a_place_is_put_back_where_it_grew() -> None:
     assert not state.joint_xd[9].any()
 
 
-def wild(rng: np.random.Generator) -> TreeBuilder:
-    """Any tree that the model can say: lengths 1 mm to 3 m, E 1e5 to 1e11 Pa, masses 1 mg to 1 t, damped or not."""
+def random_tree(rng: np.random.Generator) -> TreeBuilder:
+    """Any tree that the model can describe: lengths 1 mm to 3 m, E 1e5 to 1e11 Pa, masses 1 mg to 1 t, any damping."""
     tree = TreeBuilder(np.concatenate([rng.normal(size=3), frames.normalize(rng.normal(size=4))]))
     ends = [-1]
     for _ in range(rng.integers(1, 4)):
@@ -187,16 +189,18 @@ def wild(rng: np.random.Generator) -> TreeBuilder:
             damping=[rng.choice([0.0, 10 ** rng.uniform(-6.0, 2.0)])] * 3,
         )  # fmt: skip
     for body in tree.bodies:
-        share = np.clip(body["mass"], 1e-6, 1e3) / body["mass"]
-        body["mass"] *= share
-        body["inertia"] = np.maximum(share * np.asarray(body["inertia"]), 1e-18)
+        scale = np.clip(body["mass"], 1e-6, 1e3) / body["mass"]
+        body["mass"] *= scale
+        body["inertia"] = np.maximum(scale * np.asarray(body["inertia"]), 1e-18)
     return tree
 
 
-def thrown(seed: int, trees: list[TreeBuilder], ticks: int, start: int = 0) -> tuple[ArticulationSolver, FaultGuard]:
-    """Trees in any pose, up to 1e4 rad/s, under loads and pushes up to 1e6 N, half the time; checked every tick.
+def run_random(
+    seed: int, trees: list[TreeBuilder], ticks: int, start: int = 0
+) -> tuple[ArticulationSolver, FaultGuard]:
+    """Trees in any pose, up to 1e4 rad/s, under loads and forces up to 1e6 N for half the time; checked every tick.
 
-    Each tree draws from its own stream, numbered from ``start``: it meets the same whoever is beside it.
+    Each tree has its own random stream, numbered from ``start``: its input does not depend on its neighbours.
     """
     draws = [np.random.default_rng((seed, start + i)) for i in range(len(trees))]
     model = assemble(trees)
@@ -212,25 +216,25 @@ def thrown(seed: int, trees: list[TreeBuilder], ticks: int, start: int = 0) -> t
         sizes.append(10 ** rng.uniform(-3.0, 6.0))
     plants.wake(np.arange(len(trees)))
     for tick in range(ticks):
-        loaded = tick < ticks // 2
+        is_loaded = tick < ticks // 2
         for rng, span, size in zip(draws, spans, sizes, strict=True):
-            plants.body_load[span] = loaded * size * rng.uniform(-1.0, 1.0, (span.stop - span.start, 6))
+            plants.body_load[span] = is_loaded * size * rng.uniform(-1.0, 1.0, (span.stop - span.start, 6))
         plants.predict()
         bodies = model.tree_first[plants.awake]
-        pushes = [loaded * draws[i].uniform(-1e6, 1e6, 6) for i in plants.awake]
+        pushes = [is_loaded * draws[i].uniform(-1e6, 1e6, 6) for i in plants.awake]
         plants.integrate(bodies, np.array(pushes).reshape(-1, 6))
         guard.stop_faulty_trees()
-        everything_is_finite(plants)
+        assert_finite(plants)
         assert np.linalg.norm(plants.state.joint_qd, axis=1).max() <= 1.001 * plants.max_rate or tick == 0
     return plants, guard
 
 
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**31))
-def test_no_tree_and_no_load_breaks_the_world(seed: int) -> None:
-    """Anything at all: nothing that is not finite survives a tick, faults are counted, whatever stopped wakes again."""
+def test_any_tree_under_any_load_stays_finite(seed: int) -> None:
+    """Any input: no non-finite value survives a tick, faults are counted, stopped trees wake again."""
     rng = np.random.default_rng(seed)
-    plants, guard = thrown(seed, [wild(rng) for _ in range(24)], 40)
+    plants, guard = run_random(seed, [random_tree(rng) for _ in range(24)], 40)
     stopped = np.flatnonzero(guard.count)
     assert not plants.state.tree_awake[stopped].any()
     assert sorted({fault.tree for fault in guard.report()}) == stopped.tolist()
@@ -240,39 +244,39 @@ def test_no_tree_and_no_load_breaks_the_world(seed: int) -> None:
         plants.predict()
         plants.integrate()
         guard.stop_faulty_trees()
-    everything_is_finite(plants)
+    assert_finite(plants)
 
 
-def test_neighbours_of_wild_trees_are_equal_to_the_bit() -> None:
+def test_trees_do_not_depend_on_their_neighbours() -> None:
     rng = np.random.default_rng(7)
-    trees = [wild(rng) for _ in range(12)]
-    together, _ = thrown(3, trees, 40)
+    trees = [random_tree(rng) for _ in range(12)]
+    group, _ = run_random(3, trees, 40)
     for i in (0, 5, 11):
-        alone, _ = thrown(3, [trees[i]], 40, start=i)
+        single, _ = run_random(3, [trees[i]], 40, start=i)
         for name in ("joint_q", "joint_qd", "body_q"):
-            mine = getattr(together.state, name)[together.model.bodies_of(i)]
-            np.testing.assert_array_equal(mine, getattr(alone.state, name))
+            in_group = getattr(group.state, name)[group.model.bodies_of(i)]
+            np.testing.assert_array_equal(in_group, getattr(single.state, name))
 
 
-def test_a_vineyard_calms_down_after_any_load() -> None:
-    """Every shoot of the demo under loads up to 1e6 N, ten ticks at a time: ten seconds later all hang quietly."""
+def test_a_vineyard_slows_down_after_any_load() -> None:
+    """Every shoot of the demo under loads up to 1e6 N, ten ticks at a time: ten seconds later all are slow."""
     rng = np.random.default_rng(1)
     model = generate(spec.load_scene("demo"))
     plants = ArticulationSolver(model, State.at_rest(model))
     guard, sleep = FaultGuard(plants), SleepMonitor(plants)
-    everyone = np.arange(len(model.tree_first))
-    size = 10 ** rng.uniform(0.0, 6.0, len(everyone))[model.body_tree]
+    all_trees = np.arange(len(model.tree_first))
+    size = 10 ** rng.uniform(0.0, 6.0, len(all_trees))[model.body_tree]
     for tick in range(60):
         if tick % 10 == 0:
             chosen = rng.random(len(size)) < 0.1
             plants.body_load[:, :3] = (chosen * size)[:, None] * frames.normalize(rng.normal(size=(len(size), 3)))
-        plants.wake(everyone)
+        plants.wake(all_trees)
         plants.predict()
         plants.integrate()
         guard.stop_faulty_trees()
     assert guard.count.sum() > 10
     plants.body_load[:] = 0.0
-    plants.wake(everyone)
+    plants.wake(all_trees)
     before = guard.count.sum()
     for _ in range(1000):
         plants.predict()
@@ -282,12 +286,14 @@ def test_a_vineyard_calms_down_after_any_load() -> None:
     assert guard.count.sum() == before
     assert plants.tree_rate.max() < 2.0
     plants.forward_kinematics()
-    fallen = np.linalg.norm(plants.state.body_q[:, :3] - model.forward_kinematics(model.joint_settled)[:, :3], axis=1)
-    assert np.median(fallen) < 0.02
+    displacement = np.linalg.norm(
+        plants.state.body_q[:, :3] - model.forward_kinematics(model.joint_settled)[:, :3], axis=1
+    )
+    assert np.median(displacement) < 0.02
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"length": 0.0}, r"rod of length 0.0 m, .*all must be positive"),
         ({"radius": (0.004, -0.001)}, r"rod of .*radius \(0.004, -0.001\) m.*all must be positive"),
@@ -297,7 +303,7 @@ def test_a_vineyard_calms_down_after_any_load() -> None:
         ({"parent": 3, "offset": (0, 0, 0)}, r"body 0 names parent 3, which does not stand before it"),
     ],
 )
-def test_wood_that_cannot_be_is_refused_in_words(change: dict, says: str) -> None:
+def test_invalid_rods_are_refused_with_the_reason(change: dict, message: str) -> None:
     given = {
         "parent": -1,
         "length": 1.0,
@@ -305,5 +311,5 @@ def test_wood_that_cannot_be_is_refused_in_words(change: dict, says: str) -> Non
         "material": RodMaterial(5e9, 800.0),
         "segments": 4,
     } | change
-    with pytest.raises(ValueError, match=says):
+    with pytest.raises(ValueError, match=message):
         TreeBuilder(frames.pose(np.zeros(3))).add_rod(**given)

@@ -1,4 +1,4 @@
-"""Hands and vines: pushing, holding, pulling off, carrying, letting go; and what the controllers feel of it."""
+"""Hands of humans: pushing, holding, pulling off, carrying, releasing; and haptic feedback."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ SIGNS = {"left": 1.0, "right": -1.0}
 SOFT = (Drive("along", 400.0, 60.0, 1000.0, 5.0, -5.0, 5.0), Drive("press", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0))
 
 
-def before_a_bunch(mass: float = 0.5, pull: float = 1e3) -> tuple[Physics, HumanSpec, int, np.ndarray]:
-    """A person before a hanging bunch, the right palm 3 cm away from it; the bunch's body and its middle."""
+def human_at_bunch(mass: float = 0.5, pull: float = 1e3) -> tuple[Physics, HumanSpec, int, np.ndarray]:
+    """A human before a hanging bunch, the right palm 3 cm away; returns also the bunch's body and centre."""
     model, body, middle = bunch_scene(mass)
     model.bunch_pull[0], model.bunch_bend[0] = pull, 1e3
     physics = Physics(model)
@@ -37,18 +37,18 @@ def before_a_bunch(mass: float = 0.5, pull: float = 1e3) -> tuple[Physics, Human
     return physics, spec, body, middle
 
 
-def led(spec: HumanSpec, *way: float, closed: bool = False) -> HumanPose:
-    """The person with the right controller ``way`` m further."""
+def with_right_hand(spec: HumanSpec, *way: float, closed: bool = False) -> HumanPose:
+    """The pose with the right controller moved by ``way`` [m]."""
     at = frames.pose(spec.pose.right[:3] + np.array(way), FORWARD)
     return put(spec.pose, at, right_closed=closed)
 
 
 def move(physics: Physics, spec: HumanSpec, *way: float, ticks: int, wait: int = 0, closed: bool = False) -> HumanSpec:
-    """Lead the right controller from its place in ``spec`` by ``way``, wait there; returns the person who stands so."""
-    for share in np.append(np.linspace(0.0, 1.0, ticks), np.ones(wait)):
-        physics.move_human("eva", led(spec, *(share * np.array(way)), closed=closed))
+    """Move the right controller by ``way`` [m] from its place in ``spec`` and wait; returns the spec with that pose."""
+    for fraction in np.append(np.linspace(0.0, 1.0, ticks), np.ones(wait)):
+        physics.move_human("eva", with_right_hand(spec, *(fraction * np.array(way)), closed=closed))
         physics.step()
-    return dataclasses.replace(spec, pose=led(spec, *way, closed=closed))
+    return dataclasses.replace(spec, pose=with_right_hand(spec, *way, closed=closed))
 
 
 def middle_of(physics: Physics, body: int) -> np.ndarray:
@@ -59,8 +59,8 @@ def middle_of(physics: Physics, body: int) -> np.ndarray:
 # ---------------------------------------------------------------------- pushing
 
 
-def test_a_hand_pushes_a_bunch_with_what_it_is_held_back():
-    physics, spec, body, middle = before_a_bunch()
+def test_a_hand_pushes_a_bunch_with_the_reaction_force():
+    physics, spec, body, middle = human_at_bunch()
     move(physics, spec, 0.0, 0.2, 0.0, ticks=200, wait=500)
     hand = physics.hand("eva", "right")
     pressing = sum(contact.force for contact in physics.contacts if contact.actor == "eva")
@@ -71,8 +71,8 @@ def test_a_hand_pushes_a_bunch_with_what_it_is_held_back():
     assert physics.touched == ((0, "eva"),)
 
 
-def test_a_body_that_walks_takes_canes_along():
-    """Head and trunk move at 1.4 m/s as told, the canes before them: none passes through."""
+def test_a_walking_body_pushes_canes():
+    """Head and trunk move at 1.4 m/s and push the canes before them: none passes through."""
     model = assemble([cane((-0.5, 0.3 * i, 1.25)) for i in range(3)])
     physics = Physics(model)
     spec = eva(0.2, -0.6, 0.5 * np.pi)
@@ -94,8 +94,8 @@ def test_a_body_that_walks_takes_canes_along():
 # ---------------------------------------------------------------------- holding
 
 
-def test_a_tie_holds_a_body_beside_its_own_ties():
-    """A spring of 200 N/m at the tip of a cane that is tied already: statically, both carry."""
+def test_an_added_tie_acts_beside_ties_of_the_model():
+    """An added tie of 200 N/m at the tip of a tied cane acts like a tie of the model."""
     tree = cane((0.0, 0.0, 2.0))
     model = assemble([tree], tie_body=[15], tie_point=np.zeros((1, 3)), tie_anchor=np.zeros((1, 3)),
                      tie_stiffness=[500.0], tie_damping=[5.0])  # fmt: skip
@@ -104,28 +104,28 @@ def test_a_tie_holds_a_body_beside_its_own_ties():
                     tie_stiffness=[500.0, 200.0], tie_damping=[5.0, 10.0])  # fmt: skip
     at = model.forward_kinematics(model.joint_settled)[15]
     twin.tie_anchor[:] = model.tie_anchor[0], at[:3] + frames.rotate(at[3:], np.array([0.05, 0.0, 0.0]))
-    held, drawn = ArticulationSolver(model, State.at_rest(model)), ArticulationSolver(twin, State.at_rest(twin))
+    held, modelled = ArticulationSolver(model, State.at_rest(model)), ArticulationSolver(twin, State.at_rest(twin))
     tie = held.add_tie(15, np.array([0.05, 0.0, 0.0]), 200.0, 10.0)
     np.testing.assert_allclose(held.tie_anchor[tie], twin.tie_anchor[1], atol=1e-6)
-    drawn.tie_anchor[1] = held.tie_anchor[tie]
-    for plants, k in ((held, tie), (drawn, 1)):
+    modelled.tie_anchor[1] = held.tie_anchor[tie]
+    for plants, k in ((held, tie), (modelled, 1)):
         plants.tie_anchor[k, 1] += 0.1
         plants.wake(0)
         for _ in range(100):
             plants.predict()
             plants.integrate()
-    np.testing.assert_array_equal(held.state.joint_q, drawn.state.joint_q)
+    np.testing.assert_array_equal(held.state.joint_q, modelled.state.joint_q)
     assert np.abs(held.state.joint_q - model.joint_settled).max() > 1e-3
     held.remove_tie(15, tie)
-    drawn.tie_stiffness[1] = drawn.tie_damping[1] = 0.0
-    for plants in (held, drawn):
+    modelled.tie_stiffness[1] = modelled.tie_damping[1] = 0.0
+    for plants in (held, modelled):
         for _ in range(100):
             plants.predict()
             plants.integrate()
-    np.testing.assert_array_equal(held.state.joint_q, drawn.state.joint_q)
+    np.testing.assert_array_equal(held.state.joint_q, modelled.state.joint_q)
 
 
-def test_so_many_can_be_held():
+def test_the_number_of_held_bodies_is_limited():
     model = assemble([cane((0.0, y, 2.0)) for y in range(2)])
     plants = ArticulationSolver(model, State.at_rest(model))
     for _ in range(PhysicsParameters().max_hands_per_body):
@@ -139,7 +139,7 @@ def test_so_many_can_be_held():
 
 
 def test_a_bunch_is_held_and_follows():
-    physics, spec, body, middle = before_a_bunch()
+    physics, spec, body, middle = human_at_bunch()
     near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
     move(physics, near, 0.0, -0.3, 0.0, ticks=150, wait=550, closed=True)
     hand = physics.hand("eva", "right")
@@ -151,7 +151,7 @@ def test_a_bunch_is_held_and_follows():
     assert physics.touched == ((0, "eva"),)
     (contact,) = [contact for contact in physics.contacts if contact.actor == "eva"]
     np.testing.assert_allclose(contact.force, -hand.force)
-    for _ in range(200):  # nothing moves, and yet what is held stays awake
+    for _ in range(200):  # a held tree stays awake without motion
         physics.step()
     assert physics.state.tree_awake[0]
     physics.move_human("eva", put(spec.pose))
@@ -162,54 +162,56 @@ def test_a_bunch_is_held_and_follows():
     assert physics.contacts == ()
 
 
-def test_a_bunch_pulled_off_stays_in_the_hand_and_weighs_there_what_it_weighed_on_the_vine():
+def test_a_bunch_pulled_off_stays_in_the_hand_with_its_weight():
     """F34: 0.8 kg hang 7.8 cm below the controller."""
-    physics, spec, _, _ = before_a_bunch(0.8, pull=15.0)
+    physics, spec, _, _ = human_at_bunch(0.8, pull=15.0)
     near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
-    parted = []
-    for share in np.append(np.linspace(0.0, 1.0, 200), np.ones(600)):
-        physics.move_human("eva", led(near, 0.0, -0.3 * share, -0.6 * share, closed=True))
+    detachments = []
+    for fraction in np.append(np.linspace(0.0, 1.0, 200), np.ones(600)):
+        physics.move_human("eva", with_right_hand(near, 0.0, -0.3 * fraction, -0.6 * fraction, closed=True))
         physics.step()
-        parted += physics.detachments
-    assert [(parting.bunch, parting.cause, parting.actor) for parting in parted] == [(0, "pull", "eva")]
+        detachments += physics.detachments
+    assert [(detachment.bunch, detachment.cause, detachment.actor) for detachment in detachments] == [
+        (0, "pull", "eva")
+    ]
     hand = physics.hand("eva", "right")
     assert hand.held == ("bunch/0", "bunch")
     assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=5e-4)
     assert hand.force[2] == pytest.approx(0.8 * 9.81, rel=5e-3)
     assert physics.rigid.bunch_pose(0)[2] > 0.5
-    physics.move_human("eva", led(near, 0.0, -0.3, -0.6))
+    physics.move_human("eva", with_right_hand(near, 0.0, -0.3, -0.6))
     for _ in range(150):
         physics.step()
     assert physics.hand("eva", "right").held is None
     assert physics.rigid.bunch_pose(0)[2] < 0.2
 
 
-def test_what_lies_on_the_ground_is_picked_up():
-    """F34: a loose bunch of 0.8 kg comes off the ground when the controller is 7.8 cm above the hand."""
+def test_a_bunch_on_the_ground_is_picked_up():
+    """F34: a free bunch of 0.8 kg leaves the ground when the controller is 7.8 cm above the hand."""
     model, _, middle = bunch_scene(0.8)
     physics = Physics(model)
     physics.pick(0)
     for _ in range(200):
         physics.step()
-    lies = physics.rigid.bunch_pose(0)
-    middle = lies[:3] + frames.rotate(lies[3:], np.array([0.085, 0.0, 0.0]))
+    resting_pose = physics.rigid.bunch_pose(0)
+    middle = resting_pose[:3] + frames.rotate(resting_pose[3:], np.array([0.085, 0.0, 0.0]))
     spec = eva(middle[0] - 0.5, middle[1])
     physics.add_human(spec)
-    above = middle + np.array([0.0, 0.0, 0.045 + 2.0 * HAND_HALF_THICKNESS])
-    for share in np.linspace(0.0, 1.0, 150):
-        physics.move_human("eva", put(spec.pose, (1.0 - share) * spec.pose.right[:3] + share * above))
+    grasp_point = middle + np.array([0.0, 0.0, 0.045 + 2.0 * HAND_HALF_THICKNESS])
+    for fraction in np.linspace(0.0, 1.0, 150):
+        physics.move_human("eva", put(spec.pose, (1.0 - fraction) * spec.pose.right[:3] + fraction * grasp_point))
         physics.step()
     for rise in np.concatenate([np.linspace(0.0, 0.4, 200), np.full(400, 0.4)]):
-        physics.move_human("eva", put(spec.pose, above + np.array([0.0, 0.0, rise]), right_closed=True))
+        physics.move_human("eva", put(spec.pose, grasp_point + np.array([0.0, 0.0, rise]), right_closed=True))
         physics.step()
     hand = physics.hand("eva", "right")
     assert hand.held == ("bunch/0", "bunch")
     assert hand.controller[2] - hand.pose[2] == pytest.approx(0.0785, abs=5e-4)
-    assert physics.rigid.bunch_pose(0)[2] > lies[2] + 0.2
+    assert physics.rigid.bunch_pose(0)[2] > resting_pose[2] + 0.2
 
 
-def test_shears_leave_a_bunch_in_the_hand_that_holds_it():
-    physics, spec, body, _ = before_a_bunch(0.8)
+def test_a_cut_bunch_stays_in_the_hand_that_holds_it():
+    physics, spec, body, _ = human_at_bunch(0.8)
     near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
     move(physics, near, 0.0, 0.0, 0.0, ticks=50, closed=True)
     assert physics.hand("eva", "right").held == ("plants", f"body/{body}")
@@ -222,7 +224,7 @@ def test_shears_leave_a_bunch_in_the_hand_that_holds_it():
 
 
 def test_a_robot_joins_while_a_hand_holds_a_plant():
-    physics, spec, body, middle = before_a_bunch()
+    physics, spec, body, middle = human_at_bunch()
     near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50, wait=50)
     move(physics, near, 0.0, -0.2, 0.0, ticks=100, wait=50, closed=True)
     before = physics.hand("eva", "right")
@@ -235,7 +237,7 @@ def test_a_robot_joins_while_a_hand_holds_a_plant():
     assert np.linalg.norm(hand.force - before.force) < 0.3
 
 
-def test_a_cane_is_held_too():
+def test_a_cane_is_held():
     model = assemble([cane((-0.5, 0.0, 1.1))])
     physics, spec = Physics(model), eva(0.2, -0.6, 0.5 * np.pi)
     spec = dataclasses.replace(spec, pose=put(spec.pose, frames.pose(np.array([0.2, -0.1, 1.1]), FORWARD)))
@@ -249,7 +251,7 @@ def test_a_cane_is_held_too():
     assert physics.snapshot().body_q[12, 1] < -0.05
 
 
-def test_two_hands_share_a_box():
+def test_two_hands_carry_a_box():
     """F34: 10 kg on two hands, 49 cm each."""
     model = assemble([cane((0.0, -5.0, 3.0))], box_pose=[[0, 0, 0.002, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.24]],
                      box_mass=[10.0])  # fmt: skip
@@ -258,7 +260,7 @@ def test_two_hands_share_a_box():
 
     def hold(inside: float, height: float, *, closed: bool) -> None:
         at = {side: np.array([0.0, sign * (0.2 + 0.1 - inside), height, 0, 0, 0, 1]) for side, sign in SIGNS.items()}
-        for side, sign in SIGNS.items():  # palms to the box
+        for side, sign in SIGNS.items():  # palms towards the box
             at[side][3:] = frames.exp(np.array([-sign * 0.5 * np.pi, 0.0, 0.0]))
         physics.move_human("eva", put(spec.pose, **at, left_closed=closed, right_closed=closed))
         physics.step()
@@ -276,8 +278,8 @@ def test_two_hands_share_a_box():
     assert physics.rigid.mj_data.body("box/0").xpos[2] == pytest.approx(0.8 - 0.4905, abs=0.02)
 
 
-def test_a_robot_is_led_by_the_hand():
-    """F14: a closed hand takes the link it is at; the robot's drive is led away from where it would be."""
+def test_a_robot_is_moved_by_a_holding_hand():
+    """F14: a closing hand grasps the link it touches and moves the robot against its drive."""
     model = assemble([cane((0.0, -5.0, 3.0))])
     physics, spec = Physics(model), eva(-1.0)
     physics.add_robot(probe((0.0, 0.0, 1.1), drives=SOFT))
@@ -301,17 +303,17 @@ def test_a_robot_is_led_by_the_hand():
     assert abs(physics.rigid.joint_measurements("probe")[0][0]) < 1e-4
 
 
-def test_a_fist_takes_nothing():
-    physics, spec, _, _ = before_a_bunch()
-    away = move(physics, spec, 0.0, -0.2, 0.0, ticks=50)
-    move(physics, away, 0.0, 0.0, 0.0, ticks=30, closed=True)
-    move(physics, away, 0.0, 0.3, 0.0, ticks=100, wait=100, closed=True)
+def test_a_closed_hand_grasps_nothing():
+    physics, spec, _, _ = human_at_bunch()
+    retracted = move(physics, spec, 0.0, -0.2, 0.0, ticks=50)
+    move(physics, retracted, 0.0, 0.0, 0.0, ticks=30, closed=True)
+    move(physics, retracted, 0.0, 0.3, 0.0, ticks=100, wait=100, closed=True)
     assert physics.hand("eva", "right").held is None
     assert physics.hand("eva", "right").touching
 
 
-def test_who_leaves_lets_go():
-    physics, spec, body, _ = before_a_bunch()
+def test_a_human_that_leaves_releases():
+    physics, spec, body, _ = human_at_bunch()
     near = move(physics, spec, 0.0, 0.04, 0.0, ticks=50)
     move(physics, near, 0.0, -0.1, 0.0, ticks=50, closed=True)
     assert physics.hand("eva", "right").held == ("plants", f"body/{body}")
@@ -321,19 +323,19 @@ def test_who_leaves_lets_go():
     assert physics.contacts == ()
 
 
-# ---------------------------------------------------------------------- what is felt
+# ---------------------------------------------------------------------- haptic feedback
 
 
-def test_a_touch_is_felt_at_once_and_as_strong_as_it_is():
+def test_haptic_pulses_start_at_contact_and_follow_the_force():
     """F33"""
-    physics, spec, _, _ = before_a_bunch()
-    feedback, told = HapticFeedback(physics, "eva"), []
-    for share in np.concatenate([np.linspace(0.0, 1.0, 100), np.ones(200)]):
-        physics.move_human("eva", led(spec, 0.0, 0.15 * share, 0.0))
+    physics, spec, _, _ = human_at_bunch()
+    feedback, pulses = HapticFeedback(physics, "eva"), []
+    for fraction in np.concatenate([np.linspace(0.0, 1.0, 100), np.ones(200)]):
+        physics.move_human("eva", with_right_hand(spec, 0.0, 0.15 * fraction, 0.0))
         physics.step()
         touching = physics.hand("eva", "right").touching
-        told += [(physics.tick, haptic, touching) for haptic in feedback.update()]
-    ticks, haptics, touching = zip(*told, strict=True)
+        pulses += [(physics.tick, haptic, touching) for haptic in feedback.update()]
+    ticks, haptics, touching = zip(*pulses, strict=True)
     assert all(touching)
     assert {(haptic.actor, haptic.hand) for haptic in haptics} == {("eva", "right")}
     assert haptics[0].onset
@@ -346,17 +348,17 @@ def test_a_touch_is_felt_at_once_and_as_strong_as_it_is():
     assert last.duration == pytest.approx(0.05)
 
 
-def test_a_free_hand_feels_nothing():
-    physics, _, _, _ = before_a_bunch()
+def test_a_free_hand_gives_no_haptic_pulse():
+    physics, _, _, _ = human_at_bunch()
     feedback = HapticFeedback(physics, "eva")
     for _ in range(50):
         physics.step()
         assert feedback.update() == ()
 
 
-def test_twice_the_same_bits():
+def test_two_runs_are_bitwise_equal():
     def run() -> bytes:
-        physics, spec, _, _ = before_a_bunch(0.8, pull=15.0)
+        physics, spec, _, _ = human_at_bunch(0.8, pull=15.0)
         near = move(physics, spec, 0.0, 0.04, 0.0, ticks=30)
         move(physics, near, 0.0, -0.3, -0.2, ticks=100, closed=True)
         data = physics.rigid.mj_data

@@ -1,4 +1,4 @@
-"""What hands do to robots, as wrenches; and a robot that bears such wrenches without a hand."""
+"""Wrenches of hands on robots, and robots under such wrenches of remote hands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vinesim.physics.rigid.urdf import RobotError
 
 
 def pushing() -> RigidWorld:
-    """Eva pushes the soft arm 0.1 m in, slowly, and stays."""
+    """A human pushes the soft arm slowly by 0.1 m and stays."""
     rigid, spec = soft_arm()
     for x in np.linspace(-0.4, 0.1, 200):
         rigid.move_human("eva", put(spec.pose, (x, 0.0, 1.1)))
@@ -23,28 +23,28 @@ def pushing() -> RigidWorld:
     return rigid
 
 
-def test_a_push_is_the_hands_force_and_the_drives_feel_its_jacobian():
+def test_a_push_is_the_hands_force_and_joint_contact_is_its_jacobian_transpose():
     rigid = pushing()
-    given, (left, right) = rigid.hand_wrenches("eva")
+    wrenches, (left, right) = rigid.hand_wrenches("eva")
     assert (left, right) == (False, True)
-    (link,) = given["probe"]
-    wrench = given["probe"][link]
+    (link,) = wrenches["probe"]
+    wrench = wrenches["probe"][link]
     np.testing.assert_allclose(wrench[:3], rigid.hand_sample("eva", "right").force, atol=1e-6)
     body = rigid.mj_model.body(f"probe/{link}").id
     jacobian = rigid.jacobian("probe", link, rigid.mj_data.xipos[body])
     np.testing.assert_allclose(jacobian.T @ wrench, rigid.joint_measurements("probe")[3], atol=1e-6)
 
 
-def test_who_bears_the_same_wrench_gives_way_as_much():
-    """F05 in one world: without the hand, but with its wrench, position, effort and contact are the same."""
+def test_the_wrench_of_a_hand_has_the_effect_of_the_hand():
+    """F05 in one world: position, effort and contact are the same under the hand and under its wrench alone."""
     touched = pushing()
-    given, _ = touched.hand_wrenches("eva")
+    wrenches, _ = touched.hand_wrenches("eva")
     rigid, spec = soft_arm()
     rigid.move_human("eva", spec.pose)
-    rigid.set_remote_wrenches("probe", given["probe"])
+    rigid.set_remote_wrenches("probe", wrenches["probe"])
     step(rigid, 600)
-    for one, other in zip(rigid.joint_measurements("probe"), touched.joint_measurements("probe"), strict=True):
-        np.testing.assert_allclose(one, other, atol=2e-3 * max(1.0, np.abs(other).max()))
+    for first, other in zip(rigid.joint_measurements("probe"), touched.joint_measurements("probe"), strict=True):
+        np.testing.assert_allclose(first, other, atol=2e-3 * max(1.0, np.abs(other).max()))
     rigid.set_remote_wrenches("probe", {})
     step(rigid, 300)
     assert abs(rigid.joint_measurements("probe")[0][0]) < 1e-4
@@ -54,7 +54,7 @@ def test_who_bears_the_same_wrench_gives_way_as_much():
         rigid.set_remote_wrenches("probe", {"tail": np.zeros(6)})
 
 
-def test_what_is_borne_outlives_a_compilation():
+def test_remote_wrenches_persist_through_a_compilation():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm("early", y=3.0))
     rigid.add_robot(arm())
@@ -67,37 +67,37 @@ def test_what_is_borne_outlives_a_compilation():
     np.testing.assert_allclose(rigid.joint_measurements("anna")[3], before, rtol=1e-3)
 
 
-def test_a_hand_that_holds_a_link_gives_its_pull():
-    """Held by the weld, 0.1 m aside: the spring's force, and its moment about the link's centre of mass."""
+def test_a_hand_that_holds_a_link_reports_its_wrench():
+    """Held by the weld, 0.1 m sideways: the spring's force, and its moment about the link's centre of mass."""
     rigid, spec = soft_arm()
     for x in np.linspace(-0.4, -0.14, 100):
         rigid.move_human("eva", put(spec.pose, (x, 0.0, 1.1)))
         step(rigid)
-    near = rigid.nearest_to_hand("eva", "right", 0.1)
-    assert near is not None
-    rigid.grasp("eva", "right", near[1], near[2])
+    nearest = rigid.nearest_to_hand("eva", "right", 0.1)
+    assert nearest is not None
+    rigid.grasp("eva", "right", nearest[1], nearest[2])
     for y in np.linspace(0.0, 0.1, 100):
         rigid.move_human("eva", put(spec.pose, (-0.2, y, 1.1)))
         step(rigid)
     step(rigid, 300)
-    given, giving = rigid.hand_wrenches("eva")
-    assert giving == (False, True)
-    wrench = given["probe"][near[2]]
+    wrenches, is_holding = rigid.hand_wrenches("eva")
+    assert is_holding == (False, True)
+    wrench = wrenches["probe"][nearest[2]]
     hand = rigid.hand_sample("eva", "right")
     np.testing.assert_allclose(wrench[:3], hand.force, atol=1e-9)
     assert np.linalg.norm(hand.force) > 2.0
     np.testing.assert_allclose(hand.force, 100.0 * (hand.controller - hand.pose)[:3], rtol=0.02, atol=0.05)
-    body = rigid.mj_model.body(f"probe/{near[2]}").id
-    jacobian = rigid.jacobian("probe", near[2], rigid.mj_data.xipos[body])
+    body = rigid.mj_model.body(f"probe/{nearest[2]}").id
+    jacobian = rigid.jacobian("probe", nearest[2], rigid.mj_data.xipos[body])
     np.testing.assert_allclose(
         jacobian.T @ wrench, rigid.gravity_effort("probe") - rigid.joint_measurements("probe")[2], atol=0.05
     )
 
 
-# ---------------------------------------------------------------------- copies of people
+# ---------------------------------------------------------------------- remote humans
 
 
-def test_hands_of_a_copy_touch_no_robot_and_hold_nothing():
+def test_hands_of_a_remote_human_touch_no_robot_and_hold_nothing():
     rigid, spec = RigidWorld(yard()), eva(-1.0)
     rigid.add_robot(arm())
     rigid.add_human(spec, is_remote=True)
@@ -113,8 +113,8 @@ def test_hands_of_a_copy_touch_no_robot_and_hold_nothing():
     np.testing.assert_allclose(rigid.joint_measurements("anna")[0], HOME, atol=1e-3)
 
 
-def test_legs_of_a_copy_stop_a_base():
-    """F27 on the robot's own client: what does not give way is computed there, against the copy."""
+def test_legs_of_a_remote_human_stop_a_base():
+    """F27 on the robot's client: contact with legs is computed there, against the remote human."""
     rigid, spec = RigidWorld(yard()), eva(1.0, heading=np.pi)
     rigid.add_robot(arm(heading=np.pi))
     rigid.add_human(spec, is_remote=True)
@@ -124,7 +124,7 @@ def test_legs_of_a_copy_stop_a_base():
 
 
 @pytest.mark.parametrize("busy", [False, True])
-def test_a_copys_hand_pushes_what_lies_but_not_while_it_is_busy_at_home(busy):
+def test_a_remote_hand_pushes_objects_unless_it_is_busy(busy):
     rigid, spec = RigidWorld(yard(boxes=1)), eva(0.0, 4.0, heading=np.pi / 2)
     rigid.add_human(spec, is_remote=True)
     generation = rigid.generation
@@ -136,21 +136,21 @@ def test_a_copys_hand_pushes_what_lies_but_not_while_it_is_busy_at_home(busy):
         assert rigid.mj_data.joint("box/0").qpos[1] > 5.05
         return
     assert rigid.mj_data.joint("box/0").qpos[1] == pytest.approx(5.0, abs=1e-3)
-    assert rigid.generation == generation + 1, "listed anew once, not every tick"
+    assert rigid.generation == generation + 1, "compiled once, not every tick"
     np.testing.assert_allclose(rigid.hand_sample("eva", "right").pose, pose.right, atol=1e-3)
     rigid.add_robot(arm(x=8.0))
     step(rigid, 20)
-    assert rigid.mj_data.joint("box/0").qpos[1] == pytest.approx(5.0, abs=1e-3), "a compilation does not forget it"
+    assert rigid.mj_data.joint("box/0").qpos[1] == pytest.approx(5.0, abs=1e-3), "it persists through a compilation"
 
 
-def test_my_hand_and_the_copy_of_anothers_push_each_other():
-    """F14 between clients: each side has its own hand and a copy of the other's controller."""
-    rigid, mine, yours = RigidWorld(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
-    rigid.add_human(mine)
-    rigid.add_human(yours, is_remote=True)
+def test_a_local_and_a_remote_hand_push_each_other():
+    """F14 between clients: each side has its own hand and the remote controller of the other."""
+    rigid, local, remote = RigidWorld(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
+    rigid.add_human(local)
+    rigid.add_human(remote, is_remote=True)
     for x in np.linspace(-0.4, 0.0, 150):
-        rigid.move_human("eva", put(mine.pose, (x, 0.0, 1.1)))
-        rigid.move_human("ida", put(yours.pose, (-x, 0.0, 1.1)))
+        rigid.move_human("eva", put(local.pose, (x, 0.0, 1.1)))
+        rigid.move_human("ida", put(remote.pose, (-x, 0.0, 1.1)))
         step(rigid)
     step(rigid, 200)
     force = rigid.hand_sample("eva", "right").force[0]

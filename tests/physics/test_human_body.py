@@ -1,4 +1,4 @@
-"""People in the rigid world: what D6.4 section 3.1.1 says of hands that are dynamic and of bodies that are not."""
+"""Humans in the rigid world: dynamic hands and kinematic bodies (D6.4, section 3.1.1)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ POLE = 3.0 - 0.05
 """The yard's pole stands at x = 3, y = 0 and is 5 cm thick."""
 PRESS = Drive("press", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0)
 TIP = 0.125
-"""[m] From the middle of the palm to the tips of the fingers."""
+"""[m] From the centre of the palm to the fingertips."""
 PALM = frames.exp(np.array([0.0, -0.5 * np.pi, 0.0]))
 """Fingers up, palm forward."""
 
@@ -36,7 +36,7 @@ def eva(x: float = 0.0, y: float = 0.0, heading: float = 0.0, name: str = "eva",
 
 
 def put(pose: HumanPose, right: np.ndarray | None = None, **changes) -> HumanPose:
-    """The same person with the right hand elsewhere."""
+    """The pose with another right hand, or with other changes."""
     if right is not None:
         changes["right"] = right if len(right) == 7 else frames.pose(np.asarray(right, float), pose.right[3:])
     return dataclasses.replace(pose, **changes)
@@ -64,7 +64,7 @@ def contact_force(rigid: RigidWorld, body: str) -> np.ndarray:
 
 
 def deepest(rigid: RigidWorld, body: str) -> float:
-    """[m] how far anything is inside a body."""
+    """[m] Deepest penetration of any contact of a body."""
     depths = [
         -contact.dist
         for contact in rigid.mj_data.contact
@@ -73,11 +73,11 @@ def deepest(rigid: RigidWorld, body: str) -> float:
     return max(depths, default=0.0)
 
 
-# ---------------------------------------------------------------------- hands that touch nothing
+# ---------------------------------------------------------------------- free hands
 
 
 def test_a_free_hand_is_where_its_controller_is():
-    """F29: below 1 mm at 1 m/s; along a curve, turning, it is there to rounding in every tick."""
+    """F29: below 1 mm at 1 m/s; on a curve with rotation the hand is at its controller in every tick."""
     rigid, spec = RigidWorld(yard()), eva()
     rigid.add_human(spec)
     for t in 0.01 * np.arange(1, 200):
@@ -112,14 +112,14 @@ def test_force_is_the_offset_times_100_newtons_per_metre():
 
 
 @pytest.mark.parametrize(("offset", "force"), [(0.25, 25.0), (1.0, 100.0), (2.0, 100.0)])
-def test_force_ends_at_100_newtons(offset, force):
+def test_force_is_limited_to_100_newtons(offset, force):
     """F32"""
     rigid, _ = pressing(offset)
     assert rigid.hand_sample("eva", "right").force[0] == pytest.approx(force, rel=0.01)
     assert rigid.hand_sample("eva", "left").force[0] == 0.0
 
 
-def test_the_law_can_be_set():
+def test_stiffness_and_force_limit_can_be_set():
     """F32"""
     rigid, _ = pressing(0.1, stiffness=300.0, force=20.0)
     assert rigid.hand_sample("eva", "right").force[0] == pytest.approx(20.0, rel=0.01)
@@ -135,7 +135,7 @@ def test_a_hand_stays_outside_when_its_controller_is_inside():
     for x in np.linspace(-0.6, 0.0, 100):
         rigid.move_human("eva", put(spec.pose, (x, 0.0, 0.3)))
         step(rigid)
-        assert deepest(rigid, "eva/right_hand") < 0.01 * 0.6 + 1e-3  # no further than it comes in the tick of its touch
+        assert deepest(rigid, "eva/right_hand") < 0.01 * 0.6 + 1e-3  # at most its motion in the tick of first contact
     step(rigid, 200)
     assert deepest(rigid, "eva/right_hand") < 2e-4
     hand = rigid.hand_sample("eva", "right")
@@ -150,7 +150,7 @@ def test_a_hand_stays_outside_when_its_controller_is_inside():
 
 
 @pytest.mark.parametrize("speed", [1.0, 3.0, 8.0])
-def test_a_fast_hand_does_not_fly_through_a_thin_pole(speed):
+def test_a_fast_hand_does_not_pass_through_a_thin_pole(speed):
     rigid, spec = RigidWorld(yard()), eva(2.0)
     rigid.add_human(spec)
     for x in np.arange(2.3, 3.6, 0.01 * speed):
@@ -161,19 +161,19 @@ def test_a_fast_hand_does_not_fly_through_a_thin_pole(speed):
     assert rigid.hand_sample("eva", "right").touching
 
 
-# ---------------------------------------------------------------------- pushing robots and being pushed
+# ---------------------------------------------------------------------- hands and robots
 
 
 def soft_arm() -> tuple[RigidWorld, HumanSpec]:
-    """A rod of 3 kg on a drive of 400 N/m along x, and a person before it."""
+    """A rod of 3 kg on a drive of 400 N/m along x, and a human before it."""
     rigid, spec = RigidWorld(yard()), eva(-1.0)
     rigid.add_robot(probe((0.0, 0.0, 1.1), drives=(Drive("along", 400.0, 60.0, 1000.0, 5.0, -5.0, 5.0), PRESS)))
     rigid.add_human(spec)
     return rigid, spec
 
 
-def test_a_hand_pushes_a_robot_and_both_feel_the_same():
-    """F14, F24: the link gives way, the drive's contact effort is the hand's force."""
+def test_a_hand_pushes_a_robot_and_forces_are_equal():
+    """F14, F24: the link deflects, and the drive's contact effort is the hand's force."""
     rigid, spec = soft_arm()
     for x in np.linspace(-0.4, 0.1, 200):
         rigid.move_human("eva", put(spec.pose, (x, 0.0, 1.1)))
@@ -191,8 +191,8 @@ def test_a_hand_pushes_a_robot_and_both_feel_the_same():
     assert abs(rigid.joint_measurements("probe")[0][0]) < 1e-4
 
 
-def test_a_robot_pushes_a_hand_and_its_effort_tells():
-    """F14, F22: the arm comes to a hand that is held still."""
+def test_a_robot_pushes_a_hand_and_its_effort_is_the_force():
+    """F14, F22: the arm moves against a hand whose controller is still."""
     rigid, spec = soft_arm()
     rigid.move_human("eva", put(spec.pose, (-0.25, 0.0, 1.1)))
     step(rigid, 100)
@@ -208,7 +208,7 @@ def test_a_robot_pushes_a_hand_and_its_effort_tells():
 
 
 def test_hands_push_hands():
-    """F14: the other's hand is displaced, and both are half way."""
+    """F14: both hands are displaced by the same force."""
     rigid, one, other = RigidWorld(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
     rigid.add_human(one)
     rigid.add_human(other)
@@ -218,33 +218,33 @@ def test_hands_push_hands():
         rigid.move_human("ida", put(other.pose, (-x + reach, 0.0, 1.1)))
         step(rigid)
     step(rigid, 300)
-    mine, yours = rigid.hand_sample("eva", "right"), rigid.hand_sample("ida", "right")
-    assert mine.force[0] == pytest.approx(-yours.force[0], rel=1e-4)
-    assert mine.force[0] > 5.0
-    assert mine.controller[0] - mine.pose[0] == pytest.approx(0.01 * mine.force[0], rel=0.01)
+    first, second = rigid.hand_sample("eva", "right"), rigid.hand_sample("ida", "right")
+    assert first.force[0] == pytest.approx(-second.force[0], rel=1e-4)
+    assert first.force[0] > 5.0
+    assert first.controller[0] - first.pose[0] == pytest.approx(0.01 * first.force[0], rel=0.01)
 
 
-def test_a_pair_in_contact_keeps_its_momentum():
-    """F24: a hand on its spring bumps into a box that floats; what the one gives the other gets, to 1e-4."""
+def test_a_hand_and_a_box_conserve_momentum():
+    """F24: a hand on its spring hits a floating box: the impulse is the box's momentum, to 1e-4."""
     rigid, spec = RigidWorld(yard(boxes=1)), eva(0.0, 4.2, heading=np.pi / 2)
     rigid.add_human(spec)
     rigid.mj_model.body_gravcomp[rigid.mj_model.body("box/0").id] = 1.0
     body, joint = rigid.mj_data.body("box/0"), rigid.mj_data.joint("box/0")
     joint.qpos[2] = 1.0
-    given = 0.0
+    impulse = 0.0
     for y in np.linspace(4.4, 4.75, 60):
         rigid.move_human("eva", put(spec.pose, (0.0, y, 1.15)))
         step(rigid)
-        given += rigid.dt * rigid.hand_sample("eva", "right").force[1]
+        impulse += rigid.dt * rigid.hand_sample("eva", "right").force[1]
     mujoco.mj_comVel(rigid.mj_model, rigid.mj_data)
     velocity = np.zeros(6)
     mujoco.mj_forward(rigid.mj_model, rigid.mj_data)
     mujoco.mj_objectVelocity(rigid.mj_model, rigid.mj_data, mujoco.mjtObj.mjOBJ_BODY, body.id, velocity, 0)
-    assert given > 0.1
-    assert 2.0 * velocity[4] == pytest.approx(given, rel=1e-4)
+    assert impulse > 0.1
+    assert 2.0 * velocity[4] == pytest.approx(impulse, rel=1e-4)
 
 
-# ---------------------------------------------------------------------- a body that nothing moves
+# ---------------------------------------------------------------------- kinematic body
 
 
 def test_knees_bend_forward_and_limbs_keep_their_lengths():
@@ -269,8 +269,7 @@ def test_knees_bend_forward_and_limbs_keep_their_lengths():
 
 
 def test_nothing_moves_head_trunk_or_legs():
-    """F25, F26: one arm pushes the head, one the left shin, and MuJoCo's own bodies stay where the posture puts
-    them."""
+    """F25, F26: one arm pushes the head, one the left shin, and MuJoCo's bodies stay at the posture."""
     rigid, spec = RigidWorld(yard()), eva(0.5, heading=np.pi)
     head = frames.pose(np.array([0.5, 0.0, 1.6]), frames.exp(np.array([0.1, 0.2, 3.0])))
     pose = dataclasses.replace(spec.pose, head=head)
@@ -281,75 +280,75 @@ def test_nothing_moves_head_trunk_or_legs():
     rigid.move_human("eva", pose)
     expected = body_posture(spec.height, pose)
     human, d = rigid.human("eva"), rigid.mj_data
-    own_measure, drift, pressed = human.measure, 0.0, {"head": 0.0, "left_shank": 0.0}
+    own_measure, drift, peak_force = human.measure, 0.0, {"head": 0.0, "left_shank": 0.0}
 
-    def measure(data: mujoco.MjData) -> None:  # first: where MuJoCo's step itself has put the bodies
+    def measure(data: mujoco.MjData) -> None:  # first the poses after MuJoCo's step
         nonlocal drift
         at = [data.joint(f"eva/{part}").qpos[:3] for part in BODY_PARTS]
         drift = max(drift, float(np.abs(np.array(at) - expected[:, :3]).max()))
         own_measure(data)
 
-    step(rigid)  # the head moves there
+    step(rigid)  # the head moves to its pose
     human.measure = measure
     for target in np.linspace(0.0, 1.0, 200):
         for name in ("probe", "low"):
             rigid.command(name, np.array([target, 0.0]))
         step(rigid)
-        for part in pressed:
-            pressed[part] = max(pressed[part], float(np.linalg.norm(contact_force(rigid, f"eva/{part}"))))
+        for part in peak_force:
+            peak_force[part] = max(peak_force[part], float(np.linalg.norm(contact_force(rigid, f"eva/{part}"))))
         rigid.update_kinematics()
         place, turn = d.xpos[human.part_bodies], frames.from_wxyz(d.xquat[human.part_bodies])
         np.testing.assert_allclose(place, expected[:, :3], atol=1e-9)
         np.testing.assert_allclose(np.abs((turn * expected[:, 3:]).sum(1)), 1.0, atol=1e-9)
     np.testing.assert_array_equal(expected[BODY_PARTS.index("head")], head)
-    assert min(pressed.values()) > 100.0, "both are really pushed"
-    assert drift < 5e-6, "within a step, before it is reset, no force moves a part by more"
+    assert min(peak_force.values()) > 100.0, "both are pushed"
+    assert drift < 5e-6, "a force moved a part within a step, before its reset"
     for name in ("probe", "low"):
         assert rigid.joint_measurements(name)[3][0] < -100.0
         assert rigid.joint_measurements(name)[0][0] < 0.5
 
 
 def test_a_base_stops_at_legs():
-    """F27: 800 N of tracks against legs: no way, and no further in than 2 mm but in the tick of the blow."""
+    """F27: 800 N of tracks against legs: no motion, and at most 2 mm penetration after the first contact."""
     rigid, spec = RigidWorld(yard()), eva(1.0, heading=np.pi)
     rigid.add_robot(arm(heading=np.pi))
     rigid.add_human(spec)
     rigid.command_base("anna", (-0.5, 0.0, 0.0))
-    deep = 0.0
+    max_depth = 0.0
     for _ in range(500):
         step(rigid)
-        deep = max(deep, *(deepest(rigid, f"eva/{part}") for part in BODY_PARTS))
+        max_depth = max(max_depth, *(deepest(rigid, f"eva/{part}") for part in BODY_PARTS))
     base, velocity = rigid.base_state("anna")
     assert np.abs(velocity).max() < 1e-3
-    assert base[0] == pytest.approx(1.0 - 0.05 - 0.3, abs=2e-3)  # at the shins, the toes below it
-    assert deep < 0.01 * 0.5 + 2e-3
+    assert base[0] == pytest.approx(1.0 - 0.05 - 0.3, abs=2e-3)  # at the shins, with the toes below the chassis
+    assert max_depth < 0.01 * 0.5 + 2e-3
     assert max(deepest(rigid, f"eva/{part}") for part in BODY_PARTS) < 2e-3
     assert rigid.contact_force[rigid.robot("anna").base_v[0]] == pytest.approx(-800.0, rel=0.05)
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.4])
-def test_legs_that_walk_push_a_sleeping_box_along(speed):
+def test_walking_legs_push_a_sleeping_box(speed):
     rigid, spec = RigidWorld(crate_yard(1.6)), eva(-1.0, 5.0)
     rigid.add_human(spec)
     step(rigid, 200)
     assert rigid.mj_data.body_awake[rigid.mj_model.body("box/0").id] == 0
-    deep = 0.0
+    max_depth = 0.0
     for x in np.arange(0.0, 1.0, 0.01 * speed):
         moved = {name: getattr(spec.pose, name) + np.array([x, 0, 0, 0, 0, 0, 0]) for name in POINT_NAMES}
         rigid.move_human("eva", dataclasses.replace(spec.pose, **moved))
         step(rigid)
-        deep = max(deep, deepest(rigid, "box/0"))
+        max_depth = max(max_depth, deepest(rigid, "box/0"))
     toes = -1.0 + x + 0.19
     assert rigid.mj_data.body("box/0").xpos[0] - 0.3 > toes - 0.02 * speed
-    assert deep < 0.01 * speed + 0.01  # what it comes in a tick, and a centimetre
+    assert max_depth < 0.01 * speed + 0.01  # its motion in a tick, and a centimetre
 
 
-def test_who_is_put_elsewhere_kicks_nobody_on_the_way():
-    """A user may be set down somewhere else by a button: no speed, and the hands are there at once."""
+def test_a_teleported_human_pushes_nothing_on_the_way():
+    """A user may teleport: no velocity results, and the hands are at the new place at once."""
     rigid, spec = RigidWorld(yard(boxes=1)), eva(-1.0, 5.0)
     rigid.add_human(spec)
     step(rigid, 100)
-    elsewhere = standing_pose(frames.pose(np.array([3.5, 0.0, 0.0])))  # behind the pole, and the box between
+    elsewhere = standing_pose(frames.pose(np.array([3.5, 0.0, 0.0])))  # behind the pole, beyond the box
     rigid.move_human("eva", elsewhere)
     before = rigid.mj_data.body("box/0").xpos.copy()
     step(rigid, 50)
@@ -358,7 +357,7 @@ def test_who_is_put_elsewhere_kicks_nobody_on_the_way():
     np.testing.assert_allclose(rigid.mj_data.body("box/0").xpos, before, atol=1e-4)
 
 
-def test_people_are_seen_as_people():
+def test_humans_have_visuals_labelled_human():
     rigid = RigidWorld(yard())
     rigid.add_human(eva())
     links = [link for link in rigid.visuals() if link.organ == Organ.HUMAN]
@@ -367,11 +366,11 @@ def test_people_are_seen_as_people():
     assert {link.index for link in links} == {3}
     assert all(link.shapes for link in links)
     assert set(rigid.geoms.actor) == {"eva"}
-    assert not {link.partition("/")[2] for link in rigid.geoms.link} & set(VISUAL_PARTS)  # only seen
+    assert not {link.partition("/")[2] for link in rigid.geoms.link} & set(VISUAL_PARTS)  # visual only
 
 
-def limbs_of(pose: HumanPose) -> tuple[RigidWorld, dict[str, np.ndarray]]:
-    """Poses of all links of somebody in this pose, by part."""
+def link_poses(pose: HumanPose) -> tuple[RigidWorld, dict[str, np.ndarray]]:
+    """Poses of all links of a human in this pose, by part."""
     rigid = RigidWorld(yard())
     rigid.add_human(HumanSpec("eva", 0, pose))
     step(rigid, 1)
@@ -381,27 +380,27 @@ def limbs_of(pose: HumanPose) -> tuple[RigidWorld, dict[str, np.ndarray]]:
 @pytest.mark.parametrize("posture", appearance.posture_names())
 def test_arms_reach_from_shoulders_to_wrists(posture: str):
     """Bones keep their lengths, elbows join, and both arms of a mirrored pose mirror each other."""
-    look = appearance.load_human_model(1.75)
+    human_model = appearance.load_human_model(1.75)
     pose = appearance.apply_posture(
         standing_pose(frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(0.7))), posture, 1.75
     )
-    _, at = limbs_of(pose)
+    _, at = link_poses(pose)
     for side, sign in (("left", 1.0), ("right", -1.0)):
         upper, fore, hand = at[f"{side}_upper_arm"], at[f"{side}_forearm"], at[f"{side}_hand"]
-        reach = upper[:3] + frames.rotate(upper[3:], np.array([look.limbs.upper_arm, 0, 0]))
+        reach = upper[:3] + frames.rotate(upper[3:], np.array([human_model.limbs.upper_arm, 0, 0]))
         assert reach == pytest.approx(fore[:3], abs=1e-9)
-        wrist = hand[:3] + frames.rotate(hand[3:], np.array(look.limbs.wrist) * [1, sign, 1])
-        assert fore[:3] + frames.rotate(fore[3:], np.array([look.limbs.forearm, 0, 0])) == pytest.approx(
+        wrist = hand[:3] + frames.rotate(hand[3:], np.array(human_model.limbs.wrist) * [1, sign, 1])
+        assert fore[:3] + frames.rotate(fore[3:], np.array([human_model.limbs.forearm, 0, 0])) == pytest.approx(
             wrist, abs=1e-4
         )
-        shoulder = at["chest"][:3] + frames.rotate(at["chest"][3:], np.array(look.limbs.shoulder) * [1, sign, 1])
-        assert np.linalg.norm(upper[:3] - shoulder) < 0.07  # it gives way a little
+        shoulder = at["chest"][:3] + frames.rotate(at["chest"][3:], np.array(human_model.limbs.shoulder) * [1, sign, 1])
+        assert np.linalg.norm(upper[:3] - shoulder) < 0.07  # the shoulder moves a little
 
 
-def test_an_arm_that_is_too_short_points_at_its_hand():
+def test_an_arm_that_is_too_short_points_to_its_hand():
     pose = standing_pose(frames.pose(np.zeros(3)))
-    far = dataclasses.replace(pose, left=frames.pose(np.array([3.0, 0.2, 1.2])))
-    _, at = limbs_of(far)
+    reaching = dataclasses.replace(pose, left=frames.pose(np.array([3.0, 0.2, 1.2])))
+    _, at = link_poses(reaching)
     upper, fore = at["left_upper_arm"], at["left_forearm"]
     assert frames.rotate(upper[3:], np.array([1.0, 0, 0])) == pytest.approx(
         frames.rotate(fore[3:], np.array([1.0, 0, 0])), abs=0.01
@@ -409,24 +408,24 @@ def test_an_arm_that_is_too_short_points_at_its_hand():
     assert np.isfinite(np.concatenate(list(at.values()))).all()
 
 
-def test_fingers_bend_as_they_are_told():
-    """Each by itself, towards the palm, and no joint comes apart."""
-    look = appearance.load_human_model(1.75)
+def test_fingers_bend_as_commanded():
+    """Each finger alone bends towards the palm, and its bones stay joined."""
+    human_model = appearance.load_human_model(1.75)
     for bent in range(5):
-        told = tuple(float(k == bent) for k in range(5))
-        pose = dataclasses.replace(standing_pose(frames.pose(np.zeros(3))), left_fingers=told, right_fingers=told)
-        _, at = limbs_of(pose)
+        fingers = tuple(float(k == bent) for k in range(5))
+        pose = dataclasses.replace(standing_pose(frames.pose(np.zeros(3))), left_fingers=fingers, right_fingers=fingers)
+        _, at = link_poses(pose)
         for s, side in enumerate(("left", "right")):
             down = frames.rotate(at[f"{side}_hand"][3:], np.array([0.0, 0.0, -1.0]))
             for k, finger in enumerate(appearance.FINGERS):
                 bones = [at[f"{side}_{finger}_{n + 1}"] for n in range(3)]
                 ahead = [frames.rotate(bone[3:], np.array([1.0, 0.0, 0.0])) for bone in bones]
                 for n in (0, 1):
-                    tip = bones[n][:3] + look.length[5 * s + k, n] * ahead[n]
+                    tip = bones[n][:3] + human_model.length[5 * s + k, n] * ahead[n]
                     assert tip == pytest.approx(bones[n + 1][:3], abs=1e-9)
                 angle = np.arccos(np.clip(ahead[0] @ ahead[2], -1.0, 1.0))
-                wanted = look.bent[5 * s + k, 1:].sum() if k == bent else 0.0
-                assert angle == pytest.approx(wanted, abs=1e-6)
+                expected = human_model.bent[5 * s + k, 1:].sum() if k == bent else 0.0
+                assert angle == pytest.approx(expected, abs=1e-6)
                 if k == bent and finger != "thumb":
                     assert ahead[0] @ down > 0.9
                     assert ahead[1] @ down > -0.1
@@ -441,8 +440,8 @@ def crate_yard(mass: float) -> Model:
     return model
 
 
-def lifted(mass: float, height: float, stiffness: float = 100.0) -> tuple[RigidWorld, HumanSpec]:
-    """A hand takes a box by the middle of its bottom and goes up by ``height``, until all is at rest."""
+def lift_box(mass: float, height: float, stiffness: float = 100.0) -> tuple[RigidWorld, HumanSpec]:
+    """A hand grasps a box at the centre of its bottom and rises by ``height`` [m], until all is at rest."""
     rigid, spec = RigidWorld(crate_yard(mass)), eva(-0.7, 5.0, stiffness=stiffness, force=stiffness)
     rigid.add_human(spec)
     step(rigid, 50)
@@ -460,43 +459,43 @@ def lifted(mass: float, height: float, stiffness: float = 100.0) -> tuple[RigidW
 
 
 @pytest.mark.parametrize("mass", [0.8, 10.0])
-def test_what_is_heavier_needs_a_larger_movement(mass):
-    """F34: 0.8 kg hang 7.8 cm below the controller, 10 kg 98 cm; with a centimetre less the box stays where it is."""
+def test_a_heavier_box_needs_a_larger_movement(mass):
+    """F34: 0.8 kg hang 7.8 cm below the controller, 10 kg 98 cm; with a centimetre less the box stays."""
     needed = mass * 9.81 / 100.0
-    rigid, _ = lifted(mass, needed + 0.3)
+    rigid, _ = lift_box(mass, needed + 0.3)
     hand = rigid.hand_sample("eva", "right")
     assert hand.held == ("box/0", "box")
     assert hand.controller[2] - hand.pose[2] == pytest.approx(needed, rel=5e-3)
     assert hand.force[2] == pytest.approx(mass * 9.81, rel=5e-3)
     assert rigid.mj_data.body("box/0").xpos[2] == pytest.approx(0.3, abs=0.01)
-    rigid, _ = lifted(mass, needed - 0.01)
+    rigid, _ = lift_box(mass, needed - 0.01)
     assert rigid.mj_data.body("box/0").xpos[2] < 2e-3
 
 
-def test_a_box_slides_from_mu_m_g_on():
+def test_a_box_slides_above_mu_m_g():
     """F34: 1.5 kg on the ground: 11.8 N."""
     threshold = PhysicsParameters().friction * 1.5 * 9.81 / 100.0
-    for share, moves in ((0.9, False), (1.1, True)):
+    for fraction, moves in ((0.9, False), (1.1, True)):
         rigid, spec = RigidWorld(crate_yard(1.5)), eva(-1.0, 5.0)
         rigid.add_human(spec)
         step(rigid, 50)
         edge = -0.3 - TIP
-        for x in np.linspace(edge - 0.05, edge + share * threshold, 300):
+        for x in np.linspace(edge - 0.05, edge + fraction * threshold, 300):
             rigid.move_human("eva", put(spec.pose, (x, 5.0, 0.05)))
             step(rigid)
         step(rigid, 200)
         assert (rigid.mj_data.body("box/0").xpos[0] > 0.005) == moves
 
 
-def test_what_was_held_still_falls_when_it_is_let_go():
-    """It was so still that the solver would have let it sleep: not in the air."""
-    rigid, _ = lifted(0.8, 0.3)
+def test_a_released_box_falls():
+    """Although it was still long enough to sleep."""
+    rigid, _ = lift_box(0.8, 0.3)
     rigid.release("eva", "right")
     step(rigid, 100)
     assert rigid.mj_data.body("box/0").xpos[2] < 0.01
 
 
-def test_a_robot_is_taken_by_the_link_and_let_go():
+def test_a_robot_link_is_grasped_and_released():
     rigid, spec = soft_arm()
     rigid.move_human("eva", put(spec.pose, (-0.1, 0.0, 1.1)))
     step(rigid, 150)
@@ -537,31 +536,31 @@ def test_a_hand_holds_a_hand():
         rigid.move_human("ida", put(other.pose, (x, 0.0, 1.1 + 3 * HAND_HALF_THICKNESS)))
         step(rigid)
     step(rigid, 300)
-    mine, yours = rigid.hand_sample("eva", "right"), rigid.hand_sample("ida", "right")
-    assert mine.pose[0] - mine.controller[0] == pytest.approx(0.2, abs=0.01)
-    assert yours.controller[0] - yours.pose[0] == pytest.approx(0.2, abs=0.01)
+    first, second = rigid.hand_sample("eva", "right"), rigid.hand_sample("ida", "right")
+    assert first.pose[0] - first.controller[0] == pytest.approx(0.2, abs=0.01)
+    assert second.controller[0] - second.pose[0] == pytest.approx(0.2, abs=0.01)
 
 
-# ---------------------------------------------------------------------- coming, going, mistakes
+# ---------------------------------------------------------------------- joining, leaving, errors
 
 
-def test_others_join_and_leave_while_a_hand_holds():
-    rigid, _ = lifted(0.8, 0.3)
-    alone, _ = lifted(0.8, 0.3)
+def test_actors_join_and_leave_while_a_hand_holds():
+    rigid, _ = lift_box(0.8, 0.3)
+    undisturbed, _ = lift_box(0.8, 0.3)
     rigid.add_robot(arm("bert", 1, y=-4.0))
     rigid.add_human(eva(-3.0, -3.0, name="ida"))
-    np.testing.assert_array_equal(rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose)
+    np.testing.assert_array_equal(rigid.hand_sample("eva", "right").pose, undisturbed.hand_sample("eva", "right").pose)
     step(rigid, 30)
-    step(alone, 30)
+    step(undisturbed, 30)
     np.testing.assert_allclose(
-        rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose, atol=1e-9
+        rigid.hand_sample("eva", "right").pose, undisturbed.hand_sample("eva", "right").pose, atol=1e-9
     )
     rigid.remove_robot("bert")
     rigid.remove_human("ida")
     step(rigid, 30)
-    step(alone, 30)
+    step(undisturbed, 30)
     np.testing.assert_allclose(
-        rigid.hand_sample("eva", "right").pose, alone.hand_sample("eva", "right").pose, atol=1e-9
+        rigid.hand_sample("eva", "right").pose, undisturbed.hand_sample("eva", "right").pose, atol=1e-9
     )
     assert rigid.hand_sample("eva", "right").held == ("box/0", "box")
     rigid.remove_human("eva")
@@ -570,7 +569,7 @@ def test_others_join_and_leave_while_a_hand_holds():
     assert rigid.mj_data.body("box/0").xpos[2] < 0.01
 
 
-def test_who_is_held_may_leave():
+def test_a_held_robot_may_leave():
     rigid, _ = soft_arm()
     step(rigid, 5)
     rigid.grasp("eva", "right", "probe", "rod")
@@ -579,12 +578,12 @@ def test_who_is_held_may_leave():
     assert rigid.hand_sample("eva", "right").held is None
 
 
-def test_twice_the_same_bits():
-    states = [lifted(0.8, 0.3)[0].mj_data for _ in range(2)]
+def test_two_runs_are_bitwise_equal():
+    states = [lift_box(0.8, 0.3)[0].mj_data for _ in range(2)]
     assert states[0].qpos.tobytes() + states[0].qvel.tobytes() == states[1].qpos.tobytes() + states[1].qvel.tobytes()
 
 
-def test_mistakes_are_said_in_one_line():
+def test_errors_are_one_line():
     rigid, spec = RigidWorld(yard()), eva()
     rigid.add_human(spec)
     with pytest.raises(HumanError, match="human 'eva' is already here"):

@@ -1,4 +1,4 @@
-"""Coarse and fine bunches: switched in time, without a jump, and without a difference that the branch would feel."""
+"""Level of detail of bunches: switched in time, without jumps, and without effect on the branch."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.sensors.scene.primitives import Primitives
 
-LINGER = PhysicsParameters().steps(PhysicsParameters().detail_duration)
+DETAIL_STEPS = PhysicsParameters().steps(PhysicsParameters().detail_duration)
 
 
-def laden(rows: int = 1) -> Model:
+def loaded_canes(rows: int = 1) -> Model:
     """Level canes of 1 m, 0.6 m apart, each with a bunch of 0.6 kg at three quarters of its length."""
     trees = []
     for row in range(rows):
@@ -32,7 +32,7 @@ def laden(rows: int = 1) -> Model:
     return assemble(trees)
 
 
-def middle(model: Model, bunch: int = 0) -> np.ndarray:
+def bunch_centre(model: Model, bunch: int = 0) -> np.ndarray:
     pose = model.forward_kinematics(model.joint_settled)[model.bunch_body[bunch]]
     return pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
 
@@ -42,15 +42,17 @@ def clusters(model: Model, bunch: int = 0) -> np.ndarray:
     return np.arange(first, first + int(model.bunch_clusters[bunch]))
 
 
-def pushed(physics: Physics, at: np.ndarray, depth: float = 0.05, stay: int = 60):
-    """A bar comes at walking pace, pushes the bunch ``depth`` aside, holds it, and leaves; yields after each tick."""
+def push(physics: Physics, at: np.ndarray, depth: float = 0.05, hold_ticks: int = 60):
+    """A bar moves at walking speed, displaces the bunch by ``depth`` [m], stays, and leaves; yields after each tick."""
     radius = float(physics.model.bunch_radius[0])
     physics.add_robot(bar(at - [0.0, radius + 0.03 + 0.08, 0.0], stiffness=4e3, damping=400.0))
     reach = 0.08 + depth
     for tick in range(2000):
         t = 0.01 * tick
         target = (
-            min(0.25 * t, reach) if tick < 25 * 4 * reach + stay + 20 else reach - 0.5 * (t - 0.01 * stay) + 4 * reach
+            min(0.25 * t, reach)
+            if tick < 25 * 4 * reach + hold_ticks + 20
+            else reach - 0.5 * (t - 0.01 * hold_ticks) + 4 * reach
         )
         physics.rigid.command("bar", np.array([np.clip(target, -1.5, reach)]))
         physics.step()
@@ -58,7 +60,7 @@ def pushed(physics: Physics, at: np.ndarray, depth: float = 0.05, stay: int = 60
 
 
 def momentum(physics: Physics, bodies: np.ndarray) -> np.ndarray:
-    """Linear momentum [3] of bodies as ``kinematics`` shows them, kg m/s."""
+    """Linear momentum [3] of bodies from forward kinematics, kg m/s."""
     plants, state = physics.plants, physics.state
     com = frames.rotate(state.body_q[bodies, 3:].astype(float), plants.body_com[bodies].astype(float))
     velocity = state.body_qd[bodies, :3] + np.cross(state.body_qd[bodies, 3:].astype(float), com)
@@ -71,14 +73,14 @@ def moving(physics: Physics) -> np.ndarray:
     return np.arange(int(size[0]))
 
 
-def test_touched_pushed_released_coarsened_without_a_jump():
-    """At both switches no pose changes by a bit and no momentum by 1e-6; what was bent stays as it came to rest."""
-    model = laden()
+def test_switches_of_detail_keep_pose_and_momentum():
+    """At both switches poses are bitwise equal and momenta within 1e-6; bent joints stay bent."""
+    model = loaded_canes()
     physics = Physics(model)
     detail, switches = physics.level_of_detail, []
     refine, coarsen = physics.plants.refine, physics.plants.coarsen
 
-    def seen(change, trees):
+    def checked(change, trees):
         physics.plants.forward_kinematics(np.array([0]))
         pose, before = physics.state.body_q.copy(), momentum(physics, moving(physics))
         change(trees)
@@ -86,39 +88,39 @@ def test_touched_pushed_released_coarsened_without_a_jump():
         assert np.array_equal(pose, physics.state.body_q)
         switches.append((physics.tick, change.__name__, momentum(physics, moving(physics)) - before, before))
 
-    physics.plants.refine = lambda trees: seen(refine, trees)
-    physics.plants.coarsen = lambda trees: seen(coarsen, trees)
-    first_touch = gone = None
-    bent = 0.0
-    for tick in pushed(physics, middle(model)):
+    physics.plants.refine = lambda trees: checked(refine, trees)
+    physics.plants.coarsen = lambda trees: checked(coarsen, trees)
+    first_touch = left_at = None
+    max_bend = 0.0
+    for tick in push(physics, bunch_centre(model)):
         if first_touch is None and any(c.actor == "bar" for c in physics.contacts):
             first_touch = tick
-        if first_touch is not None and gone is None and not len(physics.contact_solver.near_trees):
-            gone = tick
+        if first_touch is not None and left_at is None and not len(physics.contact_solver.near_trees):
+            left_at = tick
         turn = frames.log(frames.multiply(
             frames.conjugate(model.joint_settled[clusters(model)]), physics.state.joint_q[clusters(model)]
         ))  # fmt: skip
-        bent = max(bent, float(np.linalg.norm(turn, axis=1).max()))
-        if gone is not None and not physics.state.tree_fine[0]:
+        max_bend = max(max_bend, float(np.linalg.norm(turn, axis=1).max()))
+        if left_at is not None and not physics.state.tree_fine[0]:
             break
     (refined, name, jump, _), (coarsened, other, drop, before) = switches
     assert (name, other) == ("refine", "coarsen")
     assert refined <= first_touch  # never late
-    assert coarsened - gone > LINGER
-    assert bent > 0.05
+    assert coarsened - left_at > DETAIL_STEPS
+    assert max_bend > 0.05
     assert np.abs(jump).max() < 1e-6
     assert np.linalg.norm(drop) < 1e-6 + 0.02 * np.linalg.norm(before)
     assert len(detail.fine_trees) == 0
 
 
-def test_the_branch_does_not_feel_how_finely_its_bunch_moves():
-    """A cane plucked by a centimetre goes the same way within a millimetre, always coarse or fine for a second."""
-    model = laden()
-    ways = []
-    for closely in (False, True):
+def test_the_level_of_detail_does_not_change_the_branch():
+    """A cane kicked by a centimetre has the same motion within a millimetre, coarse or fine for a second."""
+    model = loaded_canes()
+    paths = []
+    for is_fine in (False, True):
         physics = Physics(model)
-        if closely:
-            physics.set_detail_focus(middle(model)[None], 0.3)
+        if is_fine:
+            physics.set_detail_focus(bunch_centre(model)[None], 0.3)
         physics.plants.wake(0)
         physics.state.joint_qd[0] = 0.0, 0.05, 0.05
         at, fine = [], 0
@@ -128,52 +130,52 @@ def test_the_branch_does_not_feel_how_finely_its_bunch_moves():
             physics.step()
             at.append(physics.snapshot().body_q[9, :3])
             fine += int(physics.state.tree_fine[0])
-        assert (fine > 100) == closely
-        ways.append(np.array(at))
-    moved = np.abs(ways[0] - model.forward_kinematics(model.joint_settled)[9, :3]).max()
-    print("tip", np.abs(ways[0] - ways[1]).max(), moved, fine)
+        assert (fine > 100) == is_fine
+        paths.append(np.array(at))
+    moved = np.abs(paths[0] - model.forward_kinematics(model.joint_settled)[9, :3]).max()
+    print("tip", np.abs(paths[0] - paths[1]).max(), moved, fine)
     assert moved > 5e-3
-    assert np.abs(ways[0] - ways[1]).max() < 1e-3
+    assert np.abs(paths[0] - paths[1]).max() < 1e-3
 
 
-def test_looking_closely_refines_what_moves_and_looking_away_coarsens_it():
-    model = laden(3)
+def test_moving_trees_in_the_detail_focus_are_refined():
+    model = loaded_canes(3)
     physics = Physics(model)
-    physics.set_detail_focus(middle(model, 1)[None], 0.2)
+    physics.set_detail_focus(bunch_centre(model, 1)[None], 0.2)
     physics.step()
-    assert len(physics.level_of_detail.fine_trees) == 0  # asleep: nothing of it moves
+    assert len(physics.level_of_detail.fine_trees) == 0  # asleep trees are not refined
     physics.plants.wake(np.arange(3))
     for _ in range(3):
         physics.step()
     assert physics.level_of_detail.fine_trees.tolist() == [1]
     physics.set_detail_focus(np.zeros((0, 3)), 0.0)
-    for _ in range(LINGER + 40):
+    for _ in range(DETAIL_STEPS + 40):
         physics.step()
     assert len(physics.level_of_detail.fine_trees) == 0
 
 
-def test_a_tree_stays_fine_while_somebody_is_there_and_not_once_its_bunch_is_gone():
-    model = laden()
+def test_a_tree_stays_fine_while_an_actor_is_near_and_until_its_bunch_is_picked():
+    model = loaded_canes()
     physics = Physics(model)
-    at = middle(model)
+    at = bunch_centre(model)
     physics.add_robot(bar(at - [0.0, 0.025 + model.bunch_radius[0], 0.0], stiffness=4e3, damping=400.0))
-    for _ in range(3 * LINGER):
+    for _ in range(3 * DETAIL_STEPS):
         physics.step()
     assert physics.state.tree_fine[0]
     physics.pick(0)
-    for _ in range(2 * LINGER):
+    for _ in range(2 * DETAIL_STEPS):
         physics.step()
     assert not physics.state.tree_fine[0]
 
 
-def test_berries_are_the_same_ones_before_and_after():
-    model = laden()
+def test_berries_keep_their_identity():
+    model = loaded_canes()
     physics = Physics(model)
     primitives = Primitives(model, grass=0.0)
     labels, kinds = primitives.label.copy(), primitives.shapes.kind.numpy().copy()
     radii = primitives.shapes.a.numpy()[kinds == 1, 3].copy()
     start = primitives.shapes.a.numpy()[kinds == 1, :3].copy()
-    for tick in pushed(physics, middle(model)):
+    for tick in push(physics, bunch_centre(model)):
         if tick % 50 == 0:
             primitives.update(physics.snapshot(), np.array([0]))
             berries = primitives.shapes.a.numpy()[: len(kinds)][kinds == 1]
@@ -182,15 +184,15 @@ def test_berries_are_the_same_ones_before_and_after():
         if tick > 300 and not physics.state.tree_fine[0]:
             break
     assert np.array_equal(primitives.label[: len(labels)], labels)
-    # back where it hung, but for the swing that goes on and what the clusters came to rest with
+    # at the rest pose, but for remaining oscillation and bending of the clusters
     assert np.abs(primitives.shapes.a.numpy()[: len(kinds)][kinds == 1, :3] - start).max() < 0.05
 
 
-def test_twice_the_same_bits():
+def test_two_runs_are_bitwise_equal():
     ends = []
     for _ in range(2):
-        physics = Physics(laden())
-        for tick in pushed(physics, middle(physics.model)):
+        physics = Physics(loaded_canes())
+        for tick in push(physics, bunch_centre(physics.model)):
             if tick == 400:
                 break
         state = physics.state
@@ -199,7 +201,7 @@ def test_twice_the_same_bits():
 
 
 @pytest.mark.parametrize("bunches", [0, 2])
-def test_trees_without_clusters_are_left_alone(bunches):
+def test_trees_without_clusters_stay_coarse(bunches):
     trees = []
     for row in range(2):
         tree = TreeBuilder(frames.pose(np.array([0.0, 0.6 * row, 1.8])))

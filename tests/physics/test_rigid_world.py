@@ -1,4 +1,4 @@
-"""The rigid world: the split tick is MuJoCo's own, drives feel what they carry, robots come and go in mid-motion."""
+"""The rigid world: the split step equals MuJoCo's, measured efforts, robots that join and leave in mid-motion."""
 
 from __future__ import annotations
 
@@ -78,17 +78,17 @@ def step(rigid: RigidWorld, ticks: int = 1) -> None:
         rigid.integrate()
 
 
-def test_only_poles_and_trunks_stand_in_the_way():
+def test_only_poles_and_trunks_are_static_geoms():
     names = [yard_geom.name for yard_geom in map(RigidWorld(yard()).mj_model.geom, range(2))]
     assert names == ["ground", "fixed/0"]
 
 
-def test_split_step_is_mj_step_to_the_bit():
+def test_split_step_is_bitwise_mj_step():
     rigid = RigidWorld(yard(boxes=2))
     rigid.add_robot(arm())
     rigid.add_robot(arm("bert", 1, y=1.5))
-    twin = mujoco.MjData(rigid.mj_model)
-    mujoco.mj_copyData(twin, rigid.mj_model, rigid.mj_data)
+    reference = mujoco.MjData(rigid.mj_model)
+    mujoco.mj_copyData(reference, rigid.mj_model, rigid.mj_data)
     rng = np.random.default_rng(3)
     for tick in range(200):
         if tick % 20 == 0:
@@ -98,14 +98,14 @@ def test_split_step_is_mj_step_to_the_bit():
         rigid.velocity_free  # noqa: B018 (reading the prediction must not disturb the step)
         rigid.impulse_response(np.eye(rigid.mj_model.nv)[:4])
         rigid.integrate()
-        twin.ctrl[:] = rigid.mj_data.ctrl
-        mujoco.mj_step(rigid.mj_model, twin)
-        assert (twin.qpos == rigid.mj_data.qpos).all()
-        assert (twin.qvel == rigid.mj_data.qvel).all()
+        reference.ctrl[:] = rigid.mj_data.ctrl
+        mujoco.mj_step(rigid.mj_model, reference)
+        assert (reference.qpos == rigid.mj_data.qpos).all()
+        assert (reference.qvel == rigid.mj_data.qvel).all()
 
 
 @pytest.mark.parametrize("exact", [False, True])
-def test_prediction_and_response_are_what_the_second_half_does(exact):
+def test_predicted_velocity_and_response_are_realised(exact):
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     if exact:
@@ -121,10 +121,10 @@ def test_prediction_and_response_are_what_the_second_half_does(exact):
     np.testing.assert_allclose(rigid.mj_data.qvel, predicted, atol=1e-12)
 
 
-def test_response_holds_the_stiffness_of_a_limit_that_is_active():
+def test_response_includes_the_stiffness_of_an_active_limit():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
-    rigid.command("anna", np.array([0.4, -0.9, 0.2]))  # beyond the stop at 0.1
+    rigid.command("anna", np.array([0.4, -0.9, 0.2]))  # beyond the limit at 0.1
     step(rigid, 100)
     rigid.predict()
     assert rigid.mj_data.nefc == 1
@@ -135,7 +135,7 @@ def test_response_holds_the_stiffness_of_a_limit_that_is_active():
     np.testing.assert_allclose(rigid.mj_data.qvel, predicted, atol=1e-7)
 
 
-def test_new_gains_do_not_change_what_was_felt():
+def test_new_gains_do_not_change_the_last_measured_effort():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.command("anna", HOME + 0.02)
@@ -164,7 +164,7 @@ def test_gravity_compensation_holds_the_pose_and_effort_is_the_weight():
     np.testing.assert_allclose(effort, -weight, rtol=1e-4)
 
 
-def test_a_weak_drive_gives_no_more_than_its_effort():
+def test_a_drive_is_limited_to_its_effort():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.apply_wrench("anna", "slider", np.array([0.0, 0.0, -300.0]))
@@ -174,8 +174,8 @@ def test_a_weak_drive_gives_no_more_than_its_effort():
     assert np.abs(rigid.mj_data.qfrc_actuator[rigid.robot("anna").v]).max() <= 90.0 + 1e-9
 
 
-def test_known_contact_is_read_as_contact_and_balanced_by_the_drives():
-    """A force on the tool, handed in as the contact solve does: contact = J^T f, effort balances load and contact."""
+def test_contact_effort_is_measured_and_balanced_by_the_drives():
+    """A force on the tool, given as by the contact solver: contact = J^T f, effort balances load and contact."""
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     step(rigid, 50)
@@ -194,7 +194,7 @@ def test_known_contact_is_read_as_contact_and_balanced_by_the_drives():
     np.testing.assert_allclose(effort - at_rest, -contact, rtol=2e-2, atol=2e-2)
 
 
-def test_contact_with_a_pole_is_read_too_and_the_tracks_slip_at_their_effort():
+def test_contact_with_a_pole_is_measured_and_the_tracks_slip_at_their_effort():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm(x=2.6))
     rigid.command_base("anna", (0.3, 0.0, 0.0))
@@ -218,11 +218,11 @@ def test_tracks_drive_and_hold():
     rigid.apply_wrench("anna", "chassis", np.array([100.0, 0.0, 0.0]))
     step(rigid, 500)
     pushed, velocity = rigid.base_state("anna")
-    assert np.abs(pushed[:2] - held[:2]).max() < 2e-3  # 100 N of 800 N: an eighth of the give
+    assert np.abs(pushed[:2] - held[:2]).max() < 2e-3  # 100 N of 800 N: an eighth of the slip
     assert np.abs(velocity).max() < 1e-5
 
 
-def test_base_turns_in_its_own_axes():
+def test_the_base_rotates_about_its_own_axes():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.command_base("anna", (0.4, 0.0, 0.5))  # a circle of radius 0.8 m
@@ -233,7 +233,7 @@ def test_base_turns_in_its_own_axes():
     np.testing.assert_allclose(pose[:2], [0.8 * np.sin(yaw), 0.8 * (1 - np.cos(yaw))], atol=0.05)
 
 
-def test_joining_in_mid_motion_carries_every_number_over():
+def test_a_joining_robot_keeps_the_state_of_the_others():
     rigid = RigidWorld(yard(boxes=1))
     rigid.add_robot(arm())
     rigid.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
@@ -246,33 +246,39 @@ def test_joining_in_mid_motion_carries_every_number_over():
         rigid.mj_data.body("box/0").xpos.copy(),
         rigid.link_pose("anna", "tool"),
     )
-    alone = RigidWorld(yard(boxes=1))
-    alone.add_robot(arm())
-    alone.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
-    alone.command_base("anna", (0.2, 0.0, 0.1))
-    alone.apply_wrench("anna", "lower", np.array([0.0, 5.0, 0.0]))
-    step(alone, 13)
+    undisturbed = RigidWorld(yard(boxes=1))
+    undisturbed.add_robot(arm())
+    undisturbed.command("anna", HOME + np.array([0.5, 0.5, -0.04]), np.array([0.5, 0.0, 0.0]))
+    undisturbed.command_base("anna", (0.2, 0.0, 0.1))
+    undisturbed.apply_wrench("anna", "lower", np.array([0.0, 5.0, 0.0]))
+    step(undisturbed, 13)
 
     rigid.add_robot(arm("bert", 1, y=3.0))
-    for mine, old in zip(rigid.joint_measurements("anna"), before[0], strict=True):
-        assert (mine == old).all()
-    for mine, old in zip(rigid.base_state("anna"), before[1], strict=True):
-        assert (mine == old).all()
+    for actual, expected in zip(rigid.joint_measurements("anna"), before[0], strict=True):
+        assert (actual == expected).all()
+    for actual, expected in zip(rigid.base_state("anna"), before[1], strict=True):
+        assert (actual == expected).all()
     assert (rigid.link_pose("anna", "tool") == before[3]).all()
     step(rigid, 20)
-    step(alone, 20)
-    np.testing.assert_allclose(rigid.joint_measurements("anna")[0], alone.joint_measurements("anna")[0], atol=1e-9)
-    np.testing.assert_allclose(rigid.joint_measurements("anna")[1], alone.joint_measurements("anna")[1], atol=1e-8)
+    step(undisturbed, 20)
+    np.testing.assert_allclose(
+        rigid.joint_measurements("anna")[0], undisturbed.joint_measurements("anna")[0], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        rigid.joint_measurements("anna")[1], undisturbed.joint_measurements("anna")[1], atol=1e-8
+    )
 
     rigid.remove_robot("bert")
     assert rigid.robots == ("anna",)
     step(rigid, 20)
-    step(alone, 20)
-    np.testing.assert_allclose(rigid.joint_measurements("anna")[0], alone.joint_measurements("anna")[0], atol=1e-9)
-    np.testing.assert_allclose(rigid.base_state("anna")[0], alone.base_state("anna")[0], atol=1e-9)
+    step(undisturbed, 20)
+    np.testing.assert_allclose(
+        rigid.joint_measurements("anna")[0], undisturbed.joint_measurements("anna")[0], atol=1e-9
+    )
+    np.testing.assert_allclose(rigid.base_state("anna")[0], undisturbed.base_state("anna")[0], atol=1e-9)
 
 
-def test_a_copy_follows_the_pose_and_speed_it_receives():
+def test_a_copy_follows_the_received_pose_and_velocity():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.add_robot(arm("copy", 1, y=2.0))
@@ -285,12 +291,12 @@ def test_a_copy_follows_the_pose_and_speed_it_receives():
         base_q[1] += 2.0
         rigid.follow_remote("copy", base_q, base_qd, position, velocity)
         step(rigid)
-    (mine, _), (copy, _) = rigid.base_state("anna"), rigid.base_state("copy")
-    np.testing.assert_allclose(copy[:2] - mine[:2], [0.0, 2.0], atol=5e-3)
+    (actual, _), (copy, _) = rigid.base_state("anna"), rigid.base_state("copy")
+    np.testing.assert_allclose(copy[:2] - actual[:2], [0.0, 2.0], atol=5e-3)
     np.testing.assert_allclose(rigid.joint_measurements("copy")[0], rigid.joint_measurements("anna")[0], atol=1e-2)
 
 
-def test_robots_meet_each_other_but_not_themselves():
+def test_robots_collide_with_each_other_but_not_with_themselves():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.command("anna", np.array([-1.0, 2.5, 0.0]))  # folded into its own chassis
@@ -303,7 +309,7 @@ def test_robots_meet_each_other_but_not_themselves():
     assert rigid.base_state("anna")[0][0] - rigid.base_state("bert")[0][0] == pytest.approx(0.6, abs=2e-3)
 
 
-def test_links_for_sensors_ride_on_the_bodies():
+def test_visuals_move_with_their_bodies():
     rigid = RigidWorld(yard(boxes=1))
     rigid.add_robot(arm("anna", 7, x=1.0, heading=0.5))
     step(rigid, 30)
@@ -317,13 +323,13 @@ def test_links_for_sensors_ride_on_the_bodies():
     np.testing.assert_allclose(poses[1, :3], [1.0, 0.0, 0.25], atol=1e-9)
     np.testing.assert_allclose(poses[4], rigid.link_pose("anna", "slider"), atol=1e-12)
     np.testing.assert_allclose(links[2].shapes[0].pose[3:], [0, np.sqrt(0.5), 0, np.sqrt(0.5)], atol=1e-6)
-    np.testing.assert_allclose(poses[0, 2], 0.0, atol=2e-3)  # the box stands on the ground
-    # both wheel and axle nobody drives: fixed, and the wheel has no shape
+    np.testing.assert_allclose(poses[0, 2], 0.0, atol=2e-3)  # the box is on the ground
+    # the axle has no drive: it is fixed, and the wheel has no shape
     assert "anna/axle" not in [rigid.mj_model.joint(i).name for i in range(rigid.mj_model.njnt)]
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         ({"name": "a/b"}, "must not"),
         ({"base": "chassis"}, "root"),
@@ -334,10 +340,10 @@ def test_links_for_sensors_ride_on_the_bodies():
         ({"drives": (*DRIVES[:2], Drive("mount", 1, 1, 1, 1, 0, 1))}, "fixed"),
     ],
 )
-def test_what_is_wrong_with_a_robot_is_said_and_the_world_goes_on(change, says):
+def test_an_invalid_robot_is_refused_and_the_world_is_unchanged(change, message):
     rigid = RigidWorld(yard())
     rigid.add_robot(arm("other"))
-    with pytest.raises(RobotError, match=says) as caught:
+    with pytest.raises(RobotError, match=message) as caught:
         rigid.add_robot(dataclasses.replace(arm(), **change))
     assert "\n" not in str(caught.value)
     assert rigid.robots == ("other",)
@@ -348,8 +354,8 @@ def test_what_is_wrong_with_a_robot_is_said_and_the_world_goes_on(change, says):
         rigid.add_robot(arm("other"))
 
 
-def test_a_mimicking_finger_copies_the_one_that_is_driven():
-    twin = ARM.replace(
+def test_a_mimicking_finger_follows_the_driven_one():
+    reference = ARM.replace(
         '<link name="tool"/>',
         '<link name="thumb"><inertial><mass value="0.2"/>'
         '<inertia ixx="0.001" iyy="0.001" izz="0.001" ixy="0" ixz="0" iyz="0"/></inertial></link>'
@@ -358,7 +364,7 @@ def test_a_mimicking_finger_copies_the_one_that_is_driven():
         '</joint><link name="tool"/>',
     )
     rigid = RigidWorld(yard())
-    rigid.add_robot(dataclasses.replace(arm(), urdf=twin))
+    rigid.add_robot(dataclasses.replace(arm(), urdf=reference))
     thumb = rigid.mj_data.joint("anna/oppose")
     assert thumb.qpos[0] == pytest.approx(0.3 - 2 * 0.05)
     rigid.command("anna", np.array([0.4, -0.9, 0.09]))
@@ -367,8 +373,8 @@ def test_a_mimicking_finger_copies_the_one_that_is_driven():
     assert rigid.mj_data.joint("anna/oppose").qpos[0] == pytest.approx(0.3 - 2 * 0.09, abs=1e-3)
 
 
-def test_a_mesh_is_touched_as_the_box_around_it(tmp_path):
-    """An STL of a brick, off its link's origin: plants feel a box of its edges, sensors are told the file."""
+def test_a_mesh_collides_as_its_bounding_box(tmp_path):
+    """An STL of a brick, off its link's origin: contacts use its bounding box, sensors get the file."""
     low, high = np.array([0.1, -0.05, 0.2]), np.array([0.16, 0.07, 0.5])
     corner = [np.where([i & 1, i & 2, i & 4], high, low) for i in range(8)]
     quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
@@ -394,7 +400,7 @@ def test_a_mesh_is_touched_as_the_box_around_it(tmp_path):
 
 
 @pytest.mark.parametrize("content", [b"", b"solid of nothing", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"])
-def test_a_mesh_that_is_none_is_named(content, tmp_path):
+def test_an_unreadable_mesh_is_named(content, tmp_path):
     file = tmp_path / f"shell.{'obj' if content.startswith(b'v') else 'stl'}"
     file.write_bytes(content)
     urdf = ARM.replace('<sphere radius="0.04"/>', f'<mesh filename="{file}"/>')
@@ -405,7 +411,7 @@ def test_a_mesh_that_is_none_is_named(content, tmp_path):
     assert rigid.robots == ()
 
 
-def test_gains_can_be_tuned_and_survive_a_newcomer():
+def test_gains_can_be_set_and_persist_when_a_robot_joins():
     rigid = RigidWorld(yard())
     rigid.add_robot(arm())
     rigid.set_gains("anna", np.array([4000.0, 0.0, 8000.0]), np.array([250.0, 5.0, 400.0]), np.array([0.0, 2.0, 0.0]))
@@ -417,16 +423,16 @@ def test_gains_can_be_tuned_and_survive_a_newcomer():
     assert velocity[1] > 0.1
 
 
-def test_boxes_at_rest_sleep_until_something_pushes_them():
+def test_boxes_at_rest_sleep_until_they_are_pushed():
     rigid = RigidWorld(yard(boxes=3))
     rigid.add_robot(arm())
-    nothing = np.full(rigid.mj_model.nv, -0.0)
+    no_force = np.full(rigid.mj_model.nv, -0.0)
     for _ in range(100):
         rigid.predict()
-        rigid.integrate(nothing)
+        rigid.integrate(no_force)
     assert rigid.mj_data.ncon == 0
     assert (rigid.velocity_free[:18] == 0.0).all()
-    push = nothing.copy()
+    push = no_force.copy()
     dof, steps, dt, mu = rigid.mj_model.joint("box/1").dofadr[0], 60, rigid.dt, rigid.parameters.friction
     push[dof] = 30.0  # mu m g is 15.7 N
     impulse = np.zeros(3)  # of the ground on the box
@@ -434,9 +440,9 @@ def test_boxes_at_rest_sleep_until_something_pushes_them():
         rigid.predict()
         rigid.integrate(push)
         impulse += dt * rigid.mj_data.qfrc_constraint[dof : dof + 3]
-    # Coulomb: friction opposes the motion and is mu times what the ground bears
+    # Coulomb: friction opposes the motion and is mu times the normal force
     np.testing.assert_allclose(impulse[:2], [-mu * impulse[2], 0.0], atol=1e-6 * impulse[2])
-    # F / m = 7.15 m/s^2, summed in steps; the ground does not bear the weight in every step, so that the box hops
+    # F / m = 7.15 m/s^2, summed in steps; the normal force is zero in some steps, so that the box hops
     rigid.predict()
     moved = rigid.mj_data.joint("box/1").qpos[0]
     acceleration = (30.0 - mu * 2.0 * 9.81) / 2.0
@@ -445,31 +451,31 @@ def test_boxes_at_rest_sleep_until_something_pushes_them():
     assert rigid.mj_data.joint("box/0").qvel[0] == 0.0
 
 
-def test_a_robot_that_goes_wrong_stops_where_it_was_and_the_rest_goes_on():
-    rigid, alone = RigidWorld(yard()), RigidWorld(yard())
-    for world in (rigid, alone):
+def test_a_faulty_robot_stops_and_the_others_continue():
+    rigid, undisturbed = RigidWorld(yard()), RigidWorld(yard())
+    for world in (rigid, undisturbed):
         world.add_robot(arm())
         world.add_robot(arm("bert", 1, y=3.0))
         world.command_base("bert", (0.3, 0.0, 0.0))
     step(rigid, 20)
-    step(alone, 20)
-    where = rigid.base_state("anna")[0]
+    step(undisturbed, 20)
+    pose_before = rigid.base_state("anna")[0]
     rigid.predict()
     rigid.mj_data.qvel[rigid.robot("anna").v[1]] = np.nan
     rigid.integrate()
     step(rigid, 30)
-    step(alone, 31)
+    step(undisturbed, 31)
     assert rigid.faults == 1
     assert "anna" in rigid.last_fault
     assert "bert" not in rigid.last_fault
-    np.testing.assert_allclose(rigid.base_state("anna")[0], where, atol=1e-3)
+    np.testing.assert_allclose(rigid.base_state("anna")[0], pose_before, atol=1e-3)
     np.testing.assert_allclose(rigid.joint_measurements("anna")[0], HOME, atol=1e-2)
-    np.testing.assert_allclose(rigid.base_state("bert")[0], alone.base_state("bert")[0], atol=1e-6)
-    assert rigid.mj_data.time == pytest.approx(alone.mj_data.time)
+    np.testing.assert_allclose(rigid.base_state("bert")[0], undisturbed.base_state("bert")[0], atol=1e-6)
+    assert rigid.mj_data.time == pytest.approx(undisturbed.mj_data.time)
 
 
-def loose(shapes: int, mass: float = 0.6) -> free_bunch.FreeBunch:
-    """A bunch of some spheres and, last, a capsule."""
+def free_bunch_of(shapes: int, mass: float = 0.6) -> free_bunch.FreeBunch:
+    """A bunch of spheres and, last, a capsule."""
     start = np.stack([0.02 * np.arange(shapes), 0.003 * np.arange(shapes), np.zeros(shapes)], 1)
     end = start.copy()
     end[-1, 0] += 0.03
@@ -479,34 +485,36 @@ def loose(shapes: int, mass: float = 0.6) -> free_bunch.FreeBunch:
 
 
 @pytest.mark.parametrize("shapes", [1, 5, free_bunch.MAX_GEOMS])
-def test_a_waiting_body_becomes_what_a_compiled_one_would_be(shapes):
-    """All constants that MuJoCo derives from weight and shapes, against a world compiled with the bunch in it."""
+def test_a_pooled_body_equals_a_compiled_one(shapes):
+    """All constants that MuJoCo derives from mass and shapes, against a world compiled with the bunch."""
     model = assemble([], box_pose=[[1.0, 0, 0, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.3]], box_mass=[[2.0]])
     rigid = RigidWorld(model)
-    bunch = loose(shapes)
+    bunch = free_bunch_of(shapes)
     rigid.add_bunch(3, bunch, frames.pose(np.array([0.0, 0.0, 1.0])), np.zeros(6))
     spec = static_world.build_static_world(model, rigid.parameters)
     free_bunch.add_free_bunch(spec, bunch, rigid.parameters)
-    ours, theirs = rigid.mj_model, spec.compile()
-    a, b = ours.body("free_bunch/0").id, theirs.nbody - 1
+    pooled, compiled = rigid.mj_model, spec.compile()
+    a, b = pooled.body("free_bunch/0").id, compiled.nbody - 1
     for name in free_bunch.BODY_ARRAYS:
-        np.testing.assert_allclose(getattr(ours, name)[a], getattr(theirs, name)[b], rtol=1e-12, err_msg=name)
-    at, there = ours.body_geomadr[a], theirs.body_geomadr[b]
+        np.testing.assert_allclose(getattr(pooled, name)[a], getattr(compiled, name)[b], rtol=1e-12, err_msg=name)
+    at, there = pooled.body_geomadr[a], compiled.body_geomadr[b]
     for name in free_bunch.GEOM_ARRAYS:
-        mine, other = getattr(ours, name)[at : at + shapes], getattr(theirs, name)[there : there + shapes]
-        np.testing.assert_allclose(mine, other, rtol=1e-12, err_msg=name)
-    mine, other = slice(ours.body_dofadr[a], ours.body_dofadr[a] + 6), slice(theirs.nv - 6, theirs.nv)
+        actual, other = getattr(pooled, name)[at : at + shapes], getattr(compiled, name)[there : there + shapes]
+        np.testing.assert_allclose(actual, other, rtol=1e-12, err_msg=name)
+    actual, other = slice(pooled.body_dofadr[a], pooled.body_dofadr[a] + 6), slice(compiled.nv - 6, compiled.nv)
     for name in ("dof_M0", "dof_invweight0", "dof_length", "dof_simplenum"):
-        np.testing.assert_allclose(getattr(ours, name)[mine], getattr(theirs, name)[other], rtol=1e-12, err_msg=name)
-    mine = slice(ours.body_bvhadr[a], ours.body_bvhadr[a] + ours.body_bvhnum[a])
-    other = slice(theirs.body_bvhadr[b], theirs.body_bvhadr[b] + theirs.body_bvhnum[b])
-    np.testing.assert_allclose(ours.bvh_aabb[mine], theirs.bvh_aabb[other], rtol=1e-12)
-    assert (ours.bvh_child[mine] == theirs.bvh_child[other]).all()
-    nodes, others = ours.bvh_nodeid[mine], theirs.bvh_nodeid[other]
-    assert (np.where(nodes < 0, -1, nodes - at) == np.where(others < 0, -1, others - there)).all()
+        np.testing.assert_allclose(
+            getattr(pooled, name)[actual], getattr(compiled, name)[other], rtol=1e-12, err_msg=name
+        )
+    actual = slice(pooled.body_bvhadr[a], pooled.body_bvhadr[a] + pooled.body_bvhnum[a])
+    other = slice(compiled.body_bvhadr[b], compiled.body_bvhadr[b] + compiled.body_bvhnum[b])
+    np.testing.assert_allclose(pooled.bvh_aabb[actual], compiled.bvh_aabb[other], rtol=1e-12)
+    assert (pooled.bvh_child[actual] == compiled.bvh_child[other]).all()
+    nodes, compiled_nodes = pooled.bvh_nodeid[actual], compiled.bvh_nodeid[other]
+    assert (np.where(nodes < 0, -1, nodes - at) == np.where(compiled_nodes < 0, -1, compiled_nodes - there)).all()
 
 
-def test_waiting_bodies_sleep_and_nobody_sees_them():
+def test_pooled_bodies_sleep_and_are_invisible():
     rigid = RigidWorld(assemble([]))
     for _ in range(20):
         rigid.predict()
@@ -517,12 +525,12 @@ def test_waiting_bodies_sleep_and_nobody_sees_them():
     assert rigid.mj_data.ncon == 0
 
 
-def test_more_bunches_than_bodies_wait_for_them():
-    """The pool grows by a compilation when it is used up; those that fall go on falling."""
+def test_the_pool_of_bunches_grows():
+    """The pool grows by a compilation when it is used up; falling bunches continue to fall."""
     rigid = RigidWorld(assemble([]))
     generations = []
     for bunch in range(rigid.parameters.bunch_pool_size + 2):
-        rigid.add_bunch(bunch, loose(3), frames.pose(np.array([float(bunch), 0.0, 5.0])), np.zeros(6))
+        rigid.add_bunch(bunch, free_bunch_of(3), frames.pose(np.array([float(bunch), 0.0, 5.0])), np.zeros(6))
         generations.append(rigid.mj_model)
         rigid.predict()
         rigid.integrate()
@@ -536,5 +544,5 @@ def test_more_bunches_than_bodies_wait_for_them():
     assert 4 not in rigid.free_bunches
     assert [link.name for link in rigid.visuals()] == [f"bunch/{bunch}" for bunch in rigid.free_bunches]
     with pytest.raises(ValueError, match="shapes; a free one has"):
-        rigid.add_bunch(4, loose(free_bunch.MAX_GEOMS + 1), frames.pose(np.zeros(3)), np.zeros(6))
+        rigid.add_bunch(4, free_bunch_of(free_bunch.MAX_GEOMS + 1), frames.pose(np.zeros(3)), np.zeros(6))
     assert 4 not in rigid.free_bunches

@@ -22,8 +22,8 @@ def canes(count: int = 2) -> Model:
 
 
 @pytest.mark.parametrize("fine", [False, True])
-def test_a_rollout_is_what_plants_do(fine: bool) -> None:
-    """To the bit, over segments of unlike length, with clusters riding or moving."""
+def test_a_rollout_equals_the_solver(fine: bool) -> None:
+    """Bitwise, over segments of different lengths, with coarse or fine clusters."""
     model = clustered(2)
     rng = np.random.default_rng(2)
     rates = rng.normal(size=(len(model.body_mass), 3))
@@ -65,7 +65,7 @@ def test_gradients_do_not_depend_on_checkpoints_or_history() -> None:
         np.testing.assert_array_equal(other, found[0])
 
 
-def test_trees_do_not_hear_of_each_other() -> None:
+def test_gradients_of_trees_are_independent() -> None:
     rollout = Rollout(canes(), 20, watched=np.array([3]))
     rollout.run()
     gradient = rollout.gradient(by_qd=np.ones((21, 1, 6)))
@@ -73,7 +73,7 @@ def test_trees_do_not_hear_of_each_other() -> None:
     assert not gradient.mass[4:].any()
 
 
-def test_bad_input_is_refused_in_words() -> None:
+def test_invalid_input_is_refused_with_the_reason() -> None:
     model = canes()
     with pytest.raises(ValueError, match="0 ticks"):
         Rollout(model, 0)

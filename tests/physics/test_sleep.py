@@ -27,7 +27,7 @@ def tick(plants: ArticulationSolver, sleep: SleepMonitor, busy: np.ndarray | Non
     return sleep.update(busy)
 
 
-def test_a_kicked_tree_swings_then_sleeps_and_the_others_never_woke() -> None:
+def test_a_kicked_tree_swings_then_sleeps_and_the_others_stay_asleep() -> None:
     plants = row(5)
     sleep = SleepMonitor(plants)
     state = plants.state
@@ -40,23 +40,23 @@ def test_a_kicked_tree_swings_then_sleeps_and_the_others_never_woke() -> None:
         tick(plants, sleep)
         ticks += 1
         assert ticks < 1000
-    assert ticks > 60  # it did swing
+    assert ticks > 60  # it swung before
     assert not state.joint_qd.any()
     assert not state.tree_awake.any()
     after = [getattr(state, name)[others].tobytes() for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
     assert before == after
     np.testing.assert_allclose(
         state.body_q, plants.model.forward_kinematics(state.joint_q), atol=1e-5
-    )  # up to date, not a tick old
+    )  # current, not one tick old
 
 
-def test_a_tree_drawn_at_rest_sleeps_after_patience() -> None:
+def test_a_tree_at_rest_sleeps_after_the_sleep_duration() -> None:
     plants = row(2)
     sleep = SleepMonitor(plants, PhysicsParameters(sleep_duration=0.07))
     sleep.wake(np.array([0, 1]))
     drawn = plants.state.body_q.copy()
-    rested = [tick(plants, sleep).tolist() for _ in range(7)]
-    assert rested == [[]] * 6 + [[0, 1]]
+    slept = [tick(plants, sleep).tolist() for _ in range(7)]
+    assert slept == [[]] * 6 + [[0, 1]]
     np.testing.assert_allclose(plants.state.body_q, drawn, atol=1e-5)
 
 

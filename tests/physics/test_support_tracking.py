@@ -1,4 +1,4 @@
-"""What rides on what: parents by contact, rest by half a second of stillness in the parent's frame."""
+"""Support of objects: parents by contact, rest after half a second without motion in the parent's frame."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ def settle(physics: Physics, limit: int = 800, robot: Robot | None = None) -> No
         run(physics, 1, robot)
         if not physics.support_tracker.moving:
             return
-    pytest.fail("never at rest")
+    pytest.fail("not at rest in time")
 
 
-def in_box(physics: Physics, bunch: int = 0, box: int = 0) -> None:
+def place_in_box(physics: Physics, bunch: int = 0, box: int = 0) -> None:
     physics.pick(bunch)
-    there = frames.compose(physics.support_tracker.object_state(BOX(box))[0], frames.pose([-0.1, 0.0, 0.07]))
-    physics.rigid.place_bunch(bunch, there, np.zeros(6))
+    pose_in_box = frames.compose(physics.support_tracker.object_state(BOX(box))[0], frames.pose([-0.1, 0.0, 0.07]))
+    physics.rigid.place_bunch(bunch, pose_in_box, np.zeros(6))
 
 
-def test_boxes_start_at_rest_on_the_ground_and_a_picked_bunch_moves_until_it_lies():
+def test_boxes_start_at_rest_and_a_picked_bunch_moves_until_it_rests():
     physics = Physics(vineyard())
     run(physics, 5)
     assert physics.support_tracker.object_ids.tolist() == [BOX(0), BOX(1)]
@@ -56,13 +56,13 @@ def test_boxes_start_at_rest_on_the_ground_and_a_picked_bunch_moves_until_it_lie
     )
 
 
-def test_in_a_box_it_lies_in_the_frame_of_the_box_wherever_that_goes():
+def test_a_bunch_in_a_moving_box_is_at_rest_in_its_frame():
     physics = Physics(vineyard())
-    in_box(physics)
+    place_in_box(physics)
     settle(physics)
     parent, relative = physics.support_tracker.pose_on_support(BUNCH(0))
     assert parent == "box/0"
-    # the box is carried away with what is in it, in small steps
+    # the box is moved with its contents in small steps
     for _ in range(150):
         for number in (BOX(0), BUNCH(0)):
             pose = physics.support_tracker.object_state(number)[0]
@@ -73,16 +73,16 @@ def test_in_a_box_it_lies_in_the_frame_of_the_box_wherever_that_goes():
     settle(physics)
     moved = physics.support_tracker.pose_on_support(BUNCH(0))[1] - relative
     np.testing.assert_allclose(moved[[0, 1, 3, 4, 5, 6]], 0.0, atol=1e-6)
-    assert abs(moved[2]) < 3e-3  # put elsewhere in each step, it sinks into the bottom otherwise than when it lies
+    assert abs(moved[2]) < 3e-3  # moved in each step, it penetrates the bottom differently than at rest
     pose, _ = physics.support_tracker.to_world("box/0", physics.support_tracker.pose_on_support(BUNCH(0))[1])
     np.testing.assert_allclose(pose[:3], physics.support_tracker.object_state(BUNCH(0))[0][:3], atol=1e-9)
 
 
-def test_on_a_robot_a_box_rests_in_the_frame_of_its_link_and_what_is_in_it_in_the_box():
+def test_a_box_on_a_robot_rests_in_the_frame_of_its_link():
     physics = Physics(vineyard())
     robot = Robot(physics.rigid, cart(), "anna", pose=frames.pose([-5.0, -3.0, 0.0]))
     physics.support_tracker.set_state(BOX(0), frames.compose(physics.rigid.base_state("anna")[0], DECK), np.zeros(6))
-    in_box(physics)
+    place_in_box(physics)
     settle(physics, robot=robot)
     assert physics.support_tracker.pose_on_support(BOX(0))[0] == "anna/base_footprint"
     assert physics.support_tracker.pose_on_support(BUNCH(0))[0] == "box/0"
@@ -96,7 +96,7 @@ def test_on_a_robot_a_box_rests_in_the_frame_of_its_link_and_what_is_in_it_in_th
     np.testing.assert_allclose(pose[:3], here[:3], atol=1e-6)
     np.testing.assert_allclose(velocity[:3], speed[:3], atol=0.02)
     assert here[0] > -4.8
-    # with the robot its parent goes
+    # its parent leaves with the robot
     physics.remove_robot("anna")
     run(physics, 1)
     assert BOX(0) in physics.support_tracker.moving
@@ -105,7 +105,7 @@ def test_on_a_robot_a_box_rests_in_the_frame_of_its_link_and_what_is_in_it_in_th
     assert physics.support_tracker.object_state(BOX(0))[0][2] < 0.05
 
 
-def test_who_touches_what_moves():
+def test_touched_objects_and_their_actors_are_reported():
     physics = Physics(vineyard())
     robot = Robot(physics.rigid, cart(), "anna", pose=frames.pose([-2.72, 0.0, 0.0]))
     run(physics, 20, robot)
@@ -115,42 +115,41 @@ def test_who_touches_what_moves():
         run(physics, 1, robot, 0.3)
         touched.update(physics.support_tracker.touched)
     assert touched == {(BOX(0), "anna")}
-    assert physics.support_tracker.pose_on_support(BOX(0))[0] == "", "what is pushed along the ground does not ride"
+    assert physics.support_tracker.pose_on_support(BOX(0))[0] == "", "a box pushed along the ground has no support"
 
 
-def test_a_thing_is_at_rest_after_half_a_second_and_told_ones_at_once():
+def test_an_object_rests_after_half_a_second_or_at_once_by_a_record():
     physics = Physics(vineyard())
-    riding: SupportTracker = physics.support_tracker
+    tracker: SupportTracker = physics.support_tracker
     rest_steps = physics.parameters.steps(physics.parameters.support_rest_duration)
-    riding.set_state(BOX(0), frames.pose([-2.0, 0.5, 0.001]), np.zeros(6))
+    tracker.set_state(BOX(0), frames.pose([-2.0, 0.5, 0.001]), np.zeros(6))
     run(physics, 1)
-    assert riding.moving == [BOX(0)]
-    ticks = next(i for i in range(2 * rest_steps) if run(physics, 1) or not riding.moving)
+    assert tracker.moving == [BOX(0)]
+    ticks = next(i for i in range(2 * rest_steps) if run(physics, 1) or not tracker.moving)
     assert rest_steps - 5 <= ticks <= rest_steps + 10
-    riding.set_state(BOX(1), frames.pose([-2.0, 1.5, 0.0]), np.zeros(6))
-    riding.set_at_rest(BOX(1), "", frames.pose([-2.0, 1.5, 0.0]))
+    tracker.set_state(BOX(1), frames.pose([-2.0, 1.5, 0.0]), np.zeros(6))
+    tracker.set_at_rest(BOX(1), "", frames.pose([-2.0, 1.5, 0.0]))
     run(physics, 1)
-    assert riding.moving == []
-    riding.set_moving([BOX(0)])
-    assert riding.moving == [BOX(0)]
+    assert tracker.moving == []
+    tracker.set_moving([BOX(0)])
+    assert tracker.moving == [BOX(0)]
 
 
-def test_a_copy_is_pulled_the_faster_part_at_once_and_a_far_one_put_there():
+def test_a_remote_object_is_blended_and_a_distant_one_placed():
     physics = Physics(vineyard())
-    riding, start = physics.support_tracker, physics.support_tracker.object_state(BOX(0))[0]
-    way, speed = np.array([0.1, 0.0, 0.2, 0, 0, 0, 0]), np.array([0.3, 0, 0, 0, 0, 0.1])
-    goal, far = start + way, start + 20.0 * way
-    riding.blend_towards([BOX(0)], goal[None], speed[None], np.array([0.2]))
-    pose, velocity = riding.object_state(BOX(0))
+    tracker, start = physics.support_tracker, physics.support_tracker.object_state(BOX(0))[0]
+    offset, speed = np.array([0.1, 0.0, 0.2, 0, 0, 0, 0]), np.array([0.3, 0, 0, 0, 0, 0.1])
+    goal, far = start + offset, start + 20.0 * offset
+    tracker.blend_towards([BOX(0)], goal[None], speed[None], np.array([0.2]))
+    pose, velocity = tracker.object_state(BOX(0))
     np.testing.assert_allclose(pose[:3], start[:3] + 0.2 * (goal - start)[:3], atol=1e-12)
     np.testing.assert_allclose(velocity, speed, atol=1e-12)
-    riding.blend_towards([BOX(0)], far[None], speed[None], np.array([0.2]))
-    np.testing.assert_allclose(riding.object_state(BOX(0))[0][:3], far[:3], atol=1e-12)
+    tracker.blend_towards([BOX(0)], far[None], speed[None], np.array([0.2]))
+    np.testing.assert_allclose(tracker.object_state(BOX(0))[0][:3], far[:3], atol=1e-12)
 
 
-def test_a_bunch_that_has_just_come_can_be_called_moving_at_once():
-    """Found by the bench of two who fight for one bunch: the first loose bunch of a world without boxes, in the tick
-    in which it comes, was looked for in the arrays of before."""
+def test_a_new_bunch_can_be_set_moving_at_once():
+    """The first free bunch of a world without boxes is known in the tick in which it is picked remotely."""
     tree = TreeBuilder(frames.pose(np.array([0.5, 0.0, 1.5])))
     tree.add_bunch(tree.add_rod(-1, 0.6, (0.006, 0.004), RodMaterial(2e9, 900.0), 6)[-1], 0.4, clusters=False)
     physics = Physics(assemble([tree]))

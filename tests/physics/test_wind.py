@@ -14,7 +14,7 @@ from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
-ROUND = PhysicsParameters().steps(PhysicsParameters().wind_check_period)
+CHECK_STEPS = PhysicsParameters().steps(PhysicsParameters().wind_check_period)
 
 
 def leafy(count: int, area: float = 0.004, **wood: float) -> Model:
@@ -44,12 +44,12 @@ def step(plants: ArticulationSolver, ticks: int) -> None:
 
 def test_wind_is_a_pure_function() -> None:
     points = np.random.default_rng(0).normal(size=(5, 7, 3)) * 10.0
-    first, again = (Wind([3.0, 1.0, 0.0], gusts=1.0, seed=4) for _ in range(2))
-    once = first.velocity_at(points, 12.5)
+    first, same_seed = (Wind([3.0, 1.0, 0.0], gusts=1.0, seed=4) for _ in range(2))
+    expected = first.velocity_at(points, 12.5)
     first.velocity_at(points, 3.0)
-    np.testing.assert_array_equal(first.velocity_at(points, 12.5), once)
-    np.testing.assert_array_equal(again.velocity_at(points, 12.5), once)
-    assert np.abs(Wind([3.0, 1.0, 0.0], gusts=1.0, seed=5).velocity_at(points, 12.5) - once).max() > 0.1
+    np.testing.assert_array_equal(first.velocity_at(points, 12.5), expected)
+    np.testing.assert_array_equal(same_seed.velocity_at(points, 12.5), expected)
+    assert np.abs(Wind([3.0, 1.0, 0.0], gusts=1.0, seed=5).velocity_at(points, 12.5) - expected).max() > 0.1
     np.testing.assert_array_equal(
         Wind([3.0, 1.0, 0.0]).velocity_at(points, 12.5), np.broadcast_to([3.0, 1.0, 0.0], points.shape)
     )
@@ -61,8 +61,8 @@ def test_gusts_travel_with_the_mean() -> None:
     np.testing.assert_allclose(wind.velocity_at(here + 7.0 * wind.mean, 7.0), wind.velocity_at(here, 0.0), atol=1e-9)
 
 
-def test_gusts_are_as_strong_and_as_large_as_asked_and_without_divergence() -> None:
-    """Over many places: the mean, the standard deviation of each component; and over many seeds the correlation."""
+def test_gusts_have_the_given_strength_and_scale_and_no_divergence() -> None:
+    """Mean and standard deviation of each component over many points; correlation over many seeds."""
     points = np.random.default_rng(1).uniform(-300, 300, (20000, 3))
     wind = Wind([3.0, 0.0, 0.0], gusts=0.8, scale=2.0, seed=3)
     gust = wind.velocity_at(points, 0.0) - wind.mean
@@ -89,7 +89,7 @@ def test_gusts_are_as_strong_and_as_large_as_asked_and_without_divergence() -> N
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         ({"mean": [1.0, 2.0]}, "give three finite numbers"),
         ({"mean": [np.nan, 0, 0]}, "give three finite numbers"),
@@ -97,12 +97,12 @@ def test_gusts_are_as_strong_and_as_large_as_asked_and_without_divergence() -> N
         ({"mean": [1, 0, 0], "scale": 0.0}, r"scale 0.0 m"),
     ],
 )
-def test_wrong_wind_is_refused_in_words(arguments: dict, says: str) -> None:
-    with pytest.raises(ValueError, match=says):
+def test_invalid_wind_is_refused_with_the_reason(arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         Wind(**arguments)
 
 
-# ---- what plants feel of it
+# ---- drag on plants
 
 
 def test_without_drag_wind_changes_no_bit() -> None:
@@ -118,13 +118,13 @@ def test_without_drag_wind_changes_no_bit() -> None:
     assert runs[0] == runs[1]
 
 
-def test_a_cane_leans_as_statics_say() -> None:
+def test_deflection_by_wind_is_that_of_statics() -> None:
     """Uniform wind on an upright cane, its weight in balance: w(L) = q L^4 / 8 EI, from the model's own springs."""
     model = leafy(1, area=1e-4)
     plants = ArticulationSolver(model, State.at_rest(model), phi=1.0)
     plants.wake(0)
     plants.tree_air[0] = [0.0, 3.0, 0.0]
-    plants.body_load[:, 2] = 9.81 * model.body_mass  # hold the weight, so that only the wind bends
+    plants.body_load[:, 2] = 9.81 * model.body_mass  # compensate the weight, so that only the wind bends
     for body, frame in enumerate(plants.state.body_q):
         arm = frames.rotate(frame[3:].astype(float), model.body_com[body].astype(float))
         plants.body_load[body, 3:] = np.cross(arm, plants.body_load[body, :3])
@@ -134,7 +134,7 @@ def test_a_cane_leans_as_statics_say() -> None:
     tip = frames.compose(plants.state.body_q[7], frames.pose([0.5 / 8, 0, 0]))
     assert tip[1] == pytest.approx(q * 0.5**4 / 8 / (3e9 * np.pi / 4 * 0.003**4), rel=0.02)
     root = plants.joint_wrench(np.array([0]))[0]
-    assert root[1] == pytest.approx(-q * 0.5, rel=0.01)  # the foot holds against the wind
+    assert root[1] == pytest.approx(-q * 0.5, rel=0.01)  # the root joint balances the wind
 
 
 def test_a_falling_cane_reaches_its_terminal_velocity() -> None:
@@ -144,16 +144,18 @@ def test_a_falling_cane_reaches_its_terminal_velocity() -> None:
     plants.cut(0)
     step(plants, 500)
     mass, area = model.body_mass.sum(), model.body_drag.sum()
-    fast = np.sqrt(2.0 * mass * 9.81 / AIR_DENSITY / area)
-    np.testing.assert_allclose(plants.state.joint_xd[0], [0.0, 0.0, -fast], atol=2e-3 * fast)
+    terminal_speed = np.sqrt(2.0 * mass * 9.81 / AIR_DENSITY / area)
+    np.testing.assert_allclose(plants.state.joint_xd[0], [0.0, 0.0, -terminal_speed], atol=2e-3 * terminal_speed)
     plants.tree_air[0] = [2.0, 0.0, 0.0]
     step(plants, 1500)
-    np.testing.assert_allclose(plants.velocity_free[:, :3].mean(0), [2.0, 0.0, -fast], atol=0.05 * fast)
+    np.testing.assert_allclose(
+        plants.velocity_free[:, :3].mean(0), [2.0, 0.0, -terminal_speed], atol=0.05 * terminal_speed
+    )
 
 
 @pytest.mark.parametrize("area", [0.004, 0.02])
-def test_a_storm_blows_nothing_up(area: float) -> None:
-    """40 m/s and gusts, a thousand times the weight: canes stream, no faster than the air throws them."""
+def test_a_storm_is_stable(area: float) -> None:
+    """40 m/s and gusts, a thousand times the weight: canes align with the wind, no faster than the air."""
     model = leafy(3, area=area, damping=0.004)
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(3))
@@ -172,32 +174,32 @@ def test_a_storm_blows_nothing_up(area: float) -> None:
     assert (lean @ [0.8, 0.6, 0.0] > 0.38).all()
 
 
-# ---- who wakes
+# ---- waking
 
 
-def test_wind_wakes_whom_it_moves_and_only_them() -> None:
+def test_wind_wakes_only_trees_that_it_moves() -> None:
     model = leafy(100)
     model.body_drag[model.bodies_of(7)] = 0.0
     plants = ArticulationSolver(model, State.at_rest(model))
     breeze = Wind([0.05, 0.0, 0.0])
-    for tick in range(ROUND):
+    for tick in range(CHECK_STEPS):
         breeze.update(plants, 0.01 * tick)
     assert len(plants.awake) == 0
     wind = Wind([4.0, 0.0, 0.0], gusts=1.0)
-    for tick in range(ROUND):
+    for tick in range(CHECK_STEPS):
         wind.update(plants, 0.01 * tick)
     assert plants.awake.tolist() == [t for t in range(100) if t != 7]
     wind.update(plants, 1.0)
     np.testing.assert_allclose(plants.tree_air[50], wind.velocity_at(np.array([0.0, 50.0, 0.0]), 1.0), rtol=1e-5)
 
 
-def test_out_of_reach_the_air_stands_still() -> None:
+def test_beyond_the_radius_there_is_no_wind() -> None:
     model = leafy(100)
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(90)
     plants.tree_air[90] = [1.0, 0.0, 0.0]
     wind = Wind([4.0, 0.0, 0.0], gusts=1.0)
-    for tick in range(ROUND):
+    for tick in range(CHECK_STEPS):
         wind.update(plants, 0.01 * tick, (np.array([[0.0, 10.0, 0.0], [0.0, 40.0, 0.0]]), 2.5))
     assert plants.awake.tolist() == [8, 9, 10, 11, 12, 38, 39, 40, 41, 42, 90]
     assert plants.tree_air[90].tolist() == [1.0, 0.0, 0.0]
@@ -207,26 +209,26 @@ def test_a_tree_asleep_in_steady_wind_stays_asleep() -> None:
     model = leafy(1)
     plants = ArticulationSolver(model, State.at_rest(model))
     wind = Wind([2.0, 0.0, 0.0])
-    for tick in range(ROUND):
+    for tick in range(CHECK_STEPS):
         wind.update(plants, 0.01 * tick)
     assert plants.awake.tolist() == [0]
     plants.put_to_sleep(0)
-    for tick in range(ROUND):
+    for tick in range(CHECK_STEPS):
         wind.update(plants, 0.01 * tick)
     assert len(plants.awake) == 0
 
 
-def test_a_tick_blows_on_what_is_near_a_robot() -> None:
-    """In a breeze the cane beside the robot leans and stays awake; one nine metres on sleeps as it grew."""
+def test_a_step_applies_wind_near_robots() -> None:
+    """In a breeze the cane beside the robot leans and stays awake; one nine metres away sleeps undeformed."""
     physics = Physics(leafy(10))
     physics.add_robot(bar((1.0, -0.5, 0.2)))
     physics.wind = Wind(np.array([0.0, 6.0, 0.0]), gusts=1.0)
     for _ in range(200):
         physics.step()
     model = physics.model
-    grown = model.forward_kinematics(model.joint_settled)
+    rest_pose = model.forward_kinematics(model.joint_settled)
     first, last = model.bodies_of(0), model.bodies_of(9)
     assert 0 in physics.plants.awake
     assert 9 not in physics.plants.awake
-    assert physics.snapshot().body_q[first.stop - 1, 1] > grown[first.stop - 1, 1] + 0.01
+    assert physics.snapshot().body_q[first.stop - 1, 1] > rest_pose[first.stop - 1, 1] + 0.01
     np.testing.assert_array_equal(physics.state.joint_q[last], model.joint_settled[last])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import io
 import pathlib
@@ -11,11 +12,13 @@ import numpy as np
 import pytest
 import trimesh
 import yourdfpy
+from lxml import etree
 
 from vinesim import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.urdf_model import parse_robot
 from vinesim.scene import data_files
 
 
@@ -409,3 +412,28 @@ def test_an_extra_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("vinesim.robot.description.loader.find_installed", lambda path: None)
     with pytest.raises(DescriptionError, match=r"tiago_pro: .*pip install vinesim\[tiago\]"):
         load_description("tiago_pro")
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in (data_files.data_dir() / "robots").glob("*.urdf")))
+def test_a_urdf_is_read_as_yourdfpy_reads_it(name: str) -> None:
+    """Oracle: yourdfpy, to the last bit."""
+    urdf = load_description(name).urdf
+    ours, oracle = parse_robot(etree.fromstring(urdf.encode())), parse(urdf)
+    assert [link.name for link in ours.links] == [link.name for link in oracle.links]
+    for link, other in zip(ours.links, oracle.links, strict=True):
+        assert (link.inertial is None) == (other.inertial is None)
+        if link.inertial is not None and other.inertial is not None:
+            assert link.inertial.mass == other.inertial.mass
+            np.testing.assert_array_equal(link.inertial.origin, other.inertial.origin)
+            np.testing.assert_array_equal(link.inertial.inertia, other.inertial.inertia)
+    for joint, other in zip(ours.joints, oracle.joints, strict=True):
+        assert (joint.name, joint.type, joint.parent, joint.child) == (
+            other.name,
+            other.type,
+            other.parent,
+            other.child,
+        )
+        np.testing.assert_array_equal(joint.origin, other.origin)
+        np.testing.assert_array_equal(joint.axis, other.axis)
+        for mine, his in ((joint.limit, other.limit), (joint.mimic, other.mimic)):
+            assert (mine and dataclasses.asdict(mine)) == (his and dataclasses.asdict(his))

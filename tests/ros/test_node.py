@@ -34,7 +34,7 @@ from tests.support.stock_node import TIMEOUT, StockNode, wait_until
 from vinesim.ros.commands.types import BaseVelocity, JointPositions
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
 from vinesim.ros.node import MAX_QUEUED, Node
-from vinesim.ros.tools.topic_monitor import TopicStats
+from vinesim.ros.tools.topic_monitor import SimulationClock, TopicStats
 from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
 
 REST = frames.pose(np.zeros(3))
@@ -442,3 +442,55 @@ def test_the_monitor_counts_gaps_and_stamps_that_go_back():
     assert report["latency_ms"] >= 5.0
     ear.add(serialize_message(convert.clock(0.5)), info)
     assert not ear.report()["stamps_rise"]
+
+
+def test_the_monitor_counts_by_second_and_from_a_restart_on(monkeypatch):
+    from rclpy.serialization import serialize_message
+    from rosgraph_msgs.msg import Clock
+
+    from vinesim.ros.messages import convert
+
+    stats = TopicStats("rosgraph_msgs/msg/Clock", "RIHS01_", Clock, publishers=1)
+    now = 1000.0
+    monkeypatch.setattr("vinesim.ros.tools.topic_monitor.time.time_ns", lambda: round(now * 1e9))
+
+    def receive(at: float, sequence: int) -> None:
+        nonlocal now
+        now = at
+        info = {"source_timestamp": round(at * 1e9), "publication_sequence_number": sequence}
+        stats.add(serialize_message(convert.clock(at - 990.0)), info)
+
+    receive(1000.0, 1)
+    stats.restart(1001.0)
+    for i, at in enumerate((1001.1, 1001.2, 1001.3, 1002.5, 1003.1, 1003.2)):
+        receive(at, 2 + i + (i > 3))
+    report = stats.report(1004.0)
+    assert (report["count"], report["hz"], report["slowest_second"], report["lost"]) == (6, 2.0, 1, 1)
+    assert report["first"] == pytest.approx(1000.0)
+    assert stats.report(1005.5)["slowest_second"] == 0
+
+
+def test_the_age_of_a_message_is_simulated_time_since_its_stamp(monkeypatch):
+    from rclpy.serialization import serialize_message
+    from rosgraph_msgs.msg import Clock
+
+    from vinesim.ros.messages import convert
+
+    clock = SimulationClock()
+    ticks, pictures = (TopicStats("rosgraph_msgs/msg/Clock", "", Clock, 1, clock) for _ in range(2))
+    ticks.is_clock = True
+    now = 1000.0
+    monkeypatch.setattr("vinesim.ros.tools.topic_monitor.time.time_ns", lambda: round(now * 1e9))
+
+    def receive(stats: TopicStats, stamp: float) -> None:
+        info = {"source_timestamp": round(now * 1e9), "publication_sequence_number": None}
+        stats.add(serialize_message(convert.clock(stamp)), info)
+
+    receive(pictures, 4.0)
+    assert pictures.report()["age_ms"] is None
+    for i in range(50):
+        now = 1000.0 + 0.01 * i + (0.003 if i % 2 else 0.0)  # every other one is late
+        receive(ticks, 5.0 + 0.01 * i)
+    now = 1000.5
+    receive(pictures, 5.45)
+    assert pictures.report()["age_ms"]["p50"] == pytest.approx(50.0)

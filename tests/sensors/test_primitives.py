@@ -255,3 +255,49 @@ def test_most_bunches_of_a_random_vineyard_are_ripe_and_some_are_green() -> None
     assert np.array_equal(drawn.bunch, Ripeness.random(4000, 5).bunch)
     assert 0.6 < np.median(drawn.bunch) < 0.95
     assert 0.05 < (drawn.bunch < 0.4).mean() < 0.3
+
+
+_ARRAYS = ("kind", "tint", "sky", "label", "organ", "carrier", "material", *"abcd", "lower", "upper")
+
+
+def _bits(primitives: Primitives) -> dict[str, bytes]:
+    """All that cameras and lidars read."""
+    columns = {name: primitives._columns[name].numpy()[: primitives.count] for name in _ARRAYS}
+    clusters = len(primitives.cluster_first)
+    columns |= {name: primitives._columns[name].numpy()[:clusters] for name in ("first", "size", "shown", "ball")}
+    columns |= {"label on the host": primitives.label, "kind of cluster": primitives.cluster_kind}
+    columns |= {"rigid": primitives.rigid_clusters, "lamps": primitives.lamp_primitives}
+    return {name: np.ascontiguousarray(column).tobytes() for name, column in columns.items()}
+
+
+def test_plants_from_the_cache_are_those_that_were_laid_out(tmp_path, monkeypatch) -> None:
+    model = sensor_scenes.demo()
+    monkeypatch.setenv("VINESIM_CACHE", str(tmp_path))
+    made = Primitives(model)
+    monkeypatch.setattr(Primitives, "_bake", None)
+    read = Primitives(model)
+    assert _bits(read) == _bits(made)
+    for name in ("ground_sky", "soil_texture", "leaf_texture"):
+        assert getattr(read.materials, name).numpy().tobytes() == getattr(made.materials, name).numpy().tobytes()
+    assert read.materials.ground_cell == made.materials.ground_cell
+
+
+def test_another_list_of_rigid_bodies_leaves_what_a_new_build_would_make(model) -> None:
+    """Oracle: primitives that have seen this snapshot only."""
+    boxes = [sensor_scenes.thing(sensor_scenes.shape("box", 0.1, 0.2, 0.3), index=i) for i in range(3)]
+    crowd = [sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1), index=i) for i in range(2500)]
+    ball = sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1), index=9)
+    followed = Primitives(model, grass=0.0)
+    rng = np.random.default_rng(4)
+    for visuals in ((), tuple(boxes), (boxes[0],), (ball, *boxes), tuple(crowd), (), (ball,)):
+        poses = np.concatenate([rng.uniform(0.0, 3.0, (len(visuals), 3)), np.tile([0, 0, 0, 1], (len(visuals), 1))], 1)
+        snapshot = rest_snapshot(model, visuals, poses)
+        snapshot.body_q[model.bodies_of(5)] += np.float32(0.01)
+        snapshot.bunch_attached[rng.integers(len(snapshot.bunch_attached))] = False
+        if not visuals:  # another list of bodies is reason enough to look at all plants
+            snapshot = dataclasses.replace(snapshot, moved_trees=np.array([5]))
+        followed.update(snapshot)
+        new = Primitives(model, grass=0.0)
+        new.update(snapshot)
+        assert _bits(followed) == _bits(new)
+        assert followed.count - followed.plant_count == len(visuals)

@@ -67,11 +67,12 @@ def test_disparity_has_steps() -> None:
     assert abs(still.depth[0, 0] - 1.5) <= 1.5**2 * SPEC.stereo.step.value / REACH / 2.0 + 1e-6
 
 
+@pytest.mark.parametrize("quality", ["full", "fast"])
 @pytest.mark.parametrize(("near", "far"), [(0.5, 1.0), (0.8, 2.0), (1.0, 1.6)])
-def test_the_shadow_of_the_second_imager_lies_to_the_left(near: float, far: float) -> None:
+def test_the_shadow_of_the_second_imager_lies_to_the_left(near: float, far: float, quality: str) -> None:
     """Width f B (1 / near - 1 / far) in pixels of the picture, on the left of what is near and nowhere else."""
     info = SPEC.info("optical")
-    frame = _see(_wall(near, 0.12), _wall(far, index=1), spec=_but(noise=0.0), info=info)
+    frame = _see(_wall(near, 0.12), _wall(far, index=1), spec=_but(noise=0.0), info=info, quality=quality)
     rows = np.abs(np.arange(info.height) - info.cy) < 0.08 / near * info.fy
     gaps = np.isnan(frame.depth[rows])
     plate = frame.exact_depth[rows] < 0.5 * (near + far)
@@ -220,10 +221,11 @@ def test_absurd_values_are_refused_in_one_line(tmp_path, old: str, new: str, say
     assert "\n" not in str(caught.value)
 
 
-def test_shadows_fall_on_the_same_side_in_a_turned_picture() -> None:
+@pytest.mark.parametrize("quality", ["full", "fast"])
+def test_shadows_fall_on_the_same_side_in_a_turned_picture(quality: str) -> None:
     """The second imager hangs at the camera, not in the world: rolled by 180 degrees it is on the other side."""
     primitives, _ = sensor_scenes.world(_wall(0.8, 0.1), _wall(1.6, index=1))
-    camera = Camera(_but(noise=0.0), INFO)
+    camera = Camera(_but(noise=0.0), INFO, quality=quality)
     pose = sensor_scenes.AHEAD.copy()
     pose[3:] = frames.multiply(pose[3:], frames.exp(np.array([0.0, 0.0, np.pi])))
     for one in (sensor_scenes.AHEAD, pose):

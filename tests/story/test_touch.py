@@ -1,4 +1,4 @@
-"""The whole way of a touch, in one process over the in-memory bus: all is real but the network's wire."""
+"""A touch from contact to the copy on another client, in one process over the bus in memory."""
 
 import numpy as np
 import pytest
@@ -39,10 +39,10 @@ class World:
         self.picker, self.visitor = self.clients.values()
         for client in self.clients.values():
             client.trace = Trace(self.model, self.bunch, client.physics.state.body_q[self.body].copy(), 20000)
-        self.reach = PushBunch(
+        self.task = PushBunch(
             self.picker.robot, self.picker.side_of(self.picker.trace.centre()), self.picker.trace.centre, repeat=False
         )
-        self.picker.pre_step.append(self.reach.control)
+        self.picker.pre_step.append(self.task.control)
 
     def tick(self):
         for client in self.clients.values():
@@ -55,7 +55,7 @@ class World:
             self.tick()
             if condition():
                 return
-        pytest.fail(f"did not come true within {limit} s of simulated time")
+        pytest.fail(f"condition false after {limit} s of simulated time")
 
     def touching(self):
         return [c for c in self.picker.physics.contacts if c.actor == "picker" and c.body in self.picker.trace.bodies]
@@ -73,15 +73,15 @@ def test_the_whole_way(world):
     picker, visitor = world.picker, world.visitor
     world.until(lambda: "visitor" in picker.remote_actors and "picker" in visitor.remote_actors, 3.0)
 
-    # 1, 2: a finger meets the bunch: equal and opposite forces, in the same tick
+    # 1, 2: a finger touches the bunch: equal and opposite forces, in the same tick
     rest = picker.trace.centre()
     world.until(world.touching)
     assert touch_to_motion(picker.trace.rows()) == 0
-    # 3: the drives carry the reaction
+    # 3: the joint drives carry the reaction
     world.until(lambda: sum(np.linalg.norm(c.force) for c in world.touching()) > 1.0)
     sample = picker.robot.sample(picker.physics.time, picker.physics.contacts)
     assert np.abs(sample.joints.contact).max() > 0.05
-    # 4: what is near is awake, and nothing else
+    # 4: only trees near the robot are awake
     awake = picker.physics.plants.awake
     assert world.tree in awake
     roots = world.model.tree_pose[awake, :3]
@@ -89,12 +89,12 @@ def test_the_whole_way(world):
     assert np.linalg.norm(roots[:, :2] - base[:2], axis=1).max() < 3.5
     assert len(awake) < 0.2 * len(world.model.tree_first)
 
-    # 5: the one who touches owns, everywhere
+    # 5: the toucher owns the tree on both clients
     world.until(lambda: visitor.replicator.owner(world.tree) == "picker", 1.0)
     assert picker.replicator.owner(world.tree) == "picker"
     assert picker.replicator.counters.environment.bytes_out > 0
 
-    # 6: the copy follows while the bunch is held away from where it hung
+    # 6: the copy follows while the bunch is held displaced
     world.until(lambda: picker.trace.displacement > 0.03)
     for _ in range(50):
         world.tick()
@@ -103,16 +103,16 @@ def test_the_whole_way(world):
     assert error["peak_displacement"] > 30.0
     assert visitor.trace.displacement > 0.6 * picker.trace.displacement
 
-    # the hand goes, the bunch swings out and sleeps, all copies agree, and silence follows
-    world.until(lambda: world.reach.phase.value == "done", 20.0)
+    # the hand retracts, the bunch comes to rest and sleeps, the copies agree, and traffic stops
+    world.until(lambda: world.task.phase.value == "done", 20.0)
     picker.pre_step.clear()
-    away = picker.robot.description.home
-    picker.robot.command_position(away)
+    home = picker.robot.description.home
+    picker.robot.command_position(home)
     world.until(lambda: world.tree not in picker.physics.sleep_monitor.restless, 60.0)
     world.until(lambda: visitor.replicator.owner(world.tree) is None, 2.0)
     here = world.model.bodies_of(world.tree)
-    mine, theirs = picker.physics.state.joint_q[here], visitor.physics.state.joint_q[here]
-    assert np.abs(np.abs((mine * theirs).sum(1)) - 1.0).max() < 1e-6
+    local, remote = picker.physics.state.joint_q[here], visitor.physics.state.joint_q[here]
+    assert np.abs(np.abs((local * remote).sum(1)) - 1.0).max() < 1e-6
     sent = picker.replicator.counters.environment.bytes_out
     for _ in range(100):
         world.tick()
@@ -120,7 +120,7 @@ def test_the_whole_way(world):
     assert np.linalg.norm(picker.trace.centre() - rest) < 0.01
 
 
-def test_nobody_near_hears_nothing():
+def test_no_environment_byte_is_sent_without_a_peer_nearby():
     world = World(visitor_back=20.0)
     world.until(lambda: "visitor" in world.picker.remote_actors)
     world.until(lambda: world.picker.trace.displacement > 0.03)
@@ -131,20 +131,20 @@ def test_nobody_near_hears_nothing():
     assert world.picker.replicator.counters.actor.bytes_out > 0
 
 
-def test_twice_the_same_bits():
+def test_two_runs_are_bitwise_equal():
     """F11: the same inputs give the same state, bit for bit, on one machine."""
 
     def run():
         world = World()
         for _ in range(1000):
             world.tick()
-        mine, theirs = (client.physics.state for client in world.clients.values())
-        return np.concatenate([mine.joint_q.ravel(), mine.joint_qd.ravel(), theirs.joint_q.ravel()])
+        local, remote = (client.physics.state for client in world.clients.values())
+        return np.concatenate([local.joint_q.ravel(), local.joint_qd.ravel(), remote.joint_q.ravel()])
 
     assert np.array_equal(run(), run())
 
 
-def test_the_chosen_bunch_can_be_reached():
+def test_the_chosen_bunch_is_within_reach():
     scene = load_scene("demo")
     model = generate(scene)
     pose = spawn_pose(scene, 0)

@@ -1,7 +1,7 @@
-"""Beams: what theory says of them, computed without a line of the solver, and what the solver makes of them.
+"""Beams: theory, computed independently of the solver, and measurements on the solver.
 
-Truths are boundary value problems and eigenvalue problems (SciPy) and elliptic integrals; tests compare, and
-``tests/laws/plots.py`` draws what they compare.
+References are boundary value problems and eigenvalue problems (SciPy) and elliptic integrals; tests compare, and
+``tests/laws/plots.py`` plots the comparisons.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Beam:
         return self.density * np.pi * self.radius**2
 
     def tree(self, side: float = 0.0) -> TreeBuilder:
-        """As bodies; the tip mass is a body of its own, on a joint that carries no moment worth the name."""
+        """The beam as bodies; the tip mass is a separate body on a joint that carries hardly any moment."""
         along = np.array([np.cos(self.angle), 0.0, np.sin(self.angle)])
         tree = TreeBuilder(frames.pose(np.array([0.0, side, HEIGHT]), frames.from_x_axis(along)))
         wood = RodMaterial(self.modulus, self.density, self.beta)
@@ -72,22 +72,22 @@ def of_load(alpha: float, share: float, **others: float) -> Beam:
     """The beam whose tip load P and own weight W together are alpha = (P + W) L^2 / EI, ``share`` of it the tip's."""
     beam = Beam(**others)
     weight = beam.line_mass * beam.length
-    tip = 4.0 if share == 1.0 else weight * share / (1.0 - share)  # own weight then is a hundredth
+    tip = 4.0 if share == 1.0 else weight * share / (1.0 - share)  # the beam's own weight is then a hundredth
     modulus = (tip + weight) * G * beam.length**2 / alpha / (beam.rigidity / beam.modulus)
     return dataclasses.replace(beam, tip=tip, modulus=modulus)
 
 
-# ---------------------------------------------------------------------------------------------- truths
+# ---------------------------------------------------------------------------------------------- theory
 
 
 def elastica(beam: Beam) -> tuple[float, float]:
-    """Where the tip rests, seen from the clamp: (forward, up) [m]."""
+    """Rest position of the tip relative to the clamp: (forward, up) [m]."""
     line = elastica_line(beam)
     return float(line[0, -1]), float(line[1, -1])
 
 
 def elastica_line(beam: Beam) -> np.ndarray:
-    """Where the beam rests, from clamp to tip: (forward, up) [2, point] m.
+    """Rest line of the beam from clamp to tip: (forward, up) [2, point] m.
 
     EI(s) theta' = m, m' = V(s) cos theta, theta(0) = angle, m(L) = 0, with the weight V(s) of all beyond s.
     """
@@ -120,9 +120,9 @@ def elastica_line(beam: Beam) -> np.ndarray:
 
 
 def elastica_of_parts(parts: list[Beam]) -> tuple[float, float]:
-    """:func:`elastica` of rods that go on from each other's tips; the first's angle and the last's tip mass count.
+    """:func:`elastica` of rods joined end to end; only the first's angle and the last's tip mass are used.
 
-    From the tip back, where no moment is: its angle is sought that leads to the clamp's. Parts may taper.
+    Integrates from the tip, which carries no moment, and solves for its angle. Parts may taper.
     """
 
     def weight(part: Beam, s: np.ndarray) -> np.ndarray:  # of the part beyond s
@@ -171,7 +171,7 @@ def elastica_by_integrals(alpha: float) -> tuple[float, float]:
 
 @dataclasses.dataclass(frozen=True)
 class Rod:
-    """A rod in space: level at its clamp, running along x, perhaps curved to the left, a weight beside its tip."""
+    """A rod in space: level at its clamp, along x, optionally curved to the left, with a weight beside its tip."""
 
     bend: float = 2.0
     """EI [N m^2]"""
@@ -179,13 +179,13 @@ class Rod:
     """GJ [N m^2]"""
     length: float = 1.0
     turn: float = 0.0
-    """How far the relaxed rod has turned about z at its end [rad]."""
+    """Rotation about z of the end of the relaxed rod [rad]."""
     line_weight: float = 0.0
     """[N/m]"""
     weight: float = 0.0
     """[N]"""
     beside: float = 0.0
-    """How far to the left of the tip, along the tip's own y axis [m]."""
+    """Offset of the weight to the left of the tip, along the tip's y axis [m]."""
 
 
 def kirchhoff(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
@@ -266,7 +266,7 @@ def first_shape(tree: TreeBuilder) -> np.ndarray:
 
 
 def standing(trees: list[TreeBuilder], **options: float) -> ArticulationSolver:
-    """All awake, as drawn."""
+    """A solver with all trees awake at the drawn pose."""
     model = assemble(trees)
     plants = ArticulationSolver(model, State.at_rest(model), **options)
     plants.wake(np.arange(len(trees)))
@@ -275,17 +275,17 @@ def standing(trees: list[TreeBuilder], **options: float) -> ArticulationSolver:
 
 def run(plants: ArticulationSolver, ticks: int, watch: np.ndarray | None = None) -> np.ndarray:
     """Step; positions of the watched bodies at the start of every tick [tick, body, 3]."""
-    seen = np.zeros((ticks, 0 if watch is None else len(watch), 3))
+    measured = np.zeros((ticks, 0 if watch is None else len(watch), 3))
     for tick in range(ticks):
         plants.predict()
         if watch is not None:
-            seen[tick] = plants.state.body_q[watch, :3]
+            measured[tick] = plants.state.body_q[watch, :3]
         plants.integrate()
-    return seen
+    return measured
 
 
 def settle(trees: list[TreeBuilder], seconds: float = 30.0) -> ArticulationSolver:
-    """At rest after so long with phi 1 (which changes no equilibrium)."""
+    """A solver whose trees have come to rest, with phi 1 (which changes no equilibrium)."""
     plants = standing(trees, phi=1.0, dt=0.02)
     run(plants, int(seconds / plants.dt))
     plants.forward_kinematics()
@@ -293,8 +293,8 @@ def settle(trees: list[TreeBuilder], seconds: float = 30.0) -> ArticulationSolve
     return plants
 
 
-def grown(parts: list[Beam], side: float = 0.0) -> TreeBuilder:
-    """Rods that go on from each other's tips, as bodies; the last carries its tip mass."""
+def joined_rods(parts: list[Beam], side: float = 0.0) -> TreeBuilder:
+    """Rods joined end to end, as bodies; the last carries its tip mass."""
     first, last = parts[0], parts[-1]
     tree = dataclasses.replace(first, tip=0.0).tree(side)
     tree.bodies.pop()
@@ -315,13 +315,13 @@ def last_bodies(plants: ArticulationSolver) -> np.ndarray:
 
 
 def resting_tips(beams: list[Beam]) -> np.ndarray:
-    """What the solver makes of :func:`elastica` [beam, 2] m."""
+    """Rest positions of tips by the solver, as :func:`elastica` [beam, 2] m."""
     plants = settle([dataclasses.replace(beam, beta=0.3).tree(i) for i, beam in enumerate(beams)])
     return plants.state.body_q[last_bodies(plants)][:, [0, 2]] - np.array([0.0, HEIGHT])
 
 
 def fitted_swing(time: np.ndarray, height: np.ndarray, guess: float) -> tuple[float, float]:
-    """Frequency [Hz] and damping ratio of a decaying swing about wherever it ends."""
+    """Frequency [Hz] and damping ratio of a decaying oscillation about its final value."""
 
     def swing(t: np.ndarray, rest: float, size: float, f: float, zeta: float, phase: float) -> np.ndarray:
         w = 2 * np.pi * f
@@ -347,7 +347,7 @@ def spectral_peaks(signal: np.ndarray, dt: float, near: np.ndarray) -> np.ndarra
     return np.array(peaks)
 
 
-# ---------------------------------------------------------------------------------------------- both, side by side
+# ---------------------------------------------------------------------------------------------- comparisons
 
 ALPHAS = (0.05, 0.5, 1.0, 2.0, 3.5, 6.6, 10.0, 14.0, 20.0)
 SHARES = (0.0, 0.5, 1.0)
@@ -356,7 +356,7 @@ ANGLES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 
 @functools.cache
 def elastica_sweep() -> tuple[list[tuple[float, float, float]], np.ndarray, np.ndarray]:
-    """(alpha, share, angle) of each beam, and where its tip rests by theory and by the solver [beam, 2] m."""
+    """(alpha, share, angle) of each beam, and the rest position of its tip by theory and solver [beam, 2] m."""
     cases = [(a, s, t) for a in ALPHAS for s in SHARES for t in ANGLES]
     beams = [of_load(alpha, share, angle=angle) for alpha, share, angle in cases]
     return cases, np.array([elastica(beam) for beam in beams]), resting_tips(beams)
@@ -380,9 +380,9 @@ CONVERGING = {
 def errors_over_pieces() -> dict[str, np.ndarray]:
     """Distance of the resting tip from the elastica [m], for each of ``PIECES``."""
     beams = [dataclasses.replace(beam, pieces=n) for beam in CONVERGING.values() for n in PIECES]
-    truth = np.repeat([elastica(beam) for beam in CONVERGING.values()], len(PIECES), axis=0)
-    off = np.linalg.norm(resting_tips(beams) - truth, axis=1).reshape(-1, len(PIECES))
-    return dict(zip(CONVERGING, off, strict=True))
+    expected = np.repeat([elastica(beam) for beam in CONVERGING.values()], len(PIECES), axis=0)
+    error = np.linalg.norm(resting_tips(beams) - expected, axis=1).reshape(-1, len(PIECES))
+    return dict(zip(CONVERGING, error, strict=True))
 
 
 SOFT, STIFF = Beam(modulus=1e9, length=0.5, tip=0.01), Beam(modulus=5e9, length=0.5, tip=0.01)
@@ -400,16 +400,16 @@ JOINED = {
 
 @functools.cache
 def errors_over_pieces_of_joined() -> dict[str, np.ndarray]:
-    """The same for rods of unlike wood and thickness joined end to end: so many pieces in each."""
-    made = [
-        grown([dataclasses.replace(part, pieces=n // 2, beta=0.3) for part in parts], i)
+    """The same for rods of different wood and thickness joined end to end."""
+    trees = [
+        joined_rods([dataclasses.replace(part, pieces=n // 2, beta=0.3) for part in parts], i)
         for i, (parts, n) in enumerate((parts, n) for parts in JOINED.values() for n in PIECES)
     ]
-    plants = settle(made)
-    seen = plants.state.body_q[last_bodies(plants)][:, [0, 2]] - np.array([0.0, HEIGHT])
-    truth = np.repeat([elastica_of_parts(parts) for parts in JOINED.values()], len(PIECES), axis=0)
-    off = np.linalg.norm(seen - truth, axis=1).reshape(-1, len(PIECES))
-    return dict(zip(JOINED, off, strict=True))
+    plants = settle(trees)
+    measured = plants.state.body_q[last_bodies(plants)][:, [0, 2]] - np.array([0.0, HEIGHT])
+    expected = np.repeat([elastica_of_parts(parts) for parts in JOINED.values()], len(PIECES), axis=0)
+    error = np.linalg.norm(measured - expected, axis=1).reshape(-1, len(PIECES))
+    return dict(zip(JOINED, error, strict=True))
 
 
 STEPS = (0.01, 0.005, 0.0025, 0.00125)
@@ -417,26 +417,26 @@ STEPS = (0.01, 0.005, 0.0025, 0.00125)
 
 @functools.cache
 def errors_over_dt() -> dict[str, np.ndarray]:
-    """A cane swinging aside in its first mode, phi 1/2, for each of ``STEPS``.
+    """A cane swinging sideways in its first mode, phi 1/2, for each of ``STEPS``.
 
-    ``frequency``: how far it is from the eigenvalue of :func:`chain`, as a share; ``theory``: the trapezoidal rule's
-    own (w dt)^2 / 12; ``tip``: how far its tip is after half a second from a run at 0.5 ms [m].
+    ``frequency``: relative error to the eigenvalue of :func:`chain`; ``theory``: the trapezoidal rule's
+    error (w dt)^2 / 12; ``tip``: distance of its tip after half a second from a run at 0.5 ms [m].
     """
-    beam = Beam(modulus=1.6e10, pieces=8)  # so stiff that its weight does not matter
-    truth = chain_modes(beam.tree())[0][0]
+    beam = Beam(modulus=1.6e10, pieces=8)  # so stiff that its weight is negligible
+    expected = chain_modes(beam.tree())[0][0]
     fine = released(beam, 0.0005, 0.5)[-1]
     frequency, tip = [], []
     for dt in STEPS:
         swing = released(beam, dt, 2.0)
-        f, _ = fitted_swing(np.arange(len(swing)) * dt, swing[:, 1], truth)
-        frequency.append(abs(f / truth - 1.0))
+        f, _ = fitted_swing(np.arange(len(swing)) * dt, swing[:, 1], expected)
+        frequency.append(abs(f / expected - 1.0))
         tip.append(np.linalg.norm(swing[round(0.5 / dt)] - fine))
-    theory = (2 * np.pi * truth * np.array(STEPS)) ** 2 / 12.0
+    theory = (2 * np.pi * expected * np.array(STEPS)) ** 2 / 12.0
     return {"frequency": np.array(frequency), "theory": theory, "tip": np.array(tip)}
 
 
 def released(beam: Beam, dt: float, seconds: float, size: float = 0.003) -> np.ndarray:
-    """Tip [tick, 3] m of a cane let go in the shape of its first mode, bent aside by ``size`` [rad] at most a joint."""
+    """Tip [tick, 3] m of a cane released in the shape of its first mode, bent by at most ``size`` [rad] a joint."""
     tree = beam.tree()
     tree.solve_rest_pose()
     plants = standing([tree], phi=0.5, dt=dt)
@@ -450,8 +450,8 @@ ZETAS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2)
 
 @functools.cache
 def damping_sweep() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First mode of canes at 100 Hz and the shipping phi, for each of ``ZETAS``: damping ratio seen, frequency over
-    theory, and the floor that the solver names (``ArticulationSolver.damping_floor``)."""
+    """First mode of canes at 100 Hz and the default phi, for each of ``ZETAS``: measured damping ratio, frequency over
+    theory, and the solver's ``ArticulationSolver.damping_floor``."""
     f = cantilever_frequencies(Beam(), 1)[0]
     trees = [Beam(beta=zeta / (np.pi * f)).tree(i) for i, zeta in enumerate(ZETAS)]
     plants = standing(trees)
@@ -472,11 +472,11 @@ def two_woods(stiff_first: bool, *, beta: tuple[float, float] = (0.0, 0.0), dens
 
 @functools.cache
 def measured_frequencies(dt: float = 0.001, ticks: int = 1 << 15) -> tuple[np.ndarray, np.ndarray]:
-    """First three of a level cane kicked aside, where gravity does not bend: seen and by theory [Hz]."""
+    """First three frequencies of a level cane kicked sideways: measured and by theory [Hz]."""
     beam = Beam()
-    truth = cantilever_frequencies(beam)
+    expected = cantilever_frequencies(beam)
     plants = standing([beam.tree()], phi=0.5, dt=dt)
     plants.state.joint_qd[3:5, 2] = 0.3
     plants.state.joint_qd[10, 2] = -0.5
     side = run(plants, ticks, watch=np.array([beam.pieces - 1]))[:, 0, 1]
-    return spectral_peaks(side, dt, truth), truth
+    return spectral_peaks(side, dt, expected), expected

@@ -1,4 +1,4 @@
-"""Canes with a bunch whose berries move in clusters, and what tests measure of any plants."""
+"""Canes with a bunch of berry clusters, and momenta of plants."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def clustered(count: int = 1, clusters: int = 5, *, pose: np.ndarray | None = No
             stalk[-1], offset=(0.03, 0, 0), organ=int(Organ.BUNCH), length=0.15, radius=(0.05, 0.05),
             stiffness=(0.3, 0.3, 0.3), damping=(0.004, 0.004, 0.004), **head,
         )  # fmt: skip
-        each, parent = 0.45 / clusters, bunch
+        cluster_mass, parent = 0.45 / clusters, bunch
         for j in range(clusters):
             side = frames.exp(np.array([1.3 * j, 0.0, 0.0]))
             out = frames.multiply(side, frames.exp(np.array([0.0, 0.0, 0.7])))
             parent = bunch if j % 2 == 0 else parent
             parent = tree.add_body(
-                parent, offset=(0.02 + 0.02 * (j % 3), 0, 0), rest=out, organ=int(Organ.BUNCH), mass=each,
-                com=(0.03, 0, 0), inertia=each * np.array([3e-4, 5e-4, 5e-4]), length=0.05, radius=(0.02, 0.02),
+                parent, offset=(0.02 + 0.02 * (j % 3), 0, 0), rest=out, organ=int(Organ.BUNCH), mass=cluster_mass,
+                com=(0.03, 0, 0), inertia=cluster_mass * np.array([3e-4, 5e-4, 5e-4]), length=0.05, radius=(0.02, 0.02),
                 stiffness=(0.1, 0.1, 0.1), damping=(1e-3, 1e-3, 1e-3),
             )  # fmt: skip
         trees.append(tree)
@@ -75,7 +75,7 @@ def moving(plants: ArticulationSolver, trees: np.ndarray) -> np.ndarray:
 def momenta(
     plants: ArticulationSolver, bodies: np.ndarray, about: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Of bodies, as ``kinematics`` shows them: linear, angular about a point, centre of mass, kinetic energy."""
+    """Linear momentum, angular momentum about a point, centre of mass and kinetic energy of bodies."""
     pose, speed = plants.state.body_q[bodies].astype(float), plants.state.body_qd[bodies].astype(float)
     mass = plants.body_mass[bodies].astype(float)
     com = frames.rotate(pose[:, 3:], plants.body_com[bodies].astype(float))
@@ -92,5 +92,5 @@ def momenta(
 
 
 def fall(time: float) -> np.ndarray:
-    """How far gravity takes something in a time [s]."""
+    """Displacement [3] m of free fall after a time [s]."""
     return 0.5 * GRAVITY * time * time

@@ -45,10 +45,10 @@ def push() -> str:
     physics = Physics(model)
     robot = Robot(physics.rigid, load_description("vinebot"), "anna", pose=stand)
     body = model.bunch_body[bunch]
-    task = PushBunch(robot, "left", lambda: physics.state.body_q[body, :3])
+    plan = PushBunch(robot, "left", lambda: physics.state.body_q[body, :3])
     h = hashlib.blake2b(digest_size=16)
     for _ in range(300):
-        task.control(physics.time)
+        plan.control(physics.time)
         robot.control(physics.time)
         physics.step()
         test_determinism.digest(physics, h)
@@ -56,27 +56,27 @@ def push() -> str:
 
 
 def pick() -> str:
-    """The picking job from start to end."""
-    model, task = vineyard(7)
+    """The picking task from start to end."""
+    model, plan = vineyard(7)
     physics = Physics(model)
-    job = PickBunch(physics, picker(physics, load_description("vinebot"), task.base_pose), task)
+    task = PickBunch(physics, picker(physics, load_description("vinebot"), plan.base_pose), plan)
     h = hashlib.blake2b(digest_size=16)
-    while not job.is_done:
-        job.control(physics.time)
-        job.robot.control(physics.time)
+    while not task.is_done:
+        task.control(physics.time)
+        task.robot.control(physics.time)
         physics.step()
         test_determinism.digest(physics, h)
     return h.hexdigest()
 
 
 def fall() -> str:
-    """Canes pushed, held, cut and picked by moving bars; then a kicked vineyard that comes to rest."""
-    return _hash(test_determinism.a_day()[0].encode(), test_determinism.a_vineyard().encode())
+    """Canes pushed, held, cut and picked by moving bars; then a vineyard with random joint rates."""
+    return _hash(test_determinism.eventful_run()[0].encode(), test_determinism.vineyard_run().encode())
 
 
 def frame() -> str:
-    """A picture of the demo's vineyard with a robot, a person and a crate: colour, depth, labels, truth."""
-    words = [
+    """A picture of the demo's vineyard with a robot, a human and a crate: colour, depth, labels, truth."""
+    arguments = [
         "render",
         "demo",
         "--at",
@@ -94,7 +94,7 @@ def frame() -> str:
         "--out",
     ]
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-m", "vinesim.cli", *words, folder], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run([sys.executable, "-m", "vinesim.cli", *arguments, folder], check=True, stdout=subprocess.DEVNULL)
         return _hash(*(path.read_bytes() for path in sorted(pathlib.Path(folder).iterdir())))
 
 
@@ -116,11 +116,11 @@ def message() -> str:
     rng = np.random.default_rng(11)
     robot = messages.encode_robot(test_messages.robot(rng))
     trees = test_messages.cut(test_messages.trees(rng, [14, 3, 25]), [1, 0, 2], rng)
-    things = test_messages.things(rng, 40)
+    objects = test_messages.objects(rng, 40)
     return _hash(
         robot if isinstance(robot, bytes) else b"".join(robot),
         *messages.encode_trees(trees)[0],
-        *messages.encode_objects(things, (0, 0))[0],
+        *messages.encode_objects(objects, (0, 0))[0],
     )
 
 

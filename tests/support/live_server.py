@@ -1,4 +1,4 @@
-"""What tests of the network share: waiting for conditions, and links that are skipped where they cannot be."""
+"""For tests over real Zenoh: a server process, and a skip where network links cannot be emulated."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from vinesim.bench.support import network_emulator
 
 
 @functools.cache
-def no_links() -> str:
+def unavailable_reason() -> str:
     return network_emulator.unusable()
 
 
-def need_links() -> None:
-    """Skip a test where links cannot be emulated."""
-    if reason := no_links():
+def require_network_emulation() -> None:
+    """Skip a test where network links cannot be emulated."""
+    if reason := unavailable_reason():
         pytest.skip(f"links cannot be emulated here: {reason}")
 
 
-class Served:
+class ServerProcess:
     """A server in a process of its own, perhaps in a namespace; it can be killed and started again."""
 
     def __init__(self, listen: str, start: Callable[..., subprocess.Popen] = subprocess.Popen) -> None:
@@ -33,7 +33,7 @@ class Served:
         self.run()
 
     def run(self) -> None:
-        """Start it, and wait until it listens."""
+        """Start the process and wait until it listens."""
         command = [sys.executable, "-m", "vinesim.cli", "server", "--status", "none", "--listen", self.endpoint]
         self.process = self._start(command, stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
@@ -42,13 +42,13 @@ class Served:
         self.endpoint = line.split()[2]
 
     def kill(self) -> None:
-        """As a crash would."""
+        """Kill the process (SIGKILL), as a crash would."""
         self.process.kill()
         self.process.wait()
         assert self.process.stdout is not None
         self.process.stdout.close()
 
-    def __enter__(self) -> Served:
+    def __enter__(self) -> ServerProcess:
         return self
 
     def __exit__(self, *_: object) -> None:

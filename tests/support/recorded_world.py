@@ -30,8 +30,8 @@ def vineyard() -> Model:
     return assemble(trees)
 
 
-class Light:
-    """The least client: it stands somewhere, bends what it is told to, and takes over what it hears."""
+class MinimalClient:
+    """A minimal client: a robot at ``x`` that bends trees on request and applies the updates it receives."""
 
     def __init__(self, bus: Bus, x: float, **hello) -> None:
         self.model, self.bus, self.name = vineyard(), bus, bus.name
@@ -43,32 +43,32 @@ class Light:
         self.touched: set[int] = set()
         self.moving: set[int] = set()
         self.inbox = Inbox()
-        self.heard: list[TreeUpdate] = []
+        self.received: list[TreeUpdate] = []
         self.joined: list[str] = []
 
     def tick(self, now: float) -> None:
         self.inbox = self.replicator.receive(now)
         self.joined += [hello.name for hello in self.inbox.joined]
-        self.heard += self.inbox.trees
+        self.received += self.inbox.trees
         for update in self.inbox.trees:
-            here = self.model.bodies_of(update.tree)
-            self.state.joint_q[here], self.state.joint_qd[here] = update.joint_q, update.joint_qd
+            bodies = self.model.bodies_of(update.tree)
+            self.state.joint_q[bodies], self.state.joint_qd[bodies] = update.joint_q, update.joint_qd
         for update in self.replicator.send(now, self.robot, touched=self.touched, moving=self.moving, read=self.read):
-            here = self.model.bodies_of(update.tree)
-            self.state.joint_q[here], self.state.joint_qd[here] = update.joint_q, update.joint_qd
+            bodies = self.model.bodies_of(update.tree)
+            self.state.joint_q[bodies], self.state.joint_qd[bodies] = update.joint_q, update.joint_qd
 
     def read(self, tree: int) -> tuple[np.ndarray, np.ndarray]:
-        here = self.model.bodies_of(tree)
-        return self.state.joint_q[here], self.state.joint_qd[here]
+        bodies = self.model.bodies_of(tree)
+        return self.state.joint_q[bodies], self.state.joint_qd[bodies]
 
     def bend(self, tree: int, angle: float) -> None:
-        """Turn every joint of a tree by ``angle`` [rad] from where it hangs, and touch it."""
-        here = self.model.bodies_of(tree)
+        """Turn every joint of a tree by ``angle`` [rad] from its equilibrium, and touch it."""
+        bodies = self.model.bodies_of(tree)
         turn = frames.exp(np.array([0.0, angle, 0.0]))
-        self.state.joint_q[here] = frames.multiply(turn, self.model.joint_settled[here])
+        self.state.joint_q[bodies] = frames.multiply(turn, self.model.joint_settled[bodies])
         self.touched = {tree}
 
     def environment(self) -> int:
-        """Bytes of plants that it sent."""
+        """Bytes sent about plants."""
         counters = self.replicator.counters
         return counters.environment.bytes_out + counters.event.bytes_out

@@ -1,4 +1,4 @@
-"""A few vines, boxes and carts with a hand, several clients of them on one bus in memory, and what a server keeps."""
+"""Vines, boxes and carts with a hand, several clients on one bus in memory, and a server of retained records."""
 
 from __future__ import annotations
 
@@ -102,23 +102,23 @@ class Server:
     def __init__(self, hub: MemoryHub) -> None:
         self.hub = hub
         self.open()
-        self.facts = RetainedState()
+        self.records = RetainedState()
 
     def open(self) -> None:
         self.bus: MemoryBus = self.hub.bus("server")
         self.bus.subscribe("fact/**", KEEP_ALL)
         for x in self.CELLS:
             for y in self.CELLS:
-                self.bus.declare_queryable(f"snap/{x}/{y}", functools.partial(self.tell, (x, y)))
+                self.bus.declare_queryable(f"snap/{x}/{y}", functools.partial(self.reply, (x, y)))
 
-    def tell(self, cell: tuple[int, int], _: bytes) -> bytes:
-        return messages.encode_records(self.facts.in_cell(cell))
+    def reply(self, cell: tuple[int, int], _: bytes) -> bytes:
+        return messages.encode_records(self.records.in_cell(cell))
 
     def tick(self) -> None:
         for key, payload in self.bus.poll():
             _, x, y, _ = key.split("/")
             for fact in messages.decode_records(payload):
-                self.facts.merge((int(x), int(y)), fact)
+                self.records.merge((int(x), int(y)), fact)
 
 
 class World:
@@ -156,7 +156,7 @@ class World:
             self.run(DT)
             if condition():
                 return
-        pytest.fail(f"did not come true within {limit} s of simulated time")
+        pytest.fail(f"condition false after {limit} s of simulated time")
 
 
 BUNCH, BOX = functools.partial(object_id, ObjectKind.BUNCH), functools.partial(object_id, ObjectKind.BOX)
@@ -166,17 +166,17 @@ def pose_of(client: Client, number: int) -> np.ndarray:
     return client.physics.support_tracker.object_state(number)[0]
 
 
-def apart(a: Client, b: Client, number: int) -> float:
+def position_difference(a: Client, b: Client, number: int) -> float:
     """[m] Distance between the positions of an object on two clients."""
     return float(np.linalg.norm(pose_of(a, number)[:3] - pose_of(b, number)[:3]))
 
 
-def sent(client: Client) -> int:
+def bytes_sent(client: Client) -> int:
     """Bytes sent about trees, boxes and bunches: streams, ownership events and retained records."""
     counters = client.replicator.counters
     return sum(family.bytes_out for family in (counters.environment, counters.event, counters.retained))
 
 
-def heard(client: Client) -> int:
+def bytes_received(client: Client) -> int:
     counters = client.replicator.counters
     return sum(family.bytes_in for family in (counters.environment, counters.event, counters.retained))

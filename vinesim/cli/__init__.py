@@ -51,6 +51,11 @@ def configure_logging(
     """Log level for every command."""
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
+    progress = logging.getLogger("vinesim.progress")
+    lines = logging.StreamHandler(sys.stderr)
+    lines.setFormatter(logging.Formatter("vinesim: %(message)s"))
+    progress.handlers, progress.propagate = [lines], False
+    progress.setLevel(logging.INFO)
 
 
 def main() -> None:
@@ -61,6 +66,8 @@ def main() -> None:
     """
     # Small matrices gain nothing from BLAS threads, and those would take the other core from the sensors.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # MuJoCo draws nothing here, and looking for a window system takes 0.1 s.
+    os.environ.setdefault("MUJOCO_GL", "disable")
     # A shell lets processes in the background ignore SIGINT; a sender means it to end them, and so with SIGTERM.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)

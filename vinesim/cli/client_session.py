@@ -20,6 +20,7 @@ from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
+from vinesim.kernels.compilation import compile_kernels
 from vinesim.net.transport.bus import Bus
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.tasks.task import Task
@@ -31,6 +32,8 @@ SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Wall time between two status lines [s]."""
+FIRST_STATUS = 0.1
+"""Wall time from the first step to the first status line [s]: whoever waits for a client learns that it runs."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -52,6 +55,7 @@ class ClientSession:
         """Index of the start pose in the scene."""
         if options.pose is not None:
             self.scene, self.spawn = with_start_pose(self.scene, *options.pose), 0
+        compile_kernels()
         self.model = generate(self.scene)
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()
@@ -114,6 +118,8 @@ class ClientSession:
         self._stack.callback(self._stop.set)
         is_done = (lambda: False) if task is None else (lambda: task.is_done)
         run_loop(self._stop, client.tick, loop, self.options.seconds, client.physics.dt, is_done)
+        if self.options.tick_log is not None:
+            loop.log().save(self.options.tick_log)
         return status
 
 
@@ -149,8 +155,10 @@ def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
 
 def report_status(status: Status, publish: Callable[[dict[str, Any]], None], form: str, stop: threading.Event) -> None:
     """Every second hand the status to ``publish`` and print it as text or JSON; runs until ``stop``."""
+    period = FIRST_STATUS
     try:
-        while not stop.wait(STATUS_PERIOD):
+        while not stop.wait(period):
+            period = STATUS_PERIOD
             values = status.current()
             publish(values)
             if form == "json":

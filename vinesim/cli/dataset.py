@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vinesim.cli.render import parse_size
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.errors import UsageError
+from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
@@ -55,6 +56,7 @@ def run(
     running: list[Worker] = []
     try:
         dataset.prepare_folder(plan, out)
+        compile_kernels(SENSOR_PACKAGES)
         wanted = dataset.missing_images(out, images)
         shares = _shares(wanted, workers or max((os.cpu_count() or 2) // 2, 1))
         running += [_start_worker(plan, out, share) for share in shares]

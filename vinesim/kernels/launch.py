@@ -6,6 +6,7 @@ interpreter lock away, so Python threads can run a kernel side by side on parts 
 """
 
 import ctypes
+import os
 import threading
 from collections.abc import Callable, Sequence
 
@@ -77,6 +78,11 @@ def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> Callable[...,
     return launch
 
 
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class ThreadPool:
     """Threads that wait for work and share it with the caller of :meth:`run`.
 
@@ -97,7 +103,7 @@ class ThreadPool:
             threading.Thread(target=_wait_and_work, args=loop, name=f"thread pool {i}", daemon=True).start()
 
     def run(self, works: Sequence[Callable[[], None]]) -> None:
-        """Do all of ``works`` [at most ``size``] at once and return when all are done."""
+        """Do all of ``works`` [1 to ``size``] at once and return when all are done."""
         for i in range(1, len(works)):
             self._work[i] = works[i]
             self._start[i].release()
@@ -106,14 +112,31 @@ class ThreadPool:
         finally:
             for i in range(1, len(works)):
                 self._done[i].acquire()
-        if self._failed:
-            raise self._failed.pop()
+            failed = self._failed[:]
+            self._failed.clear()
+        if failed:
+            raise failed[0]
+
+    def share(self, tasks: Sequence[Callable[[], None]]) -> None:
+        """Do any number of ``tasks``, each by whichever thread is free next, and return when all are done."""
+        queue = iter(tasks)
+
+        def work() -> None:
+            for task in queue:  # one iterator of a list serves all threads: its steps are atomic
+                task()
+
+        if tasks:
+            self.run([work] * min(self.size, len(tasks)))
 
     def close(self) -> None:
         """End the threads."""
-        for i in range(1, self.size):
+        size, self.size = self.size, 1
+        for i in range(1, size):
             self._work[i] = None
             self._start[i].release()
+
+    def __del__(self) -> None:
+        self.close()
 
 
 def _wait_and_work(

@@ -17,12 +17,11 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.raster import camera_raster, camera_raster_plants, lidar_raster, transform_primitives
-from vinesim.kernels.sensing import lidar_echoes, stereo_depth
-from vinesim.kernels.shading import deferred, shadow_maps
+from vinesim.kernels.raster import lidar_raster, transform_primitives
+from vinesim.kernels.sensing import lidar_echoes
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot
-from vinesim.sensors.camera.camera import Camera
+from vinesim.sensors.camera.camera import Camera, load_camera_kernels
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import SpinningScan
 from vinesim.sensors.scene.primitives import Primitives
@@ -35,16 +34,8 @@ _MAX_PENDING_POSES = 1024
 
 def load_kernels() -> None:
     """Compile the kernels of cameras and lidars, or read them from the cache, before the first frame is due."""
-    for module in (
-        transform_primitives,
-        camera_raster,
-        camera_raster_plants,
-        lidar_raster,
-        deferred,
-        shadow_maps,
-        stereo_depth,
-        lidar_echoes,
-    ):
+    load_camera_kernels()
+    for module in (transform_primitives, lidar_raster, lidar_echoes):
         wp.load_module(module, device="cpu")
 
 

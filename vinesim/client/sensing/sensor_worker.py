@@ -25,10 +25,10 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, RigidVisual, RobotSample, Snapshot
-from vinesim.sensors.camera.sunlight import SunPath
 
 if TYPE_CHECKING:
     from vinesim.ros.node import Node
+    from vinesim.sensors.camera.sunlight import SunPath
     from vinesim.sensors.scheduler import SensorScheduler
 
 log = logging.getLogger(__name__)

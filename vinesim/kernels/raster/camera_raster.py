@@ -42,7 +42,7 @@ def cull_clusters(
     bound = sphere_bounds(lens, p, r)
     seen = r > 0.0 and p[2] > -r and p[2] - r < lens.max_depth
     seen = seen and bound[1] > -1.0 and bound[0] < float(lens.width)
-    seen = seen and bound[3] > -1.0 and bound[2] < float(lens.height)
+    seen = seen and bound[3] > float(lens.first_row) - 1.0 and bound[2] < float(lens.end_row)
     distance_out[i] = wp.where(seen, wp.max(distance, 0.0), FAR)
 
 
@@ -205,8 +205,8 @@ def resolve_keys(
     depth_out: wp.array(dtype=wp.float32),
     labels_out: wp.array(dtype=wp.int32),
 ):
-    """One thread reads ``run`` pixels' keys into depth [m], label and primitive (-1 sky, -2 ground)."""
-    first = wp.tid() * run
+    """One thread reads ``run`` pixels' keys, from the first row drawn on, into depth [m], label and primitive (-1 sky, -2 ground)."""
+    first = lens.first_row * lens.width + wp.tid() * run
     column = first % lens.width
     row = first // lens.width
     for pixel in range(first, first + run):

@@ -41,6 +41,10 @@ class Pinhole:
     cy: float
     width: int
     height: int
+    first_row: int
+    """Only rows from this one on are drawn, ..."""
+    end_row: int
+    """... to the one before this: threads share a picture by rows."""
     max_depth: float
     """Farthest depth that is drawn [m]."""
     near_radius: float
@@ -96,12 +100,13 @@ def sphere_bounds(lens: Pinhole, p: wp.vec3, r: float) -> wp.vec4:
 
 @wp.func
 def clip_to_image(lens: Pinhole, bound: wp.vec4) -> wp.vec4i:
-    """Bound cut to the picture: first and last + 1 column, first and last + 1 row."""
+    """Bound cut to the rows drawn: first and last + 1 column, first and last + 1 row."""
     w = float(lens.width)
-    h = float(lens.height)
+    low = float(lens.first_row)
+    high = float(lens.end_row)
     return wp.vec4i(
         int(wp.clamp(bound[0] - 0.01, 0.0, w)),
         int(wp.clamp(bound[1] + 1.01, 0.0, w)),
-        int(wp.clamp(bound[2] - 0.01, 0.0, h)),
-        int(wp.clamp(bound[3] + 1.01, 0.0, h)),
+        int(wp.clamp(bound[2] - 0.01, low, high)),
+        int(wp.clamp(bound[3] + 1.01, low, high)),
     )

@@ -7,12 +7,10 @@ import warp as wp
 
 from vinesim.kernels.raster.pinhole import Pinhole, pixel_ray
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
+wp.set_module_options({"enable_backward": False, "fast_math": False, "max_unroll": 25})
 
-WINDOW_SIDE = wp.constant(5)
-"""A window is looked at in 5 x 5 places; first in 3 x 3 of them, which is enough where there is no edge."""
 WindowDisparities = wp.types.vector(length=25, dtype=wp.float32)
-"""Disparities there [px]."""
+"""Disparities [px] in 5 x 5 places of a window; first 3 x 3 are looked at, which is enough where there is no edge."""
 SURFACE_GAP = wp.constant(1.0)
 """Surfaces whose disparities differ by more than this [px], and by more than slant explains, are two to a matcher."""
 
@@ -119,15 +117,21 @@ def window_statistics(
 
 
 @wp.func
-def surface_slant(stereo: Stereo, lens: Pinhole, window: WindowStatistics, x: int, y: int, own: float) -> float:
-    """Cosine between ray and normal of the surface in a window.
+def is_edge(stereo: Stereo, own: float, nearest: float, farthest: float) -> bool:
+    """Whether a window shows more surfaces than its own: disparities [px] of its middle, largest and smallest."""
+    return not (wp.max(nearest - own, own - farthest) < surface_gap(stereo.slope, own))
+
+
+@wp.func
+def surface_slant(stereo: Stereo, lens: Pinhole, across: float, down: float, x: int, y: int, own: float) -> float:
+    """Cosine between ray and normal of the surface in a window; see :class:`WindowStatistics`.
 
     1 / z is linear in the picture: its slopes are those of the surface.
     """
     ray = pixel_ray(lens, x, y)
     per = 1.0 / (12.0 * float(stereo.stride) * stereo.focal_baseline)
-    a = window.across * per * lens.fx
-    b = window.down * per * lens.fy
+    a = across * per * lens.fx
+    b = down * per * lens.fy
     inverse = own / stereo.focal_baseline
     normal = wp.vec3(a, b, inverse - a * ray[0] - b * ray[1])
     return inverse / (wp.length(normal) * wp.length(ray))
@@ -138,39 +142,43 @@ def match_window(
     stereo: Stereo,
     disparity: wp.array(dtype=wp.float32),
     lens: Pinhole,
-    window: WindowStatistics,
+    window_nearest: float,
+    window_farthest: float,
     x: int,
     y: int,
-    own: float,
 ) -> wp.vec2:
-    """Disparity [px] of the surface that fills most of a window at an edge, and the share of the window it fills."""
+    """Disparity [px] of the surface that fills most of a window at an edge, and the share of the window it fills.
+
+    Without a branch, so that a compiler can take several windows at once.
+    """
     disparities = WindowDisparities()
-    nearest = window.nearest
-    farthest = window.farthest
-    for k in range(WINDOW_SIDE * WINDOW_SIDE):
-        i = wp.clamp(x + (k % WINDOW_SIDE - WINDOW_SIDE // 2) * stereo.stride, 0, lens.width - 1)
-        j = wp.clamp(y + (k // WINDOW_SIDE - WINDOW_SIDE // 2) * stereo.stride, 0, lens.height - 1)
+    own = disparity[y * lens.width + x]
+    nearest = window_nearest
+    farthest = window_farthest
+    for k in range(25):
+        i = wp.clamp(x + (k % 5 - 2) * stereo.stride, 0, lens.width - 1)
+        j = wp.clamp(y + (k // 5 - 2) * stereo.stride, 0, lens.height - 1)
         d = disparity[j * lens.width + i]
         disparities[k] = d
         nearest = wp.max(nearest, d)
         farthest = wp.min(farthest, d)
     best = float(-1.0)
-    found = window.total / 9.0
+    found = float(0.0)
     agree = float(1.0)
     for c in range(3):
         candidate = wp.where(c == 0, nearest, wp.where(c == 1, own, farthest))
         within = surface_gap(stereo.slope, candidate)
         votes = float(0.0)
         mean = float(0.0)
-        for k in range(WINDOW_SIDE * WINDOW_SIDE):
+        for k in range(25):
             mine = wp.where(wp.abs(disparities[k] - candidate) < within, 1.0, 0.0)
             votes += mine
             mean += mine * disparities[k]
         weight = votes * wp.where(c == 0, stereo.fattening, 1.0)
-        if weight > best:
-            best = weight
-            agree = votes / float(WINDOW_SIDE * WINDOW_SIDE)
-            found = mean / votes
+        better = weight > best
+        best = wp.where(better, weight, best)
+        agree = wp.where(better, votes / 25.0, agree)
+        found = wp.where(better, mean / votes, found)
     return wp.vec2(found, agree)
 
 
@@ -180,14 +188,14 @@ def seen_by_second(
     lens: Pinhole,
     second: Pinhole,
     second_depth: wp.array(dtype=wp.float32),
+    row: int,
     x: int,
-    y: int,
     own: float,
 ) -> bool:
-    """Whether the second imager sees the surface of disparity ``own`` [px] at pixel (x, y): in view and not occluded."""
+    """Whether the second imager sees the surface of disparity ``own`` [px] in the column x of the picture, which its
+    ``row`` shows: in view and not occluded.
+    """
     column = int(wp.round((float(x) - lens.cx) / lens.fx * second.fx - own + second.cx))
-    row = int(wp.round((float(y) - lens.cy) / lens.fy * second.fy + second.cy))
-    row = wp.clamp(row, 0, second.height - 1)
     if column < 0 or column >= second.width:
         return False
     near = second_depth[row * second.width + column] * (own + surface_gap(stereo.slope, own))
@@ -195,12 +203,19 @@ def seen_by_second(
 
 
 @wp.func
-def loss_probability(stereo: Stereo, window: WindowStatistics, slant: float, own: float) -> float:
-    """How likely a window is not matched: too slanted, without texture, or overexposed."""
+def second_row(lens: Pinhole, second: Pinhole, y: int) -> int:
+    """Row of the second imager that shows the row ``y`` of the picture."""
+    row = int(wp.round((float(y) - lens.cy) / lens.fy * second.fy + second.cy))
+    return wp.clamp(row, 0, second.height - 1)
+
+
+@wp.func
+def loss_probability(stereo: Stereo, brightness: float, contrast: float, slant: float, own: float) -> float:
+    """How likely a window is not matched: too slanted, without texture, or overexposed (grey levels)."""
     lost = 1.0 - linear_step(stereo.slant_lost, stereo.slant_kept, slant)
-    if window.brightest - window.darkest < stereo.contrast:
+    if contrast < stereo.contrast:
         lost = wp.max(lost, linear_step(stereo.projector, 2.0 * stereo.projector, stereo.focal_baseline / own))
-    if window.brightness >= stereo.saturation:
+    if brightness >= stereo.saturation:
         lost = 1.0
     return lost
 
@@ -261,16 +276,17 @@ def measure_depth(
         window = window_statistics(disparity, grey, lens, x, y, stereo.stride)
         match = wp.vec2(window.total / 9.0, 1.0)
         slant = float(1.0)
-        if wp.max(window.nearest - own, own - window.farthest) < surface_gap(stereo.slope, own):
-            if own > 0.0:
-                slant = surface_slant(stereo, lens, window, x, y, own)
-        else:  # an edge
-            match = match_window(stereo, disparity, lens, window, x, y, own)
+        if is_edge(stereo, own, window.nearest, window.farthest):
+            match = match_window(stereo, disparity, lens, window.nearest, window.farthest, x, y)
+        elif own > 0.0:
+            slant = surface_slant(stereo, lens, window.across, window.down, x, y, own)
         is_matched = match[1] >= stereo.support
         lost = float(0.0)
         if own > 0.0:
-            is_matched = is_matched and seen_by_second(stereo, lens, second, second_depth, x, y, own)
-            lost = loss_probability(stereo, window, slant, own)
+            is_matched = is_matched and seen_by_second(
+                stereo, lens, second, second_depth, second_row(lens, second, y), x, own
+            )
+            lost = loss_probability(stereo, window.brightness, window.brightest - window.darkest, slant, own)
         is_matched = is_matched and normal_cdf(noise[1, row, column]) >= lost
         z = reported_depth(stereo, match[0], is_matched, noise[0, row, column])
         for j in range(top, bottom):

@@ -253,7 +253,7 @@ def shade_pixels(
     """
     half = block - 1  # corners are numbered by bits: divisions would cost as much as the shading
     across = (lens.width + half) >> half
-    first = wp.tid() * run
+    first = (lens.first_row >> half) * across + wp.tid() * run
     corners = block * block
     back = wp.transpose(lens.rotation)
     for n in range(first, first + run):
@@ -362,15 +362,17 @@ def tone_map(
     balance: wp.vec3,
     exposure: wp.array(dtype=wp.float32),
     tone: wp.array(dtype=wp.uint8),
+    first_pixel: int,
     run: int,
     # out
     rgb_out: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread turns the light of ``run`` neighbouring pixels, each of ``samples`` squared samples, into 8-bit sRGB.
+    """One thread turns the light of ``run`` pixels, each of ``samples`` squared samples, into 8-bit sRGB.
 
-    radiance: [sample] linear RGB; balance: white balance, factors; tone: [4096] sRGB of sqrt(light / 4); rgb: [pixel, 3].
+    radiance: [sample] linear RGB; balance: white balance, factors; tone: [4096] sRGB of sqrt(light / 4); first_pixel:
+    of the first thread; rgb: [pixel, 3].
     """
-    first = wp.tid() * run
+    first = first_pixel + wp.tid() * run
     per = 1.0 / float(samples * samples)
     gain = balance * exposure[0]
     for pixel in range(first, first + run):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import yourdfpy
 
 from vinesim import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.kinematics import joint_limits
 from vinesim.robot.description.sidecar import JointGroup
+from vinesim.robot.description.urdf_model import Joint, Robot
 from vinesim.scene.values import Drive
 
 ACCELERATION_TIME = 0.02
@@ -23,7 +23,7 @@ CENTRED_SHARE = 0.1
 """A range whose middle is nearer to 0 than this share of the range counts as centred about 0."""
 
 
-def home_positions(driven: list[yourdfpy.Joint], groups: dict[str, JointGroup]) -> np.ndarray:
+def home_positions(driven: list[Joint], groups: dict[str, JointGroup]) -> np.ndarray:
     """Home [joint] rad or m of the driven joints: their groups', else the middle of the range."""
     home = np.array([_default_home(joint) for joint in driven])
     order = [joint.name for joint in driven]
@@ -33,7 +33,7 @@ def home_positions(driven: list[yourdfpy.Joint], groups: dict[str, JointGroup]) 
     return home
 
 
-def _default_home(joint: yourdfpy.Joint) -> float:
+def _default_home(joint: Joint) -> float:
     """Middle of the range [rad or m], so elbows are bent the way they bend; zero if near to it or continuous."""
     if joint.type == "continuous":
         return 0.0
@@ -43,7 +43,7 @@ def _default_home(joint: yourdfpy.Joint) -> float:
 
 
 def make_drives(
-    robot: yourdfpy.Robot, driven: list[yourdfpy.Joint], description: RobotDescription, notes: list[str]
+    robot: Robot, driven: list[Joint], description: RobotDescription, notes: list[str]
 ) -> tuple[Drive, ...]:
     """The drives of the driven joints: gains of their groups, else derived ones, which is added to ``notes``."""
     gains: dict[str, tuple[float, float]] = {}
@@ -70,7 +70,7 @@ def make_drives(
 
 
 def _make_drive(
-    joint: yourdfpy.Joint,
+    joint: Joint,
     gains: tuple[float, float] | None,
     armature: float | None,
     spring: tuple[float, float] | None,
@@ -97,7 +97,7 @@ def _make_drive(
     )
 
 
-def _carried_inertia(robot: yourdfpy.Robot, description: RobotDescription) -> dict[str, float]:
+def _carried_inertia(robot: Robot, description: RobotDescription) -> dict[str, float]:
     """What each moving joint carries with the robot at home: mass [kg], or inertia about its origin [kg m2].
 
     The inertia is the one about the worst axis through the joint, since arms bend: gains must suit any posture.

@@ -6,9 +6,9 @@ import dataclasses
 import math
 
 import numpy as np
-import yourdfpy
 
 from vinesim import frames
+from vinesim.robot.description.urdf_model import Joint, Robot
 from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
 
 
@@ -56,7 +56,7 @@ class JointLimits:
     """[rad/s or m/s]"""
 
 
-def joint_limits(joint: yourdfpy.Joint) -> JointLimits:
+def joint_limits(joint: Joint) -> JointLimits:
     """Limits of a driven joint; ValueError if one that it needs is missing."""
     limit = joint.limit
     if limit is None or limit.effort is None or limit.velocity is None:
@@ -68,7 +68,7 @@ def joint_limits(joint: yourdfpy.Joint) -> JointLimits:
     return JointLimits(limit.lower, limit.upper, limit.effort, limit.velocity)
 
 
-def moving_joints(robot: yourdfpy.Robot, driven: list[str]) -> MovingJoints:
+def moving_joints(robot: Robot, driven: list[str]) -> MovingJoints:
     """The joints of ``robot`` that move, as arrays; ``driven``: names of the drives, in the order of joint arrays."""
     joints = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES]
     origin = np.array([joint_origin(joint) for joint in joints])
@@ -87,7 +87,7 @@ def moving_joints(robot: yourdfpy.Robot, driven: list[str]) -> MovingJoints:
     )
 
 
-def link_anchors(base: str, order: list[yourdfpy.Joint]) -> dict[str, tuple[str, np.ndarray]]:
+def link_anchors(base: str, order: list[Joint]) -> dict[str, tuple[str, np.ndarray]]:
     """Of every link the moving link (or the root ``base``) it is fixed to, and its pose [7] there.
 
     ``order``: all joints from the root outwards.
@@ -102,7 +102,7 @@ def link_anchors(base: str, order: list[yourdfpy.Joint]) -> dict[str, tuple[str,
     return anchors
 
 
-def joint_origin(joint: yourdfpy.Joint) -> np.ndarray:
+def joint_origin(joint: Joint) -> np.ndarray:
     """Pose [7] of the child in the parent at joint position 0."""
     if joint.origin is None:
         return frames.pose([0.0, 0.0, 0.0])

@@ -3,7 +3,7 @@
     robot = load_description("vinebot")
     rigid.add_robot(robot.to_spec("robot_1", index=0, pose=frames.pose([2.0, 0.0, 0.0])))
 
-The URDF is read by yourdfpy. The text that physics and ROS receive differs from the file in three ways: meshes are
+The text that physics and ROS receive differs from the file in three ways: meshes are
 named by absolute path, wheels and casters are fixed (the base is driven as a whole), and shapes whose mesh format
 physics cannot read are replaced; :attr:`RobotDescription.notes` lists each change.
 """
@@ -11,13 +11,11 @@ physics cannot read are replaced; :attr:`RobotDescription.notes` lists each chan
 from __future__ import annotations
 
 import dataclasses
-import io
 import logging
 import pathlib
 
 import msgspec
 import numpy as np
-import yourdfpy
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.description import RobotDescription
@@ -29,6 +27,7 @@ from vinesim.robot.description.meshes import resolve_meshes
 from vinesim.robot.description.package_resources import find_installed
 from vinesim.robot.description.sidecar import Sidecar, check_sidecar, read_sidecar
 from vinesim.robot.description.urdf_checks import check_joints, check_masses, check_tree
+from vinesim.robot.description.urdf_model import Joint, Robot, parse_robot
 from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES, check_numbers, fix_wheels, read_xml
 from vinesim.scene import data_files
 
@@ -52,12 +51,10 @@ def load_description(name: str | pathlib.Path) -> RobotDescription:
     sidecar = msgspec.structs.replace(sidecar, cameras=cameras, lidars=lidars)
     urdf = etree.tostring(root, encoding="unicode")
     try:
-        parsed = yourdfpy.URDF.load(
-            io.BytesIO(urdf.encode()), build_scene_graph=False, load_meshes=False, filename_handler=lambda fname: fname
-        ).robot
-    except (KeyError, AttributeError, ValueError, IndexError, TypeError) as error:
+        parsed = parse_robot(root)
+    except ValueError as error:
         raise description_error(
-            file, f"not a URDF: {type(error).__name__} {error}", "give every link, joint and shape what URDF requires"
+            file, f"not a URDF: {error}", "give every link, joint and shape what URDF requires"
         ) from error
     order = check_tree(parsed, file)
     check_joints(parsed, file)
@@ -82,8 +79,8 @@ def _locate(name: str) -> pathlib.Path:
 
 
 def _assemble(
-    robot: yourdfpy.Robot,
-    order: list[yourdfpy.Joint],
+    robot: Robot,
+    order: list[Joint],
     file: pathlib.Path,
     urdf: str,
     sidecar: Sidecar,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pathlib
 
 import numpy as np
-import yourdfpy
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.errors import description_error
 from vinesim.robot.description.package_resources import find_installed
+from vinesim.robot.description.urdf_model import parse_origin
 
 MESH_FORMATS = (".stl", ".obj", ".msh")
 """File formats that MuJoCo reads; meshes of others, such as Collada, are replaced."""
@@ -83,7 +83,7 @@ def _replace_by_box(shape: etree._Element, file: pathlib.Path) -> None:
         ) from error
     origin = shape.find("origin")
     values = dict(origin.attrib) if origin is not None else {}
-    transform = yourdfpy.URDF._parse_origin(etree.Element("origin", values))
+    transform = parse_origin(etree.Element("origin", values))
     assert transform is not None, "an element has an origin"
     centre = transform[:3, :3] @ (0.5 * (lower + upper)) + transform[:3, 3]
     if origin is None:

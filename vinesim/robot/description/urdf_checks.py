@@ -6,14 +6,14 @@ import math
 import pathlib
 
 import numpy as np
-import yourdfpy
 
 from vinesim.robot.description.errors import description_error
 from vinesim.robot.description.kinematics import joint_limits, link_anchors
+from vinesim.robot.description.urdf_model import Joint, Robot
 from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
 
 
-def check_tree(robot: yourdfpy.Robot, file: pathlib.Path) -> list[yourdfpy.Joint]:
+def check_tree(robot: Robot, file: pathlib.Path) -> list[Joint]:
     """The joints from the root outwards; :class:`DescriptionError` if they are not one tree."""
     links = {link.name for link in robot.links}
     for kind, elements in (("link", robot.links), ("joint", robot.joints)):
@@ -25,8 +25,8 @@ def check_tree(robot: yourdfpy.Robot, file: pathlib.Path) -> list[yourdfpy.Joint
         raise description_error(file, "a link is called 'world', which is the name of the world frame", "rename it")
     if not robot.joints:
         raise description_error(file, "no joints", "give a robot with at least one joint that moves")
-    parent_of: dict[str, yourdfpy.Joint] = {}
-    children: dict[str, list[yourdfpy.Joint]] = {}
+    parent_of: dict[str, Joint] = {}
+    children: dict[str, list[Joint]] = {}
     for joint in robot.joints:
         for link in (joint.parent, joint.child):
             if link not in links:
@@ -47,7 +47,7 @@ def check_tree(robot: yourdfpy.Robot, file: pathlib.Path) -> list[yourdfpy.Joint
         raise description_error(
             file, f"links {roots[0]!r} and {roots[1]!r} both have no parent", "join them with a fixed joint"
         )
-    order: list[yourdfpy.Joint] = []
+    order: list[Joint] = []
     waiting = list(children.get(roots[0], [])) if roots else []
     while waiting:
         joint = waiting.pop(0)
@@ -62,7 +62,7 @@ def check_tree(robot: yourdfpy.Robot, file: pathlib.Path) -> list[yourdfpy.Joint
     return order
 
 
-def check_joints(robot: yourdfpy.Robot, file: pathlib.Path) -> None:
+def check_joints(robot: Robot, file: pathlib.Path) -> None:
     """Raise :class:`DescriptionError` unless types, axes, limits and mimics of all joints can be simulated."""
     names = {joint.name: joint for joint in robot.joints}
     for joint in robot.joints:
@@ -100,7 +100,7 @@ def check_joints(robot: yourdfpy.Robot, file: pathlib.Path) -> None:
         raise description_error(file, "no joint moves", "give a robot with at least one joint that moves")
 
 
-def check_masses(robot: yourdfpy.Robot, order: list[yourdfpy.Joint], file: pathlib.Path, notes: list[str]) -> None:
+def check_masses(robot: Robot, order: list[Joint], file: pathlib.Path, notes: list[str]) -> None:
     """Raise :class:`DescriptionError` unless all that moves has mass and inertia, and every inertia is positive
     definite.
 

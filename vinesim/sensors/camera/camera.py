@@ -8,6 +8,7 @@ which includes the open sky; NaN for a pixel that should have measured and did n
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Annotated
 
 import msgspec
@@ -15,7 +16,12 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.shading import deferred
+from vinesim.kernels.launch import ThreadPool, usable_cores
+from vinesim.kernels.raster import camera_raster, camera_raster_plants
+from vinesim.kernels.raster.pinhole import Pinhole
+from vinesim.kernels.sensing import stereo_rows
+from vinesim.kernels.shading import deferred, shadow_maps
+from vinesim.kernels.shading.shadow_maps import ShadowMap
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput
 from vinesim.sensors import spec_file
@@ -85,14 +91,25 @@ class Quality:
     """Samples, squared, of one pixel's colour."""
     shadow_texel_divisor: int
     """Divides the texels of the shadow map nearby."""
+    second_from_first: bool
+    """Whether the second view of a stereo camera is moved out of the first one, or rendered."""
 
 
+MAX_THREADS = 4
+"""A picture is not shared by more threads than this: the gain is used up."""
 QUALITIES = {
-    "fast": Quality(taps=-1, block=2, samples=1, shadow_texel_divisor=1),
-    "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1),
-    "still": Quality(taps=12, block=2, samples=2, shadow_texel_divisor=2),
+    "fast": Quality(taps=-1, block=2, samples=1, shadow_texel_divisor=1, second_from_first=True),
+    "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1, second_from_first=False),
+    "still": Quality(taps=12, block=2, samples=2, shadow_texel_divisor=2, second_from_first=False),
 }
 """``fast`` for live robots, ``full`` for spectators, ``still`` for pictures that are not live."""
+
+
+@functools.cache
+def load_camera_kernels() -> None:
+    """Compile the CPU kernels of cameras, or read them from the cache: threads must not do so at the same time."""
+    for module in (camera_raster, camera_raster_plants, deferred, shadow_maps, stereo_rows):
+        wp.load_module(module, device="cpu")
 
 
 @dataclasses.dataclass
@@ -111,6 +128,9 @@ class Camera:
     exposure: float | None = None
     """Fixed; automatic unless given. 0.75 suits a sunny noon."""
     device: str = "cpu"
+    threads: int | None = None
+    """Threads of the CPU that draw: the cores that this process may use, up to four, unless given. Every number of
+    them gives the same bits."""
     seed: int = 0
     image_index: int = 0
     """Number of the next image. What the sensor measures follows from (seed, name, this)."""
@@ -123,17 +143,26 @@ class Camera:
         period = self.shadow_period
         if period is None:
             period = 0.0 if self.quality == "still" else 0.2
-        self.rasterizer = CameraRasterizer(width, height, self.device)
+        threads = min(usable_cores(), MAX_THREADS) if self.threads is None else self.threads
+        workers = ThreadPool(threads if self.device == "cpu" else 1)
+        self.rasterizer = CameraRasterizer(width, height, self.device, workers)
         self._supersampled = self.rasterizer
         if samples > 1:
-            self._supersampled = CameraRasterizer(width * samples, height * samples, self.device)
+            self._supersampled = CameraRasterizer(width * samples, height * samples, self.device, workers)
         self._sunlight = Sunlight(
             self.sun, taps=quality.taps, period=period, fine=quality.shadow_texel_divisor, device=self.device
         )
-        self._exposure = Exposure(width, height, samples, self.exposure, self.device)
-        self._host_buffers: list[wp.array] = []
+        self._exposure = Exposure(width, height, samples, self.exposure, self.device, workers)
+        self._host_buffers: dict[int, wp.array] = {}
         reach = self.spec.nearest.value, self.spec.farthest.value
-        self._stereo = self.spec.stereo and Stereo(self.spec.stereo, self.info, reach, self.device)
+        self._stereo = self.spec.stereo and Stereo(
+            self.spec.stereo,
+            self.info,
+            reach,
+            self.device,
+            second_from_first=quality.second_from_first,
+            workers=workers,
+        )
 
     @property
     def rate(self) -> float:
@@ -148,10 +177,17 @@ class Camera:
         Only ``outputs`` are made; the other arrays of the frame have the size 0.
         """
         pose = np.array(pose, float)
-        picture = self.render_on_device(primitives, pose, time)
         shape = (self.info.height, self.info.width)
-        rgb, exact, labels = self._download(picture, self.rasterizer.depth, self.rasterizer.labels)
-        rgb, exact = rgb.reshape(*shape, 3), exact.reshape(shape)
+        # a stereo camera matches by the texture of the picture
+        is_lit = CameraOutput.RGB in outputs or (CameraOutput.DEPTH in outputs and self._stereo is not None)
+        picture = self.render_on_device(primitives, pose, time, is_lit=is_lit)
+        wanted = [
+            picture if is_lit else None,
+            self.rasterizer.depth if outputs & (CameraOutput.DEPTH | CameraOutput.EXACT_DEPTH) else None,
+            self.rasterizer.labels if CameraOutput.LABELS in outputs else None,
+        ]
+        rgb, exact, labels = self._download(*wanted)
+        rgb, exact = rgb.reshape(-1, shape[1], 3), exact.reshape(-1, shape[1])
         if CameraOutput.DEPTH not in outputs:
             depth = np.zeros((0, 0), np.float32)
         elif self._stereo:
@@ -168,34 +204,56 @@ class Camera:
             pose=pose,
             rgb=rgb if CameraOutput.RGB in outputs else np.zeros((0, 0, 3), np.uint8),
             depth=depth,
-            labels=labels.reshape(shape) if CameraOutput.LABELS in outputs else np.zeros((0, 0), np.int32),
+            labels=labels.reshape(-1, shape[1]),
             exact_depth=exact if CameraOutput.EXACT_DEPTH in outputs else np.zeros((0, 0), np.float32),
         )
 
-    def _download(self, *arrays: wp.array) -> list[np.ndarray]:
-        """Copies for the host: from a GPU through memory that it can write to, all at once."""
-        if self.device != "cpu":
-            if not self._host_buffers:
-                self._host_buffers = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays]
-            for array, place in zip(arrays, self._host_buffers, strict=True):
-                wp.copy(place, array)
-            wp.synchronize_stream(self.device)
-            arrays = tuple(self._host_buffers)
-        return [a.numpy().copy() for a in arrays]
+    def _download(self, *arrays: wp.array | None) -> list[np.ndarray]:
+        """Copies for the host, empty for None: from a GPU through memory that it can write to, all at once."""
+        if self.device == "cpu":
+            return [np.zeros(0, np.float32) if a is None else a.numpy().copy() for a in arrays]
+        copies = []
+        for i, array in enumerate(arrays):
+            if array is not None:
+                if i not in self._host_buffers:
+                    shape, kind = array.shape, array.dtype
+                    self._host_buffers[i] = wp.empty(shape, dtype=kind, device="cpu", pinned=True)
+                wp.copy(self._host_buffers[i], array)
+        wp.synchronize_stream(self.device)
+        for i, array in enumerate(arrays):
+            copies.append(np.zeros(0, np.float32) if array is None else self._host_buffers[i].numpy().copy())
+        return copies
 
-    def render_on_device(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> wp.array:
-        """The colours [pixel, 3] of the frame, where they were made: on a GPU, nothing is waited for."""
+    def render_on_device(
+        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, is_lit: bool = True
+    ) -> wp.array | None:
+        """The colours [pixel, 3] of the frame, where they were made: on a GPU, nothing is waited for.
+
+        None, and depth and labels alone, unless ``is_lit``.
+        """
+        if self.device == "cpu":
+            load_camera_kernels()
         pose = np.array(pose, float)
         lens = pinhole(self.info, pose)
         seen = self.rasterizer
         seen.draw(primitives, lens)
+        if not is_lit:
+            return None
         seen, quality = self._supersampled, self._quality
         if quality.samples > 1:
             lens = pinhole(supersampled(self.info, quality.samples), pose)
             seen.draw(primitives, lens)
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         near, far = self._sunlight.update(primitives, pose[:3], forward, time)
-        across, down = (-(-n // quality.block) for n in (seen.width, seen.height))
+        shade = functools.partial(self._shade, primitives, near, far)
+        seen.workers.share([functools.partial(shade, band) for band in seen.bands(lens)])
+        self._exposure.add_glare(primitives, seen.primitive)
+        return self._exposure.tone_map(self._sunlight.balance, time, self._sunlight.brightness)
+
+    def _shade(self, primitives: Primitives, near: ShadowMap, far: ShadowMap, lens: Pinhole) -> None:
+        """Light the rows that ``lens`` draws."""
+        seen, block = self._supersampled, self._quality.block
+        across, down = (-(-n // block) for n in (seen.width, lens.end_row - lens.first_row))
         run = across if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
             deferred.shade_pixels,
@@ -209,11 +267,9 @@ class Camera:
                 lens,
                 seen.primitive,
                 seen.keys,
-                quality.block,
+                block,
                 run,
             ],
             outputs=[self._exposure.radiance],
             device=self.device,
         )
-        self._exposure.add_glare(primitives, seen.primitive)
-        return self._exposure.tone_map(self._sunlight.balance, time, self._sunlight.brightness)

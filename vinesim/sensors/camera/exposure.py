@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
+
 import cv2
 import numpy as np
 import warp as wp
 
+from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.shading import deferred
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
@@ -32,10 +36,17 @@ class Exposure:
     """The exposure of one camera: automatic, unless ``fixed``."""
 
     def __init__(
-        self, width: int, height: int, samples: int = 1, fixed: float | None = None, device: str = "cpu"
+        self,
+        width: int,
+        height: int,
+        samples: int = 1,
+        fixed: float | None = None,
+        device: str = "cpu",
+        workers: ThreadPool | None = None,
     ) -> None:
         """``width`` and ``height`` of the picture [px], each pixel of ``samples`` squared samples."""
         self.width, self.height, self.samples, self.fixed, self.device = width, height, samples, fixed, device
+        self._workers = workers or ThreadPool(1)
         self.radiance = wp.empty(width * height * samples * samples, dtype=wp.vec3, device=device)
         self._rgb = wp.empty((width * height, 3), dtype=wp.uint8, device=device)
         self._sum = wp.zeros(2, dtype=wp.int64, device=device)
@@ -77,23 +88,23 @@ class Exposure:
                 outputs=[self._sum, self._exposure],
                 device=self.device,
             )
+        count = self._workers.size
+        rows = [self.height * i // count for i in range(count + 1)]
+        develop = functools.partial(self._tone_map_rows, wp.vec3(*map(float, balance)))
+        self._workers.share([functools.partial(develop, *ends) for ends in itertools.pairwise(rows)])
+        return self._rgb
+
+    def _tone_map_rows(self, balance: wp.vec3, first: int, end: int) -> None:
+        """Turn the light of some rows into colours."""
         run = self.width if self.device == "cpu" else 1
+        inputs = [self.radiance, self.width, self.samples, balance, self._exposure, self._tone, first * self.width, run]
         wp.launch(
             deferred.tone_map,
-            self.width * self.height // run,
-            inputs=[
-                self.radiance,
-                self.width,
-                self.samples,
-                wp.vec3(*map(float, balance)),
-                self._exposure,
-                self._tone,
-                run,
-            ],
+            self.width * (end - first) // run,
+            inputs=inputs,
             outputs=[self._rgb],
             device=self.device,
         )
-        return self._rgb
 
     def add_glare(self, primitives: Primitives, seen: wp.array) -> None:
         """Spread some light of the lamps among the seen primitives [sample] around them, as a lens does."""

@@ -8,6 +8,8 @@ edges grow.
 
 from __future__ import annotations
 
+import functools
+import itertools
 from typing import Annotated
 
 import cv2
@@ -15,8 +17,9 @@ import msgspec
 import numpy as np
 import warp as wp
 
+from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.raster.pinhole import NEAR_DEPTH, Pinhole
-from vinesim.kernels.sensing import stereo_depth
+from vinesim.kernels.sensing import stereo_depth, stereo_rows
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer
@@ -63,9 +66,17 @@ class Stereo:
         info: CameraInfo,
         reach: tuple[float, float],
         device: str = "cpu",
+        *,
+        second_from_first: bool = False,
+        workers: ThreadPool | None = None,
     ) -> None:
-        """``reach``: nearest and farthest depth [m]."""
-        self.info, self.device = info, device
+        """``reach``: nearest and farthest depth [m].
+
+        ``second_from_first``: what the second imager sees is not drawn but taken from the depth of the first one (on a
+        CPU). ``workers`` share the rows; every number of them gives the same bits.
+        """
+        self.info, self.device, self._workers = info, device, workers or ThreadPool(1)
+        self._second_from_first = second_from_first and device == "cpu"
         s = self._parameters = stereo_depth.Stereo()
         s.baseline, s.focal_baseline = spec.baseline.value, spec.focal.value * spec.baseline.value
         s.scale = min(spec.focal.value / info.fx, 1.0)
@@ -85,11 +96,18 @@ class Stereo:
         self._rows = int(np.ceil(info.height * focal / info.fy)) + 1
         self._centre = -edge * focal, info.cy / info.fy * focal
         self._focal = focal
-        self._second = CameraRasterizer(self._columns, self._rows, device)
+        self._second = CameraRasterizer(self._columns, self._rows, device, self._workers)
         self._window = max(1, round(spec.window.value))
         cells = int(np.ceil(info.height * s.scale)), int(np.ceil(info.width * s.scale))
         self._noise = wp.empty((2, *cells), dtype=float, device=device)
-        self._depth = wp.empty(info.width * info.height, dtype=float, device=device)
+        self._pixels = _imager_pixels(cells, s.scale, info)
+        pixels = info.width * info.height
+        self._depth = wp.empty(pixels, dtype=float, device=device)
+        self._disparity = wp.empty(pixels, dtype=float, device=device)
+        self._grey = wp.empty(pixels, dtype=wp.uint8, device=device)
+        self._second_depth = self._second.depth
+        if self._second_from_first:
+            self._second_depth = wp.empty(cells[0] * self._columns, dtype=float, device=device)
 
     def measure(
         self,
@@ -101,29 +119,56 @@ class Stereo:
     ) -> np.ndarray:
         """Measured depth [height, width] m from exact ``depth`` [height, width] m and the picture ``rgb``."""
         second = self._second_pinhole(lens)
-        self._second.draw(primitives, second)
-        self._noise.assign(self._correlated_noise(rng))
+        disparity = (np.float32(self._parameters.focal_baseline) / depth).ravel()
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel()
+        if self.device != "cpu":
+            self._second.draw(primitives, second)
+            self._disparity.assign(disparity)
+            self._grey.assign(grey)
+            self._noise.assign(self._correlated_noise(rng))
+            self._measure_on_gpu(lens, second)
+        else:
+            if not self._second_from_first:
+                self._second.draw(primitives, second)
+            self._disparity.numpy()[:] = disparity
+            self._grey.numpy()[:] = grey
+            self._noise.numpy()[:] = self._correlated_noise(rng)
+            self._measure_on_cpu(lens, second)
+        return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
+
+    def _measure_on_gpu(self, lens: Pinhole, second: Pinhole) -> None:
         _, rows, columns = self._noise.shape
-        run = columns if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        arrays = [self._disparity, self._grey, self._second_depth, self._noise, 1]
         wp.launch(
             stereo_depth.measure_depth,
-            rows * columns // run,
-            inputs=[
-                self._parameters,
-                lens,
-                second,
-                wp.array(
-                    (np.float32(self._parameters.focal_baseline) / depth).ravel(), dtype=float, device=self.device
-                ),
-                wp.array(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel(), dtype=wp.uint8, device=self.device),
-                self._second.depth,
-                self._noise,
-                run,
-            ],
+            rows * columns,
+            inputs=[self._parameters, lens, second, *arrays],
             outputs=[self._depth],
             device=self.device,
         )
-        return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
+
+    def _measure_on_cpu(self, lens: Pinhole, second: Pinhole) -> None:
+        rows = self._noise.shape[1]
+        warped = self._second_from_first
+
+        def measure(first: int, end: int) -> None:
+            if warped:
+                wp.launch(
+                    stereo_rows.warp_to_second,
+                    end - first,
+                    inputs=[self._parameters, self._pixels, lens, second, self._disparity, first],
+                    outputs=[self._second_depth],
+                )
+            arrays = [self._disparity, self._grey, self._second_depth, int(warped), self._noise, first]
+            wp.launch(
+                stereo_rows.measure_depth_rows,
+                end - first,
+                inputs=[self._parameters, self._pixels, lens, second, *arrays],
+                outputs=[self._depth],
+            )
+
+        bounds = [rows * i // self._workers.size for i in range(self._workers.size + 1)]
+        self._workers.share([functools.partial(measure, *ends) for ends in itertools.pairwise(bounds)])
 
     def _second_pinhole(self, lens: Pinhole) -> Pinhole:
         """The second imager: parallel to the first, a baseline to its right."""
@@ -134,6 +179,7 @@ class Stereo:
         other.fx = other.fy = float(self._focal)
         other.cx, other.cy = map(float, self._centre)
         other.width, other.height, other.max_depth = self._columns, self._rows, lens.max_depth
+        other.first_row, other.end_row = 0, self._rows
         wide = max(other.cx, other.width - other.cx) / other.fx
         high = max(other.cy, other.height - other.cy) / other.fy
         other.near_radius = float(NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
@@ -149,3 +195,15 @@ class Stereo:
         sums = [cv2.boxFilter(field, -1, (self._window, self._window), normalize=False) for field in raw]
         low = wide // 2
         return np.stack([s[low : low + rows, low : low + columns] for s in sums]) / np.float32(self._window)
+
+
+def _imager_pixels(cells: tuple[int, int], scale: float, info: CameraInfo) -> stereo_rows.ImagerPixels:
+    """Where the ``cells`` (rows, columns) of an imager lie in the picture, of which ``scale`` cells make one pixel."""
+    o = stereo_rows.ImagerPixels()
+    for name, count, size in (("row", cells[0], info.height), ("column", cells[1], info.width)):
+        ends = np.ceil(np.arange(count + 1, dtype=np.float32) / np.float32(scale)).astype(np.int32)
+        right = np.minimum(ends[1:], size)
+        setattr(o, f"first_{name}", wp.array(np.append(ends[:-1], right[-1]), dtype=wp.int32, device="cpu"))
+        middle = np.minimum((ends[:-1] + right) // 2, size - 1)
+        setattr(o, f"middle_{name}", wp.array(middle, dtype=wp.int32, device="cpu"))
+    return o

@@ -4,11 +4,14 @@ pixel."""
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 
 import numpy as np
 import warp as wp
 
 from vinesim import frames
+from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.raster.pinhole import EMPTY_KEY, NEAR_DEPTH, Pinhole
@@ -27,6 +30,8 @@ from vinesim.sensors.raster.primitive_arrays import (
 
 MAX_DEPTH = 500.0
 """Nothing is drawn beyond this depth [m]."""
+BANDS_PER_THREAD = 2
+"""Bands of a picture that one thread draws on average: what costs more gets more time from whoever is free."""
 _KERNELS = (
     (camera_raster_plants.raster_cones, (CONE,)),
     (camera_raster_plants.raster_spheroids, (SPHEROID,)),
@@ -54,10 +59,25 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
     lens.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
     lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
     lens.width, lens.height, lens.max_depth = int(info.width), int(info.height), MAX_DEPTH
+    lens.first_row, lens.end_row = 0, lens.height
     wide = max(info.cx, info.width - info.cx) / info.fx
     high = max(info.cy, info.height - info.cy) / info.fy
     lens.near_radius = float(NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
     return lens
+
+
+def row_bands(lens: Pinhole, count: int) -> list[Pinhole]:
+    """``count`` lenses or fewer that draw the rows of one picture between them, an even number of rows each."""
+    rows = [2 * round(0.5 * lens.height * i / count) for i in range(count)] + [lens.height]
+    bands = []
+    for first, end in itertools.pairwise(rows):
+        if first < end:
+            band = Pinhole()
+            for name in Pinhole.vars:
+                setattr(band, name, getattr(lens, name))
+            band.first_row, band.end_row = first, end
+            bands.append(band)
+    return bands
 
 
 def supersampled(info: CameraInfo, samples: int) -> CameraInfo:
@@ -76,15 +96,16 @@ def supersampled(info: CameraInfo, samples: int) -> CameraInfo:
 class CameraRasterizer:
     """Nearest primitive of every pixel; the buffers of one camera."""
 
-    def __init__(self, width: int, height: int, device: str = "cpu") -> None:
+    def __init__(self, width: int, height: int, device: str = "cpu", workers: ThreadPool | None = None) -> None:
+        """``workers`` draw bands of rows at once; every number of them gives the same bits."""
         count = width * height
+        self.workers = workers or ThreadPool(1)
         self.width, self.height, self.device = width, height, device
         self.keys = wp.empty(count, dtype=wp.int64, device=device)
         self._keys = self.keys.numpy() if device == "cpu" else None
         self.primitive = wp.empty(count, dtype=wp.int32, device=device)
         self.depth = wp.empty(count, dtype=float, device=device)
         self.labels = wp.empty(count, dtype=wp.int32, device=device)
-        self._distance = wp.empty(0, dtype=float, device=device)
 
     def draw(
         self,
@@ -94,16 +115,29 @@ class CameraRasterizer:
         farthest: float = MAX_DEPTH,
     ) -> None:
         """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
-        if primitives.rasterizer is None:
-            distance = self.cluster_distances(primitives, lens)
-            seen = np.flatnonzero(distance < float(shapes.FAR))
-            self._rasterize(primitives, lens, seen[np.argsort(distance[seen], kind="stable")])
-        else:
+        if primitives.rasterizer is not None:
             primitives.rasterizer.rasterize(primitives, lens, None, self.keys)
+            self._resolve(primitives, lens, nearest, farthest)
+            return
+
+        def draw_band(band: Pinhole) -> None:
+            distance = self.cluster_distances(primitives, band)
+            seen = np.flatnonzero(distance < float(shapes.FAR))
+            self._rasterize(primitives, band, seen[np.argsort(distance[seen], kind="stable")])
+            self._resolve(primitives, band, nearest, farthest)
+
+        self.workers.share([functools.partial(draw_band, band) for band in self.bands(lens)])
+
+    def bands(self, lens: Pinhole) -> list[Pinhole]:
+        """The bands of rows that :attr:`workers` take one after the other."""
+        return row_bands(lens, BANDS_PER_THREAD * self.workers.size if self.workers.size > 1 else 1)
+
+    def _resolve(self, primitives: PosedPrimitives, lens: Pinhole, nearest: float, farthest: float) -> None:
+        """Read the keys of the rows that ``lens`` draws into primitive numbers, depth and labels."""
         run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(
             camera_raster.resolve_keys,
-            self.width * self.height // run,
+            self.width * (lens.end_row - lens.first_row) // run,
             inputs=[
                 primitives.labels,
                 self.keys,
@@ -121,17 +155,15 @@ class CameraRasterizer:
 
     def cluster_distances(self, primitives: PosedPrimitives, lens: Pinhole) -> np.ndarray:
         """How near each cluster may come to the eye [cluster] m; :data:`shapes.FAR` if no pixel can see it."""
-        clusters = len(primitives.cluster_first)
-        if len(self._distance) != clusters:
-            self._distance = wp.empty(clusters, dtype=float, device=self.device)
+        distance = wp.empty(len(primitives.cluster_first), dtype=float, device=self.device)
         wp.launch(
             camera_raster.cull_clusters,
-            clusters,
+            len(distance),
             inputs=[primitives.ball, lens],
-            outputs=[self._distance],
+            outputs=[distance],
             device=self.device,
         )
-        return self._distance.numpy()
+        return distance.numpy()
 
     def coverage(self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray) -> np.ndarray:
         """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
@@ -142,9 +174,12 @@ class CameraRasterizer:
         return self.keys.numpy().reshape(self.height, self.width) < int(EMPTY_KEY)
 
     def _rasterize(self, primitives: PosedPrimitives, lens: Pinhole, seen: np.ndarray) -> None:
-        """Fill the keys with the nearest of some clusters [k]; fastest if they come from near to far."""
+        """Fill the keys of the rows that ``lens`` draws with the nearest of some clusters [k]; fastest if they come
+        from near to far.
+        """
         assert self._keys is not None, "these kernels draw on a CPU only"
-        self._keys.fill(int(EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
+        rows = slice(lens.first_row * self.width, lens.end_row * self.width)
+        self._keys[rows].fill(int(EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]
         stage = _KERNEL_OF_KIND[kind]

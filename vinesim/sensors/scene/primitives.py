@@ -2,20 +2,22 @@
 
 :class:`Primitives` is built once from a :class:`~vinesim.scene.model.Model` and follows the world through
 :meth:`Primitives.update`: one Warp launch moves the clusters of the trees and rigid bodies that moved, and nothing
-else.
+else. Plants come from :mod:`vinesim.disk_cache` where they were laid out before; another list of rigid bodies lays out
+those, and no plant.
 """
 
 from __future__ import annotations
 
-import logging
-from typing import Any
+import dataclasses
+import pathlib
 
 import numpy as np
 import warp as wp
 
-from vinesim import frames
+from vinesim import disk_cache, frames
 from vinesim.kernels.raster import primitives, transform_primitives
 from vinesim.kernels.shading import materials
+from vinesim.scene import berries
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -26,15 +28,27 @@ from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
 from vinesim.sensors.scene.leaf_area_density import LeafDensity
 from vinesim.sensors.scene.plant_primitives import cane_batch, leaf_batches
-from vinesim.sensors.scene.primitive_batches import placeholder_batch
+from vinesim.sensors.scene.primitive_batches import Batch, placeholder_batch
 from vinesim.sensors.scene.primitive_clusters import ClusterLayout, lay_out
 from vinesim.sensors.scene.rigid_primitives import rigid_batches
 from vinesim.sensors.scene.static_primitives import grass_batch, litter_batch, row_layout, trellis_batch
 
-log = logging.getLogger(__name__)
-
 _SKY_OF_RIGID = 0.7
 """Share of the sky that robots, people and boxes see: GUESSED, nothing is baked for them."""
+_RIGID_ROOM = 2048
+"""Rigid primitives for which there is room from the start."""
+_PRIMITIVE_COLUMNS = {
+    **{f"local_{name}": wp.vec4 for name in "abcd"}, **dict.fromkeys("abcd", wp.vec4), "tint": wp.vec3,
+    "lower": wp.vec3, "upper": wp.vec3, "sky": wp.float32,
+    **dict.fromkeys(("kind", "carrier", "label", "organ", "material"), wp.int32),
+}  # fmt: skip
+"""Values of each primitive: ``local_`` in the frame of its carrier, the others in the world."""
+_CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
+"""Values of each cluster."""
+_TEXTURES = (
+    "leaf_texture", "noise_texture", "soil_texture", "rows", "ground_sky", "ground_x", "ground_y", "ground_cell",
+)  # fmt: skip
+"""Fields of ``Materials`` that are the same for all primitives."""
 
 
 class Primitives:
@@ -60,34 +74,31 @@ class Primitives:
         bodies = len(model.body_mass)
         self._static_carrier = bodies
         """Carrier of the static scene; those of rigid bodies follow it."""
-        spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2]])
-        low, high = (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
-        trees = len(model.tree_first)
-        batches = [cane_batch(model, bodies), *leaf_batches(model)]
-        every = np.arange(len(model.bunch_body))
-        pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
-        batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], ripeness)
-        around = [trellis_batch(model, bodies)]
-        if grass > 0.0:
-            age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
-            around += [grass_batch(row_layout(model), low, high, grass, bodies), litter_batch(low, high, age, bodies)]
-        batches += [b for b in around if b is not None]
-        self._fixed_batches = [b for b in batches if len(b)] or [placeholder_batch(bodies)]
-        self._tree_count = trees
         self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
         self._moved = np.zeros(0, np.int64)
         outline, hull = textures.leaf_outlines()
         self._outline, self._hull = wp.array(outline, device=device), wp.array(hull, dtype=wp.vec2, device=device)
-        self._rest = self._body_q = State.at_rest(model).body_q
+        self._body_q = State.at_rest(model).body_q
         self.pose_version = 0
         """Counts changes of any pose."""
         self.layout_version = 0
         """Counts changes of the set of primitives."""
+        self._columns: dict[str, wp.array] = {}
+        """All values of primitives and clusters by name, with room for more rigid bodies than there are now."""
         self._poses = np.zeros((0, 7), np.float32)
-        self._build(())
-        self._bake_sky(low, high)
+        self._textures = materials.Materials()
+        self._textures.rows = wp.vec2(*row_layout(model))
+        self._textures.leaf_texture, self._textures.noise_texture, self._textures.soil_texture = (
+            wp.array(table, dtype=wp.vec4, device=device)
+            for table in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
+        )
+        if ripeness is None:
+            baked = disk_cache.load_or_make("primitives", _digest(model, grass), lambda: self._bake(grass))
+        else:
+            baked = self._bake(grass)
+        self._open(baked)
         self._pose(np.arange(len(self.cluster_first)))
 
     # -- reading
@@ -112,87 +123,151 @@ class Primitives:
 
     # -- building
 
+    def _bake(self, grass: float) -> disk_cache.Arrays:
+        """Plants and the static scene laid out in clusters, and the share of the sky that each primitive, the far end
+        of each piece of wood, and the ground see through the leaves, in the shape at rest."""
+        low, high = _ground_extent(self.model)
+        layout = lay_out(self._plant_batches(grass, low, high), [], self._static_carrier)
+        baked = {field.name: getattr(layout, field.name) for field in dataclasses.fields(layout)}
+        baked["sky"] = np.zeros(len(layout.label), np.float32)
+        baked["ground_sky"] = np.zeros((1, 1), np.float32)
+        self._open(baked)
+        self._pose(np.arange(len(self.cluster_first)))
+
+        low, high = low - 3.0, high + 3.0
+        posed, kind = self.shapes.a.numpy(), self.shapes.kind.numpy()
+        blades = posed[(layout.organ == int(Organ.LEAF)) & (kind == LEAF)]
+        canopy = LeafDensity(blades, low, high, self.device)
+        # light runs on from one piece of wood to the next: cones know the sky at their far end too
+        wood = np.flatnonzero(kind == CONE)
+        far = canopy.visible_sky(self.shapes.b.numpy()[wood, :3])
+        baked["c"][wood, 2:] = np.stack([far, np.ones(len(wood))], 1)
+        baked["sky"] = canopy.visible_sky(posed[:, :3])
+        step = _ground_step(low, high)
+        x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
+        ground = canopy.visible_sky(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1))
+        baked["ground_sky"] = ground.reshape(x.shape)
+        return baked
+
+    def _plant_batches(self, grass: float, low: np.ndarray, high: np.ndarray) -> list[Batch]:
+        """Plants, trellis, grass and fallen leaves on the ground from ``low`` to ``high`` [2] m."""
+        model, bodies = self.model, self._static_carrier
+        batches = [cane_batch(model, bodies), *leaf_batches(model)]
+        every = np.arange(len(model.bunch_body))
+        pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
+        batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], self._ripeness)
+        around = [trellis_batch(model, bodies)]
+        if grass > 0.0:
+            age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
+            around += [grass_batch(row_layout(model), low, high, grass, bodies), litter_batch(low, high, age, bodies)]
+        batches += [b for b in around if b is not None]
+        return [b for b in batches if len(b)] or [placeholder_batch(bodies)]
+
+    def _open(self, baked: disk_cache.Arrays) -> None:
+        """Take over what :meth:`_bake` made; poses are not yet applied."""
+        low, high = _ground_extent(self.model)
+        low, high = low - 3.0, high + 3.0
+        self._textures.ground_sky = wp.array(baked["ground_sky"], dtype=float, device=self.device)
+        self._textures.ground_x, self._textures.ground_y = float(low[0]), float(low[1])
+        self._textures.ground_cell = float(_ground_step(low, high))
+        self.plant_count = len(baked["label"])
+        """How many primitives are plants or the static scene; those of rigid bodies follow them."""
+        names = [field.name for field in dataclasses.fields(ClusterLayout)]
+        self._plants = ClusterLayout(**{name: baked[name] for name in names})
+        self._columns = {}
+        self._reserve(self._plants, 0)
+        self._write(self._plants, baked["sky"], 0, 0)
+        trees = len(self.model.tree_first)
+        self._by_owner = np.argsort(self._plants.owner, kind="stable")
+        self._owner_start = np.searchsorted(self._plants.owner[self._by_owner], np.arange(trees + 1))
+        self._poses = np.zeros((0, 7), np.float32)
+        self._build(())
+
     def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
-        """Lay all primitives out in clusters: plants, the static scene, then rigid bodies."""
+        """Lay out the primitives of rigid bodies behind those of the plants, which stay as they are."""
+        plants, empty = self._plants, not visuals
         moving = rigid_batches(
             self.model, visuals, self._static_carrier + 1, 0, self._picked_bunch_shapes(visuals), self._ripeness
         )
-        layout = lay_out(self._fixed_batches, moving, self._static_carrier)
+        rigid = plants if empty or not moving else lay_out([], moving, self._static_carrier)
+        empty = rigid is plants
+        rows, clusters = len(plants.label), len(plants.first)
+        if not empty:
+            rigid = dataclasses.replace(rigid, first=rigid.first + rows)
+            if rows + len(rigid.label) > len(self._columns["label"]) or clusters + len(rigid.first) > len(
+                self._columns["first"]
+            ):
+                self._reserve(plants, len(rigid.label))
+            self._write(rigid, np.full(len(rigid.label), _SKY_OF_RIGID, np.float32), rows, clusters)
+        parts = [plants] if empty else [plants, rigid]
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("label", "organ", "first", "size", "kind", "owner", "bunch")
+        }
+        self.label, self.organ = joined["label"], joined["organ"]
+        self.cluster_first, self.cluster_size, self.cluster_kind = joined["first"], joined["size"], joined["kind"]
+        self._owner, self._cluster_bunch = joined["owner"], joined["bunch"]
+        self.rigid_clusters = np.arange(clusters, len(self.cluster_first))
+        version = np.zeros(len(self.cluster_first), np.int64)
         if self.layout_version:
-            layout.c[: len(self._baked_c)] = self._baked_c
-        self.label, self.organ = layout.label, layout.organ
-        self.cluster_first, self.cluster_size, self.cluster_kind = layout.first, layout.size, layout.kind
-        self._owner, self._cluster_bunch = layout.owner, layout.bunch
-        self.rigid_clusters = np.flatnonzero(layout.is_rigid)
-        self.cluster_version = np.zeros(len(self.cluster_first), np.int64)
+            version[:clusters] = self.cluster_version[:clusters]
+        self.cluster_version = version
         """:attr:`pose_version` at which each cluster moved last."""
-        self._by_owner = np.argsort(self._owner, kind="stable")
-        self._owner_start = np.searchsorted(self._owner[self._by_owner], np.arange(self._tree_count + 1))
-        self._upload(layout)
-        self._upload_materials(layout)
+        lamps = [np.flatnonzero(part.material == int(materials.LAMP)) for part in parts]
+        self.lamp_primitives = lamps[0] if empty else np.concatenate([lamps[0], lamps[1] + rows])
+        """Primitives that emit light."""
+        self._bind()
         poses = np.zeros((self._static_carrier + 1 + len(visuals), 7), np.float32)
         poses[:, 6] = 1.0
-        poses[: self._static_carrier] = self._poses[: self._static_carrier] if len(self._poses) else self._rest
-        self._poses = poses
+        poses[: self._static_carrier] = self._poses[: self._static_carrier] if len(self._poses) else self._body_q
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
+        self._poses = self._pose_array.numpy() if self._pose_array.device.is_cpu else poses
+        """[carrier, 7]; on a CPU the kernels read this very memory."""
         self._visuals = visuals
-        self.plant_count = len(layout.label) - sum(len(b) for b in moving)
         self.layout_version += 1
 
-    def _array(self, values: np.ndarray, kind: Any) -> wp.array:
-        return wp.array(np.ascontiguousarray(values), dtype=kind, device=self.device)
+    def _reserve(self, plants: ClusterLayout, rigid: int) -> None:
+        """Device memory for the plants and twice as many rigid primitives as given; that of the plants is kept."""
+        kept, room = self._columns, max(2 * rigid, _RIGID_ROOM)
+        for names, count in ((_PRIMITIVE_COLUMNS, len(plants.label)), (_CLUSTER_COLUMNS, len(plants.first))):
+            for name, kind in names.items():
+                column = wp.zeros(count + room, dtype=kind, device=self.device)
+                if name in kept:
+                    wp.copy(column, kept[name], count=count)
+                self._columns = self._columns | {name: column}
 
-    def _upload(self, layout: ClusterLayout) -> None:
-        """Device arrays of the primitives and clusters; poses are not yet applied."""
-        total = len(layout.label)
+    def _write(self, layout: ClusterLayout, sky: np.ndarray, row: int, cluster: int) -> None:
+        """Write primitives and clusters to the device, from a ``row`` and a ``cluster`` on."""
+        values = {name: getattr(layout, name) for name in ("material", "tint", "organ", "label", "carrier")}
+        values |= {f"local_{name}": getattr(layout, name) for name in "abcd"}
+        values |= {"kind": np.repeat(layout.kind, layout.size), "sky": sky}
+        for name, column in values.items():
+            self._columns[name][row : row + len(sky)].assign(np.ascontiguousarray(column))
+        values = {"first": layout.first, "size": layout.size, "cluster_kind": layout.kind}
+        values["shown"] = _clusters_shown(layout.bunch, self._attached)
+        for name, column in values.items():
+            end = cluster + len(layout.first)
+            self._columns[name][cluster:end].assign(np.ascontiguousarray(column.astype(np.int32)))
+
+    def _bind(self) -> None:
+        """Structs of the primitives and clusters that there are now, in the memory of the columns."""
+        column = {name: self._columns[name][: len(self.label)] for name in _PRIMITIVE_COLUMNS}
+        column |= {name: self._columns[name][: len(self.cluster_first)] for name in _CLUSTER_COLUMNS}
         self._local, self.shapes, self.clusters = primitives.Shapes(), primitives.Shapes(), primitives.Clusters()
         for name in "abcd":
-            setattr(self._local, name, self._array(getattr(layout, name), wp.vec4))
-            setattr(self.shapes, name, wp.empty(total, dtype=wp.vec4, device=self.device))
-        primitive_kind = np.repeat(layout.kind, layout.size)
+            setattr(self._local, name, column[f"local_{name}"])
+            setattr(self.shapes, name, column[name])
         for table in (self._local, self.shapes):
-            table.kind = self._array(primitive_kind, wp.int32)
-            table.outline, table.hull = self._outline, self._hull
-        self.clusters.first, self.clusters.size, self.clusters.kind, self.clusters.shown = (
-            self._array(v.astype(np.int32), wp.int32)
-            for v in (layout.first, layout.size, layout.kind, self._cluster_shown())
-        )
-        self._carrier, self.labels, self.organs = (
-            self._array(v, wp.int32) for v in (layout.carrier, layout.label, layout.organ)
-        )
-        self.lower, self.upper = (wp.empty(total, dtype=wp.vec3, device=self.device) for _ in range(2))
-        self.ball = wp.empty(len(layout.first), dtype=wp.vec4, device=self.device)
-
-    def _cluster_shown(self) -> np.ndarray:
-        """Whether each cluster is to be drawn [cluster]: not those of bunches that no longer hang."""
-        if not len(self._attached):
-            return np.ones(len(self._cluster_bunch), bool)
-        return (self._cluster_bunch < 0) | self._attached[self._cluster_bunch]
-
-    def _upload_materials(self, layout: ClusterLayout) -> None:
-        """Material, colour and visible sky of each primitive; baked values are kept."""
+            table.kind, table.outline, table.hull = column["kind"], self._outline, self._hull
+        self.clusters.first, self.clusters.size = column["first"], column["size"]
+        self.clusters.kind, self.clusters.shown = column["cluster_kind"], column["shown"]
+        self._carrier, self.labels, self.organs = column["carrier"], column["label"], column["organ"]
+        self.lower, self.upper, self.ball = column["lower"], column["upper"], column["ball"]
         self.materials = materials.Materials()
-        self.materials.material = self._array(layout.material, wp.int32)
-        self.materials.tint = self._array(layout.tint, wp.vec3)
-        self.lamp_primitives = np.flatnonzero(layout.material == int(materials.LAMP))
-        """Primitives that emit light."""
-        sky = np.full(len(layout.label), _SKY_OF_RIGID, np.float32)
-        if self.layout_version:
-            known = self._sky[: min(len(self._sky), len(sky))]
-            sky[: len(known)] = known
-            baked = self._baked_materials
-            for name in (
-                "leaf_texture",
-                "noise_texture",
-                "soil_texture",
-                "rows",
-                "ground_sky",
-                "ground_x",
-                "ground_y",
-                "ground_cell",
-            ):
-                setattr(self.materials, name, getattr(baked, name))
-        self.materials.sky = self._array(sky, float)
+        self.materials.material, self.materials.tint = column["material"], column["tint"]
+        self.materials.sky = column["sky"]
+        for name in _TEXTURES:
+            setattr(self.materials, name, getattr(self._textures, name))
 
     def _picked_bunch_shapes(self, visuals: tuple[RigidVisual, ...]) -> dict[int, np.ndarray]:
         """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
@@ -203,34 +278,6 @@ class Primitives:
         self._picked_shapes = picked
         return picked
 
-    def _bake_sky(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Share of the sky that every primitive and the ground see through the leaves, in the shape at rest."""
-        self._pose(np.arange(len(self.cluster_first)))
-        low, high = low - 3.0, high + 3.0
-        posed = self.shapes.a.numpy()
-        is_blade = (self.organ == int(Organ.LEAF)) & (self.shapes.kind.numpy() == LEAF)
-        canopy = LeafDensity(posed[is_blade], low, high, self.device)
-        # light runs on from one piece of wood to the next: cones know the sky at their far end too
-        wood = np.flatnonzero(self.shapes.kind.numpy() == CONE)
-        wood_c = self._local.c.numpy()
-        wood_c[wood, 2:] = np.stack([canopy.visible_sky(self.shapes.b.numpy()[wood, :3]), np.ones(len(wood))], 1)
-        self._local.c.assign(wood_c)
-        self._baked_c = wood_c.copy()
-        self._sky = canopy.visible_sky(posed[:, :3]) if len(posed) else np.zeros(0, np.float32)
-        baked = self.materials
-        baked.sky = wp.array(self._sky, dtype=float, device=self.device)
-        step = max(0.2, float((high - low).max()) / 500.0)
-        x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
-        ground = canopy.visible_sky(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1)).reshape(x.shape)
-        baked.rows = wp.vec2(*row_layout(self.model))
-        baked.ground_sky = wp.array(ground, dtype=float, device=self.device)
-        baked.ground_x, baked.ground_y, baked.ground_cell = float(low[0]), float(low[1]), float(step)
-        baked.leaf_texture, baked.noise_texture, baked.soil_texture = (
-            wp.array(table, dtype=wp.vec4, device=self.device)
-            for table in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
-        )
-        self._baked_materials = baked
-
     # -- following the world
 
     def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
@@ -239,34 +286,30 @@ class Primitives:
         ``moved`` are the trees that may have moved since the last call (default: those of this snapshot and
         the one before). A caller that skips snapshots must gather them from all of these.
         """
-        if snapshot.visuals is not self._visuals:
-            self._body_q = snapshot.body_q
+        body_q, visual_q = snapshot.body_q, np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
+        trees = np.union1d(snapshot.moved_trees if moved is None else moved, self._moved).astype(np.int64)
+        self._moved = np.asarray(snapshot.moved_trees, np.int64)
+        new_visuals = snapshot.visuals is not self._visuals
+        if new_visuals:
+            self._body_q = body_q
             self._build(snapshot.visuals)
-            everything = True
-        else:
-            everything = False
+            # a world that is new, or was set back, need not say what moved
+            differs = (np.asarray(body_q, np.float32) != self._poses[: self._static_carrier]).any(1)
+            trees = np.union1d(trees, self.model.body_tree[differs])
         attached = np.asarray(snapshot.bunch_attached, bool)
         changed = np.flatnonzero(attached != self._attached)
         if len(changed):
             self._attached = attached.copy()
-            shown = self.clusters.shown.numpy()
-            shown[:] = self._cluster_shown()
-            if self.device != "cpu":
-                self.clusters.shown.assign(shown)
-        trees = np.union1d(snapshot.moved_trees if moved is None else moved, self._moved).astype(np.int64)
-        self._moved = np.asarray(snapshot.moved_trees, np.int64)
-        if everything:
-            dirty = np.arange(len(self.cluster_first))
-        else:
-            dirty = self._tree_clusters(trees)
-            if len(changed):
-                dirty = np.union1d(dirty, np.flatnonzero(np.isin(self._cluster_bunch, changed)))
-            visual_q = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
-            if len(self.rigid_clusters) and not np.array_equal(self._poses[self._static_carrier + 1 :], visual_q):
-                dirty = np.concatenate([dirty, self.rigid_clusters])
+            self.clusters.shown.assign(_clusters_shown(self._cluster_bunch, attached))
+        dirty = self._tree_clusters(trees)
+        if len(changed):
+            dirty = np.union1d(dirty, np.flatnonzero(np.isin(self._cluster_bunch, changed)))
+        first_visual = self._static_carrier + 1
+        if new_visuals or not np.array_equal(self._poses[first_visual:], visual_q):
+            dirty = np.concatenate([dirty, self.rigid_clusters])
         if len(dirty):
-            self._poses[: self._static_carrier] = snapshot.body_q
-            self._poses[self._static_carrier + 1 :] = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
+            self._poses[: self._static_carrier] = body_q
+            self._poses[first_visual:] = visual_q
             self._pose(dirty)
         return dirty
 
@@ -277,7 +320,8 @@ class Primitives:
         return self._by_owner[np.repeat(start, size) + inner]
 
     def _pose(self, dirty: np.ndarray) -> None:
-        self._pose_array.assign(self._poses)
+        if not self._pose_array.device.is_cpu:
+            self._pose_array.assign(self._poses)
         wp.launch(
             transform_primitives.pose_clusters,
             len(dirty),
@@ -293,6 +337,34 @@ class Primitives:
         )
         self.pose_version += 1
         self.cluster_version[dirty] = self.pose_version
+
+
+def _clusters_shown(bunch: np.ndarray, attached: np.ndarray) -> np.ndarray:
+    """Whether each cluster is to be drawn [cluster] int32, by the bunch that it belongs to (-1 for none) [cluster]: not
+    those of bunches that no longer hang."""
+    if not len(attached):
+        return np.ones(len(bunch), np.int32)
+    return ((bunch < 0) | attached[bunch]).astype(np.int32)
+
+
+def _ground_extent(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest x and y [2] m of vines and posts."""
+    spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2]])
+    return (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
+
+
+def _ground_step(low: np.ndarray, high: np.ndarray) -> float:
+    """Spacing of the table of the sky that the ground sees [m]."""
+    return max(0.2, float((high - low).max()) / 500.0)
+
+
+def _digest(model: Model, grass: float) -> str:
+    """Of all that the plants' primitives follow from."""
+    package = pathlib.Path(__file__).parents[2]
+    code = [package / part for part in ("scene", "sensors/scene", "sensors/raster", "kernels/raster", "frames.py")]
+    shading = package / "kernels" / "shading"
+    code += [shading / "materials.py", shading / "shadow_maps.py"]
+    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r}")
 
 
 def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:

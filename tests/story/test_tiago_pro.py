@@ -1,4 +1,4 @@
-"""A robot that others made, as they publish it: it holds, drives, grips, reaches and pushes a bunch, no file edited."""
+"""TIAGo Pro from its published, unedited description: holds, drives, grips, reaches and pushes a bunch."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.builder import assemble
 
 BUNCH = np.array([0.65, 0.25, 1.25])
-"""Middle of a hanging bunch, ahead of the robot's left shoulder [m]."""
+"""Centre of a hanging bunch, ahead of the robot's left shoulder [m]."""
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +31,8 @@ class Vineyard:
     """One vine with a bunch in front of the robot, and a clock."""
 
     def __init__(self, description: RobotDescription) -> None:
-        hang = assemble([cane((0.0, 0.0, 0.0), bunch=0.5)])
-        pose = hang.forward_kinematics(hang.joint_settled)[hang.bunch_body[0]]
+        at_origin = assemble([cane((0.0, 0.0, 0.0), bunch=0.5)])
+        pose = at_origin.forward_kinematics(at_origin.joint_settled)[at_origin.bunch_body[0]]
         middle = pose[:3] + frames.rotate(pose[3:].astype(float), np.array([0.085, 0.0, 0.0]))
         self.physics = Physics(assemble([cane(BUNCH - middle, bunch=0.5)]), detachment=False)
         self.robot = Robot(self.physics.rigid, description, "tiago")
@@ -43,7 +43,7 @@ class Vineyard:
             self.physics.step()
 
 
-def test_it_holds_its_pose_with_every_link_weighing_what_the_file_says(tiago):
+def test_it_holds_its_pose_with_the_link_masses_of_its_urdf(tiago):
     world = Vineyard(tiago)
     world.run(2.0)
     position, velocity, effort, _ = world.physics.rigid.joint_measurements("tiago")
@@ -54,7 +54,7 @@ def test_it_holds_its_pose_with_every_link_weighing_what_the_file_says(tiago):
     assert world.physics.rigid.faults == 0
 
 
-def test_it_drives_a_circle_and_stops_when_nobody_commands(tiago):
+def test_it_drives_a_circle_and_stops_without_commands(tiago):
     world = Vineyard(tiago)
     rigid = world.physics.rigid
     rigid.place_robot("tiago", frames.pose([10.0, 0.0, 0.0]), tiago.home)
@@ -68,28 +68,28 @@ def test_it_drives_a_circle_and_stops_when_nobody_commands(tiago):
     assert np.abs(rigid.base_state("tiago")[1]).max() < 1e-2
 
 
-def test_its_fingers_close_with_their_mimics(tiago):
+def test_fingers_and_their_mimic_joints_close(tiago):
     world = Vineyard(tiago)
     finger = tiago.joint_indices("gripper_left")
     drive = tiago.drives[finger[0]]
-    for share in (0.2, 0.8):
-        goal = drive.lower + share * (drive.upper - drive.lower)
+    for fraction in (0.2, 0.8):
+        goal = drive.lower + fraction * (drive.upper - drive.lower)
         world.robot.command_position(np.full(len(finger), goal), finger)
         world.run(1.5)
         np.testing.assert_allclose(world.physics.rigid.joint_measurements("tiago")[0][finger], goal, atol=5e-3)
 
 
-def test_it_reaches_for_a_bunch_and_pushes_it(tiago):
+def test_it_reaches_and_pushes_a_bunch(tiago):
     world = Vineyard(tiago)
-    reach = PushBunch(world.robot, "left", lambda: BUNCH, repeat=False, hold_time=0.5)
+    task = PushBunch(world.robot, "left", lambda: BUNCH, repeat=False, hold_time=0.5)
     pushed, effort = 0.0, 0.0
-    while reach.push_count == 0 and world.physics.time < 40.0:
-        reach.control(world.physics.time)
+    while task.push_count == 0 and world.physics.time < 40.0:
+        task.control(world.physics.time)
         world.run(world.physics.dt)
         contacts = [c for c in world.physics.contacts if c.actor == "tiago"]
         pushed = max(pushed, float(np.linalg.norm(sum((c.force for c in contacts), np.zeros(3)))))
         effort = max(effort, float(np.abs(world.physics.rigid.joint_measurements("tiago")[3]).max()))
-    assert (reach.push_count, reach.missed_count) == (1, 0)
+    assert (task.push_count, task.missed_count) == (1, 0)
     assert 0.5 < pushed < 60.0
-    assert effort > 0.1, "its joints feel the bunch"
+    assert effort > 0.1, "the joints carry the reaction of the bunch"
     assert world.physics.rigid.faults == 0

@@ -1,4 +1,4 @@
-"""F54: one client moves several robots; each is an actor of its own to everybody else, and its topics have a prefix."""
+"""F54: one client controls several robots; each is a separate actor for others, and its topics have a prefix."""
 
 import contextlib
 import json
@@ -20,12 +20,12 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
 DT = 0.01
-LONGEST = 300.0
-"""For a process to start, or to end [s]; reached only by a failure."""
+PROCESS_TIMEOUT = 300.0
+"""Limit for a process to start or to end [s]; reached only by a failure."""
 
 
-class Farm:
-    """A client with two robots, and a visitor: the second robot stands before the vines."""
+class TwoRobots:
+    """A client with two robots, of which the second stands before the vines, and a client named visitor."""
 
     def __init__(self, visitor_back: float = 0.0) -> None:
         self.now = 100.0
@@ -61,18 +61,18 @@ class Farm:
             self.now += DT
             if condition():
                 return
-        pytest.fail(f"did not come true within {limit} s of simulated time")
+        pytest.fail(f"condition false after {limit} s of simulated time")
 
 
-def test_two_robots_of_one_client_are_two_actors_to_the_others():
-    world = Farm()
+def test_two_robots_of_one_client_are_two_actors_for_others():
+    world = TwoRobots()
     farm, visitor = world.farm, world.visitor
     world.until(lambda: len(visitor.remote_actors) == 2 and len(farm.remote_actors) == 1, 3.0)
     assert set(visitor.remote_actors) == {"farm_1", "farm_2"}
     assert set(farm.remote_actors) == {"visitor"}
     assert farm.physics.rigid.robots == ("farm_1", "farm_2", "visitor")
 
-    # each moves by its own commands, in both worlds
+    # each moves by its own commands, on both clients
     first, second = farm.robots.values()
     first.command_position([0.5], ["head_1_joint"])
     second.command_position([-0.5], ["head_1_joint"])
@@ -80,7 +80,7 @@ def test_two_robots_of_one_client_are_two_actors_to_the_others():
     world.until(lambda: visitor.physics.rigid.joint_measurements("farm_2")[0][head] < -0.49, 3.0)
     assert visitor.physics.rigid.joint_measurements("farm_1")[0][head] == pytest.approx(0.5, abs=0.02)
 
-    # what the second one touches is told by it, and moves on the visitor's side
+    # the second robot publishes what it touches, and the copy at the visitor moves
     world.reach()
     world.until(lambda: visitor.replicator.owner(world.tree) == "farm_2", 15.0)
     assert farm.replicators["farm_2"].owner(world.tree) == "farm_2"
@@ -89,8 +89,8 @@ def test_two_robots_of_one_client_are_two_actors_to_the_others():
 
     def moved(client: Client) -> float:
         """Largest turn of a joint of the touched tree [rad]."""
-        alike = np.abs((client.physics.state.joint_q[here] * rest).sum(1))
-        return float(2.0 * np.arccos(np.clip(alike, 0.0, 1.0)).max())
+        cosine = np.abs((client.physics.state.joint_q[here] * rest).sum(1))
+        return float(2.0 * np.arccos(np.clip(cosine, 0.0, 1.0)).max())
 
     world.until(lambda: moved(farm) > 0.2, 10.0)
     world.until(lambda: moved(visitor) > 0.15, 1.0)
@@ -98,34 +98,34 @@ def test_two_robots_of_one_client_are_two_actors_to_the_others():
     assert farm.replicators["farm_2"].counters.environment.bytes_out > 0
 
 
-def test_a_companion_is_nobody_that_must_be_told():
-    """With the visitor 20 m away, one robot touches a vine beside its companion: not one byte leaves."""
-    world = Farm(visitor_back=20.0)
+def test_two_robots_of_one_client_send_each_other_no_plants():
+    """With the visitor 20 m away, one robot touches a vine beside the other robot of its client: no byte is sent."""
+    world = TwoRobots(visitor_back=20.0)
     world.reach()
     world.until(lambda: world.farm.interest_audit.ticks_touching > 20, 15.0)
     assert world.farm.interest_audit.bytes == 0
     assert sum(e.counters.environment.bytes_out for e in world.farm.replicators.values()) == 0
 
 
-def test_robots_of_one_client_start_side_by_side_then_in_line():
+def test_robots_of_one_client_start_side_by_side_then_in_a_queue():
     scene = load_scene("demo")
     poses = [start_pose(scene, 0, 0.0, i) for i in range(2 * len(scene.spawns))]
     first, behind = poses[0], poses[len(scene.spawns)]
     assert np.linalg.norm(first[:3] - behind[:3]) == pytest.approx(QUEUE_SPACING)
-    apart = [np.linalg.norm(a[:2] - b[:2]) for i, a in enumerate(poses) for b in poses[:i]]
-    assert min(apart) > 1.1
+    distances = [np.linalg.norm(a[:2] - b[:2]) for i, a in enumerate(poses) for b in poses[:i]]
+    assert min(distances) > 1.1
 
 
 @pytest.mark.slow
 @pytest.mark.ros
-def test_each_has_its_topics_under_its_name():
+def test_each_robot_publishes_under_its_prefix():
     """A stock ROS node receives the topics of both, each under its own prefix, and one clock."""
     topics = [
         "/clock",
         *(f"/farm_{i}/{topic}" for i in (1, 2) for topic in ("joint_states", "mobile_base_controller/odom", "tf")),
     ]
-    asked = [word for topic in topics for word in ("--topic", topic)]
-    two = ["--robot", "vinebot", "--robot", "vinebot", "--name", "farm", "--status", "json"]
+    options = [option for topic in topics for option in ("--topic", topic)]
+    robots = ["--robot", "vinebot", "--robot", "vinebot", "--name", "farm", "--status", "json"]
     with contextlib.ExitStack() as stack:
         monitor, client = (
             stack.enter_context(
@@ -135,13 +135,13 @@ def test_each_has_its_topics_under_its_name():
                 )
             )
             for command in (
-                ["vinesim.ros.tools.topic_monitor", *asked],
-                ["vinesim.cli", "client", *two],
+                ["vinesim.ros.tools.topic_monitor", *options],
+                ["vinesim.cli", "client", *robots],
             )
         )  # fmt: skip
         for process in (monitor, client):
             stack.callback(process.kill)
-        watchdog = threading.Timer(LONGEST, client.kill)
+        watchdog = threading.Timer(PROCESS_TIMEOUT, client.kill)
         watchdog.start()
         stack.callback(watchdog.cancel)
         subscribed = None
@@ -151,9 +151,9 @@ def test_each_has_its_topics_under_its_name():
             if subscribed is not None and status["time"] > subscribed + 5.0:
                 break
         client.send_signal(signal.SIGINT)
-        _, errors = client.communicate(timeout=LONGEST)
+        _, errors = client.communicate(timeout=PROCESS_TIMEOUT)
         assert client.returncode == 0, errors
-        received, _ = monitor.communicate(timeout=LONGEST)
+        received, _ = monitor.communicate(timeout=PROCESS_TIMEOUT)
     report = json.loads(received)
     for topic in topics:
         assert report[topic]["count"] > 20, (topic, report)

@@ -1,4 +1,4 @@
-"""The picking job with a second client watching: what the robot lays into its box lies in the other's box, too."""
+"""The picking task replicated to a second client: the bunch is in the same box there, with its weight."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ GRAVITY = 9.81
 
 
 @pytest.mark.slow
-def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_weighed_on_the_vine():
+def test_a_picked_bunch_is_in_the_box_with_its_weight_on_the_other_client():
     now = [100.0]
     scene = with_seed(load_scene("harvest"), 7)
     model, vinebot, hub = generate(scene), load_description("vinebot"), MemoryHub(delay=0.02, jitter=0.005, seed=2)
     task = next(pick_planning.plan_picks(model, start_poses.spawn_pose(scene, 0)[:2]))
     box = object_id(ObjectKind.BOX, task.box)
-    beside = model.box_pose[task.box, :2] + [0.0, 1.6]
+    visitor_xy = model.box_pose[task.box, :2] + [0.0, 1.6]
     worker, visitor = (
         Client(scene, model, vinebot, hub.bus(name), name=name, pose=pose, clock=lambda: now[0])
-        for name, pose in (("worker", task.base_pose), ("visitor", frames.pose([*beside, 0.0])))
+        for name, pose in (("worker", task.base_pose), ("visitor", frames.pose([*visitor_xy, 0.0])))
     )
-    # let MuJoCo compute the forces of what lies still, too
+    # without sleep, so that MuJoCo computes the forces of resting bodies, too
     visitor.physics.rigid.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
     def run(ticks: int = 1) -> None:
@@ -48,20 +48,20 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
     empty = float(model.box_mass[task.box]) * GRAVITY
     pick = PickBunch(worker.physics, worker.robot, task)
     worker.pre_step.append(pick.control)
-    bunch, worst = object_id(ObjectKind.BUNCH, task.bunch), []
+    bunch, position_errors = object_id(ObjectKind.BUNCH, task.bunch), []
     while not pick.is_done:
         run()
         cut = not worker.physics.state.bunch_attached[task.bunch]
         if cut and visitor.replicator.owner(bunch) == "worker":
             here, there = (client.physics.support_tracker.object_state(bunch)[0] for client in (worker, visitor))
-            worst.append(float(np.linalg.norm(here[:3] - there[:3])))
+            position_errors.append(float(np.linalg.norm(here[:3] - there[:3])))
     assert pick.picked, pick.reason
     run(300)
     assert not visitor.physics.state.bunch_attached[task.bunch]
     assert visitor.physics.state.bunch_attached.sum() == len(model.bunch_body) - 1
     here, there = (
-        frames.compose(frames.inverse(riding.object_state(box)[0]), riding.object_state(bunch)[0])
-        for riding in (worker.physics.support_tracker, visitor.physics.support_tracker)
+        frames.compose(frames.inverse(tracker.object_state(box)[0]), tracker.object_state(bunch)[0])
+        for tracker in (worker.physics.support_tracker, visitor.physics.support_tracker)
     )
     assert np.linalg.norm(here[:3] - there[:3]) < 5e-3
     assert visitor.physics.support_tracker.pose_on_support(bunch)[0] == f"box/{task.box}"
@@ -71,12 +71,12 @@ def test_the_other_client_sees_the_bunch_in_its_box_and_it_weighs_there_what_it_
         bunch, visitor.physics.support_tracker.object_state(bunch)[0], np.zeros(6)
     )
     run(100)
-    weighed = np.mean([(run(), pressed_on_ground(visitor.physics, task.box))[1] for _ in range(50)]) - empty
-    assert weighed == pytest.approx(float(model.body_mass[model.bunch_body[task.bunch]]) * GRAVITY, rel=0.03)
+    weight = np.mean([(run(), pressed_on_ground(visitor.physics, task.box))[1] for _ in range(50)]) - empty
+    assert weight == pytest.approx(float(model.body_mass[model.bunch_body[task.bunch]]) * GRAVITY, rel=0.03)
     counters = worker.replicator.counters
-    told = counters.environment, counters.event, counters.retained
-    assert sum(family.bytes_out for family in told) < 100e3
-    assert max(worst) < 0.03
-    sent = [family.bytes_out for family in told]
+    families = counters.environment, counters.event, counters.retained
+    assert sum(family.bytes_out for family in families) < 100e3
+    assert max(position_errors) < 0.03
+    sent = [family.bytes_out for family in families]
     run(200)
-    assert [family.bytes_out for family in told] == sent
+    assert [family.bytes_out for family in families] == sent

@@ -1,0 +1,95 @@
+"""What makes a live picture cheap changes nothing: threads, outputs left out, a second view out of the first."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.support import sensor_scenes
+from vinesim.kernels.launch import ThreadPool
+from vinesim.kernels.sensing import stereo_depth
+from vinesim.scene.values import CameraFrame, CameraOutput
+from vinesim.sensors.camera.camera import QUALITIES, Camera, CameraSpec
+from vinesim.sensors.camera.stereo import Stereo
+from vinesim.sensors.export.images import look_at
+from vinesim.sensors.raster.camera_rasterizer import pinhole
+from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.spec_file import noise_rng
+
+SPEC = CameraSpec.load("d435")
+INFO = SPEC.info("optical", 0.5)
+ODD = SPEC.info("optical", 0.213)
+"""Of 136 x 102 pixels."""
+ALONG_THE_ROW = look_at(np.array([0.4, 1.2, 1.3]), np.array([3.0, 1.0, 1.7]))
+AT_A_BUNCH = look_at(np.array([1.65, 1.9, 1.5]), np.array([1.67, 2.74, 1.65]))
+
+
+@pytest.fixture(scope="module")
+def primitives() -> Primitives:
+    return Primitives(sensor_scenes.demo())
+
+
+def _arrays(frame: CameraFrame) -> list[np.ndarray]:
+    assert frame.exact_depth is not None
+    return [frame.rgb, frame.depth, frame.exact_depth, frame.labels]
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+@pytest.mark.parametrize("info", [INFO, ODD], ids=["320x240", "136x102"])
+def test_any_number_of_threads_gives_the_same_bits(primitives, quality: str, info) -> None:
+    frames = [Camera(SPEC, info, quality=quality, threads=n).render(primitives, ALONG_THE_ROW) for n in (1, 2, 3)]
+    for other in frames[1:]:
+        for mine, theirs in zip(_arrays(other), _arrays(frames[0]), strict=True):
+            assert np.array_equal(mine, theirs, equal_nan=mine.dtype == np.float32)
+
+
+@pytest.mark.parametrize("output", list(CameraOutput.ALL))
+def test_what_is_made_alone_is_what_is_made_with_the_rest(primitives, output: CameraOutput) -> None:
+    """And nothing else is in the frame."""
+    every = Camera(SPEC, INFO, quality="fast").render(primitives, ALONG_THE_ROW)
+    alone = Camera(SPEC, INFO, quality="fast").render(primitives, ALONG_THE_ROW, outputs=output)
+    assert alone.outputs == output
+    names = {CameraOutput.RGB: "rgb", CameraOutput.DEPTH: "depth", CameraOutput.LABELS: "labels"}
+    name = names.get(output, "exact_depth")
+    assert np.array_equal(getattr(alone, name), getattr(every, name), equal_nan=name == "depth")
+
+
+def test_rows_of_the_imager_are_matched_as_single_pixels_are(primitives) -> None:
+    """The kernel for CPUs against the one for GPUs, run on the CPU: the same depth, bit for bit."""
+    frame = Camera(SPEC, INFO).render(primitives, ALONG_THE_ROW)
+    assert SPEC.stereo is not None
+    stereo = Stereo(SPEC.stereo, INFO, (SPEC.nearest.value, SPEC.farthest.value))
+    lens = pinhole(INFO, ALONG_THE_ROW)
+    by_rows = stereo.measure(primitives, lens, frame.exact_depth, frame.rgb, noise_rng(0, "camera", 0))
+    by_pixels = wp.empty(INFO.width * INFO.height, dtype=float, device="cpu")
+    _, rows, columns = stereo._noise.shape
+    arrays = [stereo._disparity, stereo._grey, stereo._second_depth, stereo._noise, columns]
+    inputs = [stereo._parameters, lens, stereo._second_pinhole(lens), *arrays]
+    wp.launch(stereo_depth.measure_depth, rows, inputs=inputs, outputs=[by_pixels], device="cpu")
+    assert np.array_equal(by_rows.ravel(), by_pixels.numpy(), equal_nan=True)
+
+
+@pytest.mark.parametrize("pose", [ALONG_THE_ROW, AT_A_BUNCH], ids=["row", "bunch"])
+def test_a_second_view_from_the_first_misses_what_a_true_one_misses(primitives, pose) -> None:
+    """Pixels without depth: as many to a tenth, and nearly all of them the same; what is measured is the same."""
+    full, fast = (Camera(SPEC, SPEC.info("optical"), quality=q).render(primitives, pose) for q in ("full", "fast"))
+    assert SPEC.stereo is not None
+    lens, reach = pinhole(full.info, pose), (SPEC.nearest.value, SPEC.farthest.value)
+    warping = Stereo(SPEC.stereo, full.info, reach, second_from_first=True, workers=ThreadPool(2))
+    warped = warping.measure(primitives, lens, full.exact_depth, full.rgb, noise_rng(0, "camera", 0))
+    missed, missed_too = np.isnan(full.depth), np.isnan(warped)
+    assert missed_too.mean() == pytest.approx(missed.mean(), rel=0.1)
+    assert (missed != missed_too).mean() < 0.01
+    measured = np.isfinite(full.depth) & np.isfinite(warped)
+    assert np.array_equal(full.depth[measured], warped[measured])
+    assert np.isfinite(fast.depth).mean() == pytest.approx(np.isfinite(full.depth).mean(), rel=0.02)
+
+
+def test_a_pool_shares_tasks_and_raises_their_errors() -> None:
+    pool = ThreadPool(3)
+    done: list[int] = []
+    pool.share([lambda i=i: done.append(i) for i in range(20)])
+    assert sorted(done) == list(range(20))
+    with pytest.raises(ZeroDivisionError):
+        pool.share([lambda: 1 // 0] * 2)
+    pool.share([lambda: done.append(20)])
+    assert done[-1] == 20

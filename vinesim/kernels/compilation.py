@@ -1,0 +1,86 @@
+"""Compilation of all kernels before they are needed: by one process at a time, on all cores, with progress.
+
+Warp compiles a module at its first launch and keeps the result on disk. Processes that start together would each
+compile the same modules, in silence and one after the other. :func:`compile_kernels` compiles them once; others wait for it.
+"""
+
+import concurrent.futures
+import hashlib
+import importlib
+import os
+import pathlib
+import pkgutil
+import types
+
+import warp as wp
+
+import vinesim.kernels
+from vinesim import disk_cache
+
+SENSOR_PACKAGES = ("raster", "sensing", "shading")
+"""Kernels of cameras and lidars; the others are those of physics."""
+TIMEOUT = 600.0
+"""How long another process may take to compile, before this one compiles as well [s]."""
+_CUDA_ONLY = ("vinesim.kernels.raster.cuda_raster",)
+
+
+def compile_kernels(packages: tuple[str, ...] = ()) -> int:
+    """Compile the kernels of some ``packages`` of :mod:`vinesim.kernels` for the CPU, all unless given.
+
+    Returns how many modules were compiled here: 0 where all are in Warp's cache, which takes a millisecond to find.
+    """
+    stamp = _stamp(packages)
+    if _is_valid(stamp):
+        return 0
+    with disk_cache.exclusive("kernels", TIMEOUT, waiting_for="another process that compiles kernels"):
+        if _is_valid(stamp):
+            return 0
+        modules = _modules(packages)
+        folders = [os.path.join(wp.config.kernel_cache_dir, m.get_module_identifier(1)) for m in modules]
+        missing = [m for m, folder in zip(modules, folders, strict=True) if not os.path.isdir(folder)]
+        _compile(missing)
+        stamp.write_text("\n".join(folders))
+    return len(missing)
+
+
+def _compile(modules: list[wp.Module]) -> None:
+    """Compile modules on all cores; the compiler works without the interpreter lock."""
+
+    def compile_one(number: int) -> None:
+        name = modules[number].name.removeprefix("vinesim.kernels.")
+        disk_cache.progress.info("compiling kernels: %s (%d of %d)", name, number + 1, len(modules))
+        wp.force_load("cpu", [modules[number]], max_workers=0)
+
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+        for _ in pool.map(compile_one, range(len(modules))):
+            pass
+
+
+def _modules(packages: tuple[str, ...]) -> list[wp.Module]:
+    """All Warp modules of the packages that have kernels, by name."""
+    found = []
+    for info in pkgutil.walk_packages(vinesim.kernels.__path__, "vinesim.kernels."):
+        part = info.name.split(".")[2]
+        if info.ispkg or info.name in _CUDA_ONLY or (packages and part not in packages):
+            continue
+        python: types.ModuleType = importlib.import_module(info.name)
+        module = wp.get_module(python.__name__)
+        if module.kernels:
+            found.append(module)
+    return found
+
+
+def _stamp(packages: tuple[str, ...]) -> pathlib.Path:
+    """A file in Warp's cache that lists the compiled modules of this version of the kernels."""
+    h = hashlib.blake2b(repr((packages, wp.config.version, wp.config.cpu_compiler_flags)).encode(), digest_size=8)
+    for file in sorted(pathlib.Path(vinesim.kernels.__path__[0]).rglob("*.py")):
+        h.update(file.name.encode() + file.read_bytes())
+    return pathlib.Path(wp.config.kernel_cache_dir) / f"vinesim-{h.hexdigest()}"
+
+
+def _is_valid(stamp: pathlib.Path) -> bool:
+    """Whether all modules that a stamp lists are still there."""
+    try:
+        return all(map(os.path.isdir, stamp.read_text().split("\n")))
+    except OSError:
+        return False
