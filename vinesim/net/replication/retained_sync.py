@@ -6,6 +6,7 @@ publishes all of its own records again, for the new one may know nothing.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
 from vinesim.net.codec import messages
@@ -38,6 +39,8 @@ class RetainedSync:
         self._asked: dict[Cell, tuple[float, float]] = {}
         self._is_disconnected = False
         self._window_changes = -1
+        self._next_query = math.inf
+        """When the server is asked next [s]."""
 
     def publish(self, cell: Cell, record: RetainedRecord) -> None:
         """Queue an own record about an object in ``cell``."""
@@ -65,7 +68,7 @@ class RetainedSync:
         """
         is_disconnected = bool(self.bus.status_message)
         if (
-            not self._asked
+            (now < self._next_query or is_disconnected)
             and is_disconnected == self._is_disconnected
             and changes == self._window_changes
             and len(self._publishers) == len(window)
@@ -92,6 +95,7 @@ class RetainedSync:
                 if now >= due:
                     self._asked[cell] = now + period, min(2.0 * period, MAX_QUERY_PERIOD)
                     self.bus.query(f"snap/{cell[0]}/{cell[1]}")
+        self._next_query = min((due for due, _ in self._asked.values()), default=math.inf)
 
     def mark_answered(self, cell: Cell) -> None:
         """The server has replied for a cell."""
