@@ -30,8 +30,10 @@ def run(
     crates: Sequence[str] = (),
     hour: float | None = None,
     renderer: str = "warp",
+    device: str = "cpu",
 ) -> int:
     """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
+    from vinesim.physics.plants.device_buffers import find_device
     from vinesim.scene.camera_geometry import depth_millimetres
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.ids import unlabel
@@ -45,7 +47,8 @@ def run(
     from vinesim.sensors.scene.ray_caster import enclosing_primitive
     from vinesim.sensors.truth import ground_truth
 
-    renderer_selection.check_renderer(renderer)
+    find_device(device)
+    renderer_selection.check_renderer(renderer, device)
     eye, target = parse_point("--at", at), parse_point("--look", look)
     if np.linalg.norm(target - eye) < 1e-6:
         raise UsageError(f"--look {look} is where the camera stands; look at another point")
@@ -57,7 +60,7 @@ def run(
     sun = plan.sun if hour is None else msgspec.structs.replace(plan.sun, hour=hour)
     model = generate(plan)
     view = staged.compose(model)
-    primitives = Primitives(model, renderer=renderer)
+    primitives = Primitives(model, renderer=renderer, device=device)
     primitives.update(view)
     inside = enclosing_primitive(primitives, eye)
     if inside >= 0:
@@ -66,7 +69,7 @@ def run(
     pose = picture.look_at(eye, target)
     seen = ground_truth.render_buffers(primitives, info, pose)
     truths = ground_truth.bunch_truths(primitives, view, seen)
-    frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
+    frame = Camera(spec, info, "camera", sun.direction(), quality="still", device=device).render(primitives, pose)
     assert frame.exact_depth is not None, "a camera that renders by itself gives exact depth"
     images = {
         "rgb": frame.rgb,
