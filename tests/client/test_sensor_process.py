@@ -1,4 +1,4 @@
-"""The sensor process of a robot, as a real process: its pictures go on whatever joins, fails or dies."""
+"""The sensor process of a robot: its pictures continue when actors join and when processes fail."""
 
 from __future__ import annotations
 
