@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import csv
 import dataclasses
 import pathlib
@@ -89,13 +90,39 @@ def run(
     for viewpoint in viewpoints:
         _check_not_enclosed(primitives, viewpoint)
     stage = _Stage(plan, model, staged, view, primitives, RayCaster(primitives), spec, info)
-    for number, viewpoint in enumerate(viewpoints):
-        folder = out if path is None else out / f"{number:04d}"
-        try:
-            print(f"{folder}: {stage.write(viewpoint, folder)}")
-        except OSError as bad:
-            raise UsageError(f"--out {out} cannot be written: {bad.strerror or bad}") from None
+    try:
+        with concurrent.futures.ThreadPoolExecutor(1, "png") as writer:
+            written: list[concurrent.futures.Future[None]] = []
+            for number, viewpoint in enumerate(viewpoints):
+                folder = out if path is None else out / f"{number:04d}"
+                folder.mkdir(parents=True, exist_ok=True)
+                picture, sight = stage.render(viewpoint)
+                written.append(writer.submit(picture.write, folder))  # while the next picture is rendered
+                if number:
+                    written[number - 1].result()
+                print(f"{folder}: {sight}")
+            written[-1].result()
+    except OSError as bad:
+        raise UsageError(f"--out {out} cannot be written: {bad.strerror or bad}") from None
     return 0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Picture:
+    """A picture with its truth, ready to be written."""
+
+    images: dict[str, np.ndarray]
+    records: dict[str, Any]
+
+    def write(self, folder: pathlib.Path) -> None:
+        """Write PNG and JSON files; OSError if that fails."""
+        from vinesim.sensors.export import annotations as formats
+        from vinesim.sensors.export import images as picture
+
+        for name, image in self.images.items():
+            picture.write_png(folder / f"{name}.png", image)
+        for name, record in self.records.items():
+            formats.write_json(folder / f"{name}.json", record)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -111,8 +138,8 @@ class _Stage:
     spec: CameraSpec
     info: CameraInfo
 
-    def write(self, viewpoint: Viewpoint, folder: pathlib.Path) -> str:
-        """Write the picture from a viewpoint and its truth; returns what is in sight, in words."""
+    def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
+        """The picture from a viewpoint, and in words what is in sight."""
         from vinesim.scene.camera_geometry import depth_millimetres
         from vinesim.sensors.camera.camera import Camera
         from vinesim.sensors.export import annotations as formats
@@ -137,13 +164,12 @@ class _Stage:
         described: dict[str, Any] = {
             "scene": self.plan.name, "seed": self.plan.seed, "digest": self.model.digest(), "actors": actors,
         }  # fmt: skip
-        folder.mkdir(parents=True, exist_ok=True)
-        for name, image in images.items():
-            picture.write_png(folder / f"{name}.png", image)
-        formats.write_json(folder / "camera.json", formats.camera_record(self.spec.model, self.info, pose))
-        formats.write_json(folder / "truth.json", {**described, "bunches": formats.bunch_records(truths, self.info)})
+        records = {
+            "camera": formats.camera_record(self.spec.model, self.info, pose),
+            "truth": {**described, "bunches": formats.bunch_records(truths, self.info)},
+        }
         in_sight = [one for one in truths if one.pixels]
-        return (
+        return _Picture(images, records), (
             f"{len(in_sight)} bunches, {sum(t.berries_seen for t in in_sight)} of "
             f"{sum(t.berries for t in in_sight)} berries and {sum(t.cut_seen for t in in_sight)} cut points in sight"
         )

@@ -13,6 +13,7 @@ from vinesim.cli.demo.placement import APPROACH_DISTANCE, choose_poses
 from vinesim.cli.demo.processes import REPORT_TIMEOUT, START_TIMEOUT, process_group
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import push_summary, push_table, write_summary
+from vinesim.kernels.compilation import compile_kernels
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
@@ -29,6 +30,7 @@ def run_push(*, seconds: float, seed: int | None, scene: str, robot: str, headle
     """Run the demo for ``seconds`` of simulated time after all sensors publish, and write ``out``; the exit code."""
     console = Console(stderr=True)
     plan = with_seed(load_scene(scene), seed)
+    compile_kernels()
     description = load_description(robot)  # refused once, and before any process starts
     bunch, poses = choose_poses(plan, generate(plan))
     for folder in (out, out / PICKER, out / VISITOR):
