@@ -16,3 +16,10 @@ def test_a_bench_that_needs_a_checkout_says_so(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.delitem(sys.modules, "vinesim.bench.message_fuzz", raising=False)
     with pytest.raises(NoSuchBench, match="in a checkout"):
         run(["fuzz"], as_json=True)
+
+
+def test_rows_are_of_the_bench_live_and_have_names() -> None:
+    with pytest.raises(NoSuchBench, match="no row 'picture'; there are: demo"):
+        run(["live"], as_json=True, rows=["picture"])
+    with pytest.raises(NoSuchBench, match="leave it out"):
+        run(["plants"], as_json=True, rows=["demo"])

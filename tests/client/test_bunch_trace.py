@@ -13,19 +13,19 @@ def rows(clock, x, force, is_remote=True):
     )
 
 
-def test_motion_in_the_tick_of_the_touch_counts_zero():
+def test_motion_in_the_tick_of_contact_counts_as_zero_ticks():
     t = np.arange(5) * 0.01
     assert touch_to_motion(rows(t, [0, 0, 1e-4, 2e-4, 3e-4], [0, 0, 1, 1, 1])) == 0
     assert touch_to_motion(rows(t, [0, 0, 0, 0, 3e-4], [0, 0, 1, 1, 1])) == 2
 
 
-def test_untouched_or_unmoved_is_said():
+def test_without_contact_or_motion_there_is_no_result():
     t = np.arange(4) * 0.01
     assert touch_to_motion(rows(t, [0, 0, 0, 0], [0, 0, 0, 0])) is None
     assert touch_to_motion(rows(t, [0, 0, 0, 0], [0, 1, 1, 0])) is None
 
 
-def test_swinging_before_the_touch_is_not_motion_by_touch():
+def test_motion_before_contact_does_not_count():
     t = np.arange(4) * 0.01
     assert touch_to_motion(rows(t, [0.1, 0.1, 0.1, 0.2], [0, 0, 1, 1])) == 1
 
@@ -44,7 +44,7 @@ def test_remote_error_needs_common_time():
     assert remote_error(rows(t, 0.1 * t, t), rows(t + 10, t, t)) is None
 
 
-def test_rows_survive_a_file(tmp_path):
+def test_rows_are_saved_and_loaded(tmp_path):
     before = rows([0.0, 0.1], [0.0, 0.5], [0.0, 2.0])
     before.save(tmp_path / "trace.npz")
     after = Rows.load(tmp_path / "trace.npz")
@@ -56,6 +56,6 @@ def test_remote_error_is_judged_only_while_the_copy_follows_the_owner():
     t = np.arange(0, 4, 0.01)
     owner = rows(t, 0.1 * t, np.ones_like(t))
     assert remote_error(owner, rows(t, 0 * t, 0 * t, is_remote=False)) is None
-    half = rows(t, np.where(t < 2, 0.0, 0.1 * t), 0 * t)
-    half.is_remote[t < 2] = False
-    assert remote_error(owner, half)["max"] < 0.01
+    partly_following = rows(t, np.where(t < 2, 0.0, 0.1 * t), 0 * t)
+    partly_following.is_remote[t < 2] = False
+    assert remote_error(owner, partly_following)["max"] < 0.01

@@ -1,4 +1,4 @@
-"""Random scenes of a data set: actors, free places, and that all follows from the random numbers."""
+"""Random scenes of a data set: actors, free places, and determinism by the seed."""
 
 from __future__ import annotations
 
@@ -10,53 +10,55 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
 
 
-def test_everybody_has_room() -> None:
-    """Discs of all that comes overlap neither trunks nor poles nor each other."""
+def test_placed_objects_do_not_overlap() -> None:
+    """Footprints of added objects overlap neither trunks nor poles nor each other."""
     model = sensor_scenes.demo()
     wood = np.isin(model.fixed_organ, [Organ.POLE, Organ.TRUNK])
     for seed in range(60):
-        stage = random_composition(model, np.array([2.5, 1.2]), np.random.default_rng(seed))
-        discs = [((one.x, one.y), FOOTPRINT_RADIUS[one.robot]) for one in stage.robots]
-        discs += [((one.x, one.y), FOOTPRINT_RADIUS["person"]) for one in stage.people]
-        discs += [((one.x, one.y), FOOTPRINT_RADIUS["crate"]) for one in stage.crates]
-        for k, (spot, reach) in enumerate(discs):
-            assert np.hypot(*(model.fixed_start[wood, :2] - spot).T).min() > reach
-            assert all(np.hypot(*np.subtract(spot, other)) > reach + far for other, far in discs[:k])
+        composition = random_composition(model, np.array([2.5, 1.2]), np.random.default_rng(seed))
+        discs = [((one.x, one.y), FOOTPRINT_RADIUS[one.robot]) for one in composition.robots]
+        discs += [((one.x, one.y), FOOTPRINT_RADIUS["person"]) for one in composition.people]
+        discs += [((one.x, one.y), FOOTPRINT_RADIUS["crate"]) for one in composition.crates]
+        for k, (xy, radius) in enumerate(discs):
+            assert np.hypot(*(model.fixed_start[wood, :2] - xy).T).min() > radius
+            assert all(
+                np.hypot(*np.subtract(xy, other_xy)) > radius + other_radius for other_xy, other_radius in discs[:k]
+            )
 
 
-def test_the_same_numbers_give_the_same_life_and_others_another() -> None:
-    model, seen = sensor_scenes.demo(), []
+def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
+    model, results = sensor_scenes.demo(), []
     for seed in (1, 1, 2):
-        happens = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
-        assert happens is not None
-        view, near, record = happens
-        seen.append((view.visual_q.tobytes(), view.body_q.tobytes(), near.tobytes(), str(record)))
-    assert seen[0] == seen[1] != seen[2]
+        randomised = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
+        assert randomised is not None
+        snapshot, nearby, record = randomised
+        results.append((snapshot.visual_q.tobytes(), snapshot.body_q.tobytes(), nearby.tobytes(), str(record)))
+    assert results[0] == results[1] != results[2]
 
 
-def test_wind_sways_the_plants() -> None:
-    """Some leaves have moved by centimetres when wind blows, and nothing has when it does not."""
+def test_wind_moves_the_plants() -> None:
+    """Some leaves move by centimetres in wind, and none without."""
     model = sensor_scenes.demo()
     rest, moved = State.at_rest(model).body_q[:, :3], {True: [], False: []}
     for seed in range(8):
-        happens = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
-        assert happens is not None
-        view, _, record = happens
+        randomised = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
+        assert randomised is not None
+        snapshot, _, record = randomised
         hanging = np.ones(len(rest), bool)
         hanging[model.bunch_of_body() >= 0] = False
-        moved["wind" in record].append(np.linalg.norm(view.body_q[:, :3] - rest, axis=1)[hanging].max())
+        moved["wind" in record].append(np.linalg.norm(snapshot.body_q[:, :3] - rest, axis=1)[hanging].max())
     assert max(moved[False]) < 0.02
     assert max(moved[True]) > 0.02
 
 
-def test_nothing_happens_in_the_other_images() -> None:
+def test_other_images_are_not_randomised() -> None:
     assert SceneRandomizer(0.0).snapshot(sensor_scenes.demo(), np.random.default_rng(1)) is None
-    lively = [SceneRandomizer(0.3).snapshot(sensor_scenes.empty(), _Fixed(share)) is None for share in (0.31, 0.9)]
-    assert lively == [True, True]
+    snapshots = [SceneRandomizer(0.3).snapshot(sensor_scenes.empty(), _Fixed(value)) is None for value in (0.31, 0.9)]
+    assert snapshots == [True, True]
 
 
 class _Fixed(np.random.Generator):
-    """Says one number for ever."""
+    """A generator that always returns one number."""
 
     def __init__(self, value: float) -> None:
         super().__init__(np.random.PCG64(0))

@@ -1,4 +1,4 @@
-"""People of one client among the robots and people of others: seen as they are, felt as they push."""
+"""Humans among robots and humans of other clients: displayed poses, and forces between clients."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from vinesim.sensors.scene.primitives import Primitives
 
 DT = 0.01
 FOREARM = np.array([0.2, 0.36, 0.885])
-"""A point of the vinebot's left forearm, when it stands at the origin with its arms at home."""
+"""A point of vinebot's left forearm, at the origin with its arms at home."""
 SIDE = frames.pose(np.array([0.2, 1.2, 0.0]), frames.from_yaw(-0.5 * np.pi))
-"""Beside that arm, facing it."""
+"""A pose beside that arm, facing it."""
 
 
 @pytest.fixture(scope="module")
@@ -69,16 +69,16 @@ class World:
 
 
 def parts_of(client: Client, name: str) -> np.ndarray:
-    """[part, 7] as sensors see them."""
+    """Poses [part, 7] of the visuals of a human's body parts."""
     links = [link.name for link in client.physics.rigid.visuals()]
     return client.physics.rigid.visual_q()[[links.index(f"{name}/{part}") for part in BODY_PARTS]]
 
 
-# ---------------------------------------------------------------------- seen
+# ---------------------------------------------------------------------- poses of remote humans
 
 
-def test_people_and_robots_meet_and_part(vinebot):
-    """F90, F52: two people and a robot, each on a client of its own; all see all, with height and limbs."""
+def test_humans_and_robots_join_and_leave(vinebot):
+    """F90, F52: two humans and a robot of three clients; each client has all of them, with height and limbs."""
     world = World()
     anna = world.join("anna", vinebot, frames.pose(np.zeros(3)))
     eva = world.join("eva", None, frames.pose(np.array([3.0, 0.0, 0.0])), height=1.6)
@@ -100,42 +100,42 @@ def test_people_and_robots_meet_and_part(vinebot):
     assert anna.physics.rigid.humans == ("eva",)
 
 
-def test_who_stands_still_is_the_same_everywhere_to_the_bit():
-    """F89: what copies hold is what crossed the network, and nothing makes it up anew."""
+def test_a_standing_human_is_equal_on_all_clients():
+    """F89: a remote human has exactly the received pose."""
     world = World()
     pose = poses.quantise_pose(standing_pose(SIDE, 1.8))
     world.join("eva", None, SIDE, lambda _: pose, height=1.8)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(4.0)
-    seen, here = parts_of(ida, "eva"), parts_of(world.clients[0], "eva")
-    np.testing.assert_allclose(seen, here, atol=1e-12)
+    remote_parts, here = parts_of(ida, "eva"), parts_of(world.clients[0], "eva")
+    np.testing.assert_allclose(remote_parts, here, atol=1e-12)
     turned = ida.physics.rigid.human("eva").hand("left")
     np.testing.assert_allclose(ida.physics.hand("eva", turned.side).pose, pose.left, atol=1e-9)
 
 
-def test_a_walker_is_seen_walking():
-    """F89: hips, feet and hands at 1.1 m/s, over a network of 50 ms: the trunk is 2 cm wrong at most; a foot that lands
-    is wrong for the 50 ms in which it was believed to go on."""
+def test_a_walking_human_is_followed():
+    """F89: hips, feet and hands at 1.1 m/s with 50 ms delay: the error of the trunk is at most 2 cm; a foot that lands
+    is extrapolated for 50 ms."""
     world = World(delay=0.05)
     walker = ScriptedHuman(frames.pose(np.zeros(3)))
     eva = world.join("eva", None, walker.root, walker)
     ida = world.join("ida", None, frames.pose(np.array([2.0, 3.0, 0.0])))
     world.run(1.0)
     walker.do(walker.walk((4.0, 0.0)))
-    wrong = []
+    errors = []
     for _ in range(300):
         world.run(DT)
-        wrong.append(np.linalg.norm(parts_of(ida, "eva")[:, :3] - parts_of(eva, "eva")[:, :3], axis=1))
-    wrong = np.array(wrong)
+        errors.append(np.linalg.norm(parts_of(ida, "eva")[:, :3] - parts_of(eva, "eva")[:, :3], axis=1))
+    errors = np.array(errors)
     assert walker.pose.head[0] > 3.0
     trunk = [BODY_PARTS.index(part) for part in ("head", "chest", "hips")]
-    assert wrong[50:, trunk].max() < 0.02
-    assert np.median(wrong[50:]) < 0.01
-    assert wrong[50:].max() < 0.2
+    assert errors[50:, trunk].max() < 0.02
+    assert np.median(errors[50:]) < 0.01
+    assert errors[50:].max() < 0.2
 
 
-def test_legs_that_each_client_makes_up_differ():
-    """F89: from head and hands alone another client, who came a little later, makes up other legs; told, they agree."""
+def test_legs_estimated_by_each_client_differ():
+    """F89: legs estimated by another client from head and hands differ; received ones agree."""
     world = World()
     walker = ScriptedHuman(frames.pose(np.zeros(3)))
     eva = world.join("eva", None, walker.root, walker)
@@ -143,33 +143,33 @@ def test_legs_that_each_client_makes_up_differ():
     world.run(0.5)
     walker.do(walker.walk((2.0, 0.0)))
     world.run(0.4)
-    seen = ida.physics.rigid.human("eva").part_poses
-    guess = LegEstimator(standing_pose(frames.pose(np.array([seen[0, 0] - 0.09, seen[0, 1], 0.0]))))
+    remote_parts = ida.physics.rigid.human("eva").part_poses
+    estimator = LegEstimator(standing_pose(frames.pose(np.array([remote_parts[0, 0] - 0.09, remote_parts[0, 1], 0.0]))))
     feet = [BODY_PARTS.index("left_foot"), BODY_PARTS.index("right_foot")]
-    guessed = []
+    differences = []
     for _ in range(250):
         world.run(DT)
         head = ida.physics.rigid.human("eva").part_poses[BODY_PARTS.index("head")]
-        guessed.append(guess.update(head)[1:, :3] - parts_of(eva, "eva")[feet, :3])
-    apart = np.linalg.norm(guessed, axis=-1)
-    assert apart.max() > 0.2, "in mid-stride"
-    assert apart[-1].max() > 0.05, "and they stop in other places"
-    told = parts_of(ida, "eva")[feet, :3] - parts_of(eva, "eva")[feet, :3]
-    assert np.linalg.norm(told, axis=-1).max() < 5e-4
+        differences.append(estimator.update(head)[1:, :3] - parts_of(eva, "eva")[feet, :3])
+    distances = np.linalg.norm(differences, axis=-1)
+    assert distances.max() > 0.2, "in mid-stride"
+    assert distances[-1].max() > 0.05, "they stop in other places"
+    received_error = parts_of(ida, "eva")[feet, :3] - parts_of(eva, "eva")[feet, :3]
+    assert np.linalg.norm(received_error, axis=-1).max() < 5e-4
 
 
-def test_fingers_are_seen():
-    """F47, as far as the network goes."""
+def test_fingers_are_replicated():
+    """F47, over the network."""
     world = World()
     pose = dataclasses.replace(standing_pose(SIDE), right_fingers=(0.2, 0.0, 1.0, 1.0, 1.0))
     world.join("eva", None, SIDE, lambda _: pose)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(0.5)
-    heard = ida.replicator.receive(world.now).people["eva"].pose
-    assert heard.right_fingers == pytest.approx((0.2, 0.0, 1.0, 1.0, 1.0), abs=1 / 255)
+    received = ida.replicator.receive(world.now).people["eva"].pose
+    assert received.right_fingers == pytest.approx((0.2, 0.0, 1.0, 1.0, 1.0), abs=1 / 255)
 
 
-def test_who_is_set_down_elsewhere_is_there_at_once():
+def test_a_teleported_human_is_placed_at_once():
     world = World()
     here, there = standing_pose(SIDE), standing_pose(frames.pose(np.array([6.0, 1.2, 0.0])))
     place = [here]
@@ -180,55 +180,55 @@ def test_who_is_set_down_elsewhere_is_there_at_once():
     for _ in range(12):
         world.run(DT)
         x = parts_of(ida, "eva")[BODY_PARTS.index("hips"), 0]
-        assert abs(x - here.hips[0]) < 1e-3 or abs(x - there.hips[0]) < 1e-3, "never in between"
+        assert abs(x - here.hips[0]) < 1e-3 or abs(x - there.hips[0]) < 1e-3, "an intermediate position"
     assert x == pytest.approx(there.hips[0], abs=1e-3)
 
 
-def test_lidar_and_camera_see_people_and_robots_of_other_clients(vinebot):
-    """F59, F62: points with the label of each lie where it is on its own client."""
+def test_lidar_and_camera_render_humans_and_robots_of_other_clients(vinebot):
+    """F59, F62: points with the label of an actor are where it is on its own client."""
     world = World()
     anna = world.join("anna", vinebot, frames.pose(np.zeros(3)))
     eva = world.join("eva", None, frames.pose(np.array([3.0, 0.5, 0.0]), frames.from_yaw(2.0)))
     bert = world.join("bert", vinebot, frames.pose(np.array([3.5, -1.5, 0.0]), frames.from_yaw(1.0)))
     world.run(0.8)
-    view = anna.physics.snapshot()
+    snapshot = anna.physics.snapshot()
     primitives = Primitives(world.model, grass=0.0)
-    primitives.update(view)
+    primitives.update(snapshot)
     eye = np.array([0.0, 0.0, 1.3])
     scan = Lidar(LidarSpec.load("vlp16")).scan(primitives, frames.pose(eye))
-    gaze = look_at(eye, np.array([3.0, -0.4, 1.0]))
-    frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.4, 0.5, 0.77)).render(primitives, gaze)
+    camera_pose = look_at(eye, np.array([3.0, -0.4, 1.0]))
+    frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.4, 0.5, 0.77)).render(primitives, camera_pose)
     d435 = CameraSpec.load("d435")
-    clear = look_at(np.array([1.0, 0.0, 1.3]), np.array([3.0, -0.4, 1.0]))  # both its imagers, of her own robot
+    clear = look_at(np.array([1.0, 0.0, 1.3]), np.array([3.0, -0.4, 1.0]))  # both imagers clear of the own robot
     measured = Camera(d435, d435.info("optical", 0.5)).render(primitives, clear)
-    seen, rows, columns = frame.labels, *np.indices(frame.labels.shape)
+    remote_parts, rows, columns = frame.labels, *np.indices(frame.labels.shape)
     for organ, name, at in (
         (Organ.HUMAN, "eva", eva.physics.rigid.actor_position("eva")),
         (Organ.ROBOT, "bert", bert.physics.rigid.actor_position("bert")),
     ):
-        mine = label(organ, label_index(name))
-        points = eye + scan.xyz[scan.labels == mine].astype(float)
+        actor_label = label(organ, label_index(name))
+        points = eye + scan.xyz[scan.labels == actor_label].astype(float)
         assert len(points) > 30, name
         assert np.linalg.norm(points[:, :2] - at[:2], axis=1).max() < 0.8
-        here = seen == mine
+        here = remote_parts == actor_label
         assert here.sum() > 30, name
         info, depth = frame.info, frame.depth[here].astype(float)
         rays = np.stack([(columns[here] - info.cx) / info.fx, (rows[here] - info.cy) / info.fy, np.ones(len(depth))], 1)
-        found = gaze[:3] + frames.rotate(gaze[3:], rays * depth[:, None])
+        found = camera_pose[:3] + frames.rotate(camera_pose[3:], rays * depth[:, None])
         assert np.linalg.norm(found[:, :2] - at[:2], axis=1).max() < 0.8
         assert found[:, 2].min() > -0.01
         assert found[:, 2].max() < 2.2
-        mine = measured.labels == mine
-        off = np.abs(measured.depth[mine] - measured.exact_depth[mine])
-        assert np.isfinite(off).mean() > 0.6, name
-        assert np.nanmedian(off) < 0.1, "three metres away, a D435 errs by 36 mm"
+        actor_label = measured.labels == actor_label
+        depth_error = np.abs(measured.depth[actor_label] - measured.exact_depth[actor_label])
+        assert np.isfinite(depth_error).mean() > 0.6, name
+        assert np.nanmedian(depth_error) < 0.1, "at 3 m the error of a D435 is 36 mm"
 
 
-# ---------------------------------------------------------------------- felt
+# ---------------------------------------------------------------------- forces
 
 
-class Shove:
-    """A person beside a robot's arm who puts the right hand where a test says."""
+class PushingHuman:
+    """A human beside a robot's arm whose right hand is controlled by the test."""
 
     def __init__(self, vinebot: RobotDescription, delay: float) -> None:
         self.world = World(delay)
@@ -246,40 +246,40 @@ class Shove:
         return dataclasses.replace(self.stand, right=right, right_closed=self.closed)
 
     def move(self, y: float, seconds: float) -> np.ndarray:
-        """Move the hand in y; [tick, 2] force [N] along y that the person's and the robot's client knew of."""
+        """Move the hand in y; force along y on the human's and on the robot's client [tick, 2] N."""
         rows = []
         for end in np.linspace(self.at[1], y, round(seconds / DT) + 1)[1:]:
             self.at[1] = end
             self.world.run(DT)
-            rows.append((self.given()[1], self.felt()[1]))
+            rows.append((self.applied_force()[1], self.received_force()[1]))
         return np.array(rows)
 
-    def given(self) -> np.ndarray:
+    def applied_force(self) -> np.ndarray:
         return self.human.physics.hand("eva", "right").force
 
-    def felt(self) -> np.ndarray:
-        borne = self.robot.physics.rigid.robot("anna").remote_wrenches.values()
-        return sum((wrench[:3] for wrench in borne), np.zeros(3))
+    def received_force(self) -> np.ndarray:
+        wrenches = self.robot.physics.rigid.robot("anna").remote_wrenches.values()
+        return sum((wrench[:3] for wrench in wrenches), np.zeros(3))
 
-    def forces_said(self) -> int:
+    def force_bytes(self) -> int:
         return self.human.replicator.counters.force.bytes_out
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.02, 0.05, 0.1])
-def test_a_push_on_the_copy_is_felt_by_the_robot(vinebot, delay):
-    """F05, F92, F93: the touch is computed by the person's client, at once; the robot's client applies its force, a
-    latency later, and the joints' efforts tell. At rest both know of the same force, whatever the latency."""
-    shove = Shove(vinebot, delay)
-    assert shove.forces_said() == 0
-    pushing = shove.move(0.25, 1.5)
+def test_a_push_on_the_copy_acts_on_the_robot(vinebot, delay):
+    """F05, F92, F93: the human's client computes the contact at once; the robot's client applies its force a latency
+    later, and joint efforts balance it. At rest both have the same force at any latency."""
+    setup = PushingHuman(vinebot, delay)
+    assert setup.force_bytes() == 0
+    pushing = setup.move(0.25, 1.5)
     first = [int(np.flatnonzero(np.abs(pushing[:, side]) > 0.5)[0]) for side in (0, 1)]
     assert 0 <= first[1] - first[0] <= round(delay / DT) + 3
-    still = shove.move(0.25, 1.5)[-20:]
-    assert still[:, 0].mean() < -20.0
-    np.testing.assert_allclose(still[:, 1].mean(), still[:, 0].mean(), rtol=0.01)
+    at_rest = setup.move(0.25, 1.5)[-20:]
+    assert at_rest[:, 0].mean() < -20.0
+    np.testing.assert_allclose(at_rest[:, 1].mean(), at_rest[:, 0].mean(), rtol=0.01)
 
-    # the efforts of the real robot hold against the wrench; nothing of it is counted twice
-    rigid = shove.robot.physics.rigid
+    # the efforts of the controlled robot balance the wrench, which is counted once
+    rigid = setup.robot.physics.rigid
     _, _, effort, contact = rigid.joint_measurements("anna")
     expected = np.zeros(len(contact))
     for link, wrench in rigid.robot("anna").remote_wrenches.items():
@@ -287,80 +287,82 @@ def test_a_push_on_the_copy_is_felt_by_the_robot(vinebot, delay):
         expected += rigid.jacobian("anna", link, at).T @ wrench
     np.testing.assert_allclose(contact, expected, atol=1e-3)
     assert np.abs(expected).max() > 3.0
-    change = (effort - shove.rest)[shove.arm]
-    np.testing.assert_allclose(change, -expected[shove.arm], atol=0.1 * np.abs(expected).max())
+    change = (effort - setup.rest)[setup.arm]
+    np.testing.assert_allclose(change, -expected[setup.arm], atol=0.1 * np.abs(expected).max())
 
-    # the hand goes: the force ends, and so do the messages
-    shove.move(0.75, 0.5)
-    shove.world.run(0.3 + delay)
-    assert (shove.felt() == 0.0).all()
-    said = shove.forces_said()
-    shove.world.run(0.5)
-    assert shove.forces_said() == said
-    np.testing.assert_allclose(rigid.joint_measurements("anna")[2], shove.rest, atol=0.1)
+    # the hand leaves: the force ends, and so do the messages
+    setup.move(0.75, 0.5)
+    setup.world.run(0.3 + delay)
+    assert (setup.received_force() == 0.0).all()
+    bytes_before = setup.force_bytes()
+    setup.world.run(0.5)
+    assert setup.force_bytes() == bytes_before
+    np.testing.assert_allclose(rigid.joint_measurements("anna")[2], setup.rest, atol=0.1)
 
 
-def test_a_hand_that_pulls_at_an_arm_is_seen_there_and_felt(vinebot):
-    """F14 between clients: grabbed on one client, pulled on the other."""
-    shove = Shove(vinebot, 0.02)
-    shove.move(0.55, 0.5)
-    shove.closed = True
-    shove.move(0.55, 0.2)
-    assert shove.human.physics.hand("eva", "right").held[0] == "anna"
-    shove.move(0.85, 1.0)
-    rows = shove.move(0.85, 1.0)[-20:]
-    assert rows[:, 0].mean() > 20.0, "towards the person"
+def test_a_hand_that_pulls_an_arm_acts_on_the_robot(vinebot):
+    """F14 between clients: grasped on one client, pulled on the other."""
+    setup = PushingHuman(vinebot, 0.02)
+    setup.move(0.55, 0.5)
+    setup.closed = True
+    setup.move(0.55, 0.2)
+    assert setup.human.physics.hand("eva", "right").held[0] == "anna"
+    setup.move(0.85, 1.0)
+    rows = setup.move(0.85, 1.0)[-20:]
+    assert rows[:, 0].mean() > 20.0, "towards the human"
     np.testing.assert_allclose(rows[:, 1].mean(), rows[:, 0].mean(), rtol=0.01)
-    palm = shove.human.physics.hand("eva", "right").pose
-    np.testing.assert_allclose(shove.robot.physics.hand("eva", "right").pose[:3], palm[:3], atol=2e-3)
-    assert np.linalg.norm(palm[:3] - shove.at) > 0.15, "not where the controller is"
-    shove.closed = False
-    shove.world.run(0.5)
-    assert (shove.felt() == 0.0).all()
+    palm = setup.human.physics.hand("eva", "right").pose
+    np.testing.assert_allclose(setup.robot.physics.hand("eva", "right").pose[:3], palm[:3], atol=2e-3)
+    assert np.linalg.norm(palm[:3] - setup.at) > 0.15, "the hand is at its controller"
+    setup.closed = False
+    setup.world.run(0.5)
+    assert (setup.received_force() == 0.0).all()
 
 
-def test_who_pushes_and_crashes_pushes_no_more(vinebot):
-    shove = Shove(vinebot, 0.02)
-    shove.move(0.25, 1.0)
-    assert shove.felt()[1] < -10.0
-    shove.world.clients.remove(shove.human)
-    shove.world.run(0.16)
-    assert (shove.felt() == 0.0).all()
+def test_a_crashed_client_stops_pushing(vinebot):
+    setup = PushingHuman(vinebot, 0.02)
+    setup.move(0.25, 1.0)
+    assert setup.received_force()[1] < -10.0
+    setup.world.clients.remove(setup.human)
+    setup.world.run(0.16)
+    assert (setup.received_force() == 0.0).all()
 
 
-def test_an_arm_that_comes_to_a_hand_feels_it(vinebot):
-    """F22 between clients: the person's client finds its copy of the arm pressing on the hand, and says so."""
-    shove = Shove(vinebot, 0.02)
-    shove.at[:] = 0.15, 0.62, 0.92
-    shove.world.run(0.8)
-    robot = shove.robot.robot
+def test_an_arm_that_moves_into_a_hand_gets_its_force(vinebot):
+    """F22 between clients: the human's client computes the contact of its copy of the arm with the hand."""
+    setup = PushingHuman(vinebot, 0.02)
+    setup.at[:] = 0.15, 0.62, 0.92
+    setup.world.run(0.8)
+    robot = setup.robot.robot
     joint = robot.joint_indices(["arm_left_2_joint"])
     home = float(robot.description.home[joint][0])
     for swing in np.linspace(0.0, 0.8, 150):
         robot.command_position([home + swing], joint)
-        shove.world.run(DT)
-    shove.world.run(1.0)
-    efforts = shove.robot.physics.rigid.joint_measurements("anna")[3][shove.arm]
-    assert shove.felt()[1] < -3.0, "the hand pushes back"
-    np.testing.assert_allclose(shove.felt(), shove.given(), atol=0.05 * np.abs(shove.given()).max())
+        setup.world.run(DT)
+    setup.world.run(1.0)
+    efforts = setup.robot.physics.rigid.joint_measurements("anna")[3][setup.arm]
+    assert setup.received_force()[1] < -3.0, "no reaction of the hand"
+    np.testing.assert_allclose(
+        setup.received_force(), setup.applied_force(), atol=0.05 * np.abs(setup.applied_force()).max()
+    )
     assert np.abs(efforts).max() > 1.0
 
 
-# ---------------------------------------------------------------------- plants and what grows on them
+# ---------------------------------------------------------------------- plants
 
 
-def test_a_bunch_that_a_person_pulls_at_is_seen_to_move_by_a_robot(vinebot):
-    """F74 with a human: held by the hand on one client, it moves on the other, whose copy of the hand holds nothing."""
+def test_a_bunch_pulled_by_a_human_moves_on_the_robots_client(vinebot):
+    """F74 with a human: held on one client, it moves on the other, whose copy of the hand holds nothing."""
     world = World()
     world.scene = load_scene("demo")
     world.model = generate(world.scene)
-    stand = start_pose(world.scene, 0)
-    bunch = find_reachable_bunch(world.model, stand)
+    standing = start_pose(world.scene, 0)
+    bunch = find_reachable_bunch(world.model, standing)
     body = int(world.model.bunch_body[bunch])
     centre = bunch_centres(world.model)[bunch]
-    walker = ScriptedHuman(frames.pose(np.array([*standing_place(centre, stand), 0.0]), stand[3:]))
+    walker = ScriptedHuman(frames.pose(np.array([*standing_place(centre, standing), 0.0]), standing[3:]))
     eva = world.join("eva", None, walker.root, walker)
-    aside = frames.compose(stand, frames.pose(np.array([-1.5, 1.0, 0.0])))
+    aside = frames.compose(standing, frames.pose(np.array([-1.5, 1.0, 0.0])))
     anna = world.join("anna", vinebot, aside)
     world.run(0.6)
     middle = np.array([0.5 * float(world.model.bunch_length[bunch]), 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""What a picker is told to do fits the vineyard: a bunch that hangs free, room for the base, a way without posts."""
+"""Planned picks are feasible: a reachable bunch, space for the base, a path clear of posts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def harvest(seed: int, **changes) -> Scene:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
+def test_planned_tasks_are_geometrically_feasible(seed: int):
     plan = harvest(seed)
     model = generate(plan)
     start = start_poses.spawn_pose(plan, 0)[:2]
@@ -31,7 +31,7 @@ def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
             pick_planning.BUNCH_ASIDE if task.side == "left" else -pick_planning.BUNCH_ASIDE, abs=0.02
         )
         assert model.bunch_radius[task.bunch] <= pick_planning.MAX_BUNCH_RADIUS
-        # the way keeps away from what stands, and ends with the box beside the base, on the arm's side
+        # the path keeps clear of static objects and ends with the box beside the base, on the arm's side
         points = np.concatenate([task.base_pose[None, :2], task.path])
         for a, b in itertools.pairwise(points[:-1]):
             line = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
@@ -45,7 +45,7 @@ def test_tasks_are_feasible_as_far_as_geometry_tells(seed: int):
         assert (box[1] > 0.0) == (task.side == "left")
 
 
-def test_a_way_goes_round_what_stands_and_is_short():
+def test_a_path_avoids_static_objects_and_is_short():
     model = generate(harvest(7, boxes=()))
     start, goal = np.array([5.0, 1.4]), np.array([5.0, -1.4])  # a vine stands between
     points = path_planning.find_path(model, start, goal, pick_planning.BASE_CLEARANCE)
@@ -56,22 +56,22 @@ def test_a_way_goes_round_what_stands_and_is_short():
         assert start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - path_planning.GRID_SIZE
 
 
-def test_no_way_through_a_vine():
+def test_there_is_no_path_through_a_vine():
     model = generate(harvest(7))
     assert (
         path_planning.find_path(model, np.array([5.0, 1.4]), np.array([5.0, 0.1]), pick_planning.BASE_CLEARANCE) is None
     )
 
 
-def test_boxes_without_room_are_told():
+def test_boxes_without_free_space_are_reported():
     model = generate(harvest(7, boxes=()))
     with pytest.raises(start_poses.PlacementError, match=r"no box of this scene has .* room beside it"):
         next(pick_planning.plan_picks(model, np.zeros(2)))
 
 
-def test_a_box_is_an_obstacle_as_large_as_it_is():
+def test_a_box_is_an_obstacle_of_its_size():
     model = generate(harvest(7, boxes=(Box(x=3.75, y=1.2, yaw=0.5),)))
     corner = np.array([3.75, 1.2]) + frames.rotate(frames.from_yaw(0.5), np.array([0.3, 0.2, 0.0]))[:2]
-    away = frames.rotate(frames.from_yaw(0.5), np.array([0.3, 0.4, 0.0]))[:2]
-    assert start_poses.ground_clearance(model, (corner + away)[None])[0] == pytest.approx(0.5, abs=1e-6)
+    offset = frames.rotate(frames.from_yaw(0.5), np.array([0.3, 0.4, 0.0]))[:2]
+    assert start_poses.ground_clearance(model, (corner + offset)[None])[0] == pytest.approx(0.5, abs=1e-6)
     assert start_poses.ground_clearance(model, corner[None], without=0)[0] > 1.0

@@ -8,7 +8,7 @@ from vinesim.client.rate_loop import RateLoop
 
 
 class FakeTime:
-    """A clock that moves only when somebody sleeps or works."""
+    """A clock that advances only by sleep and work."""
 
     def __init__(self):
         self.now = 100.0
@@ -37,7 +37,7 @@ def run(loop, clock, works):
     return np.array(starts) - starts[0]
 
 
-def test_a_late_tick_does_not_shift_the_beat(clock):
+def test_a_late_tick_does_not_shift_later_deadlines(clock):
     loop = RateLoop(0.01)
     starts = run(loop, clock, [0.001, 0.025, 0.001, 0.001, 0.001, 0.001])
     assert starts == pytest.approx([0.0, 0.01, 0.035, 0.036, 0.04, 0.05])
@@ -56,27 +56,49 @@ def test_real_time_factor_is_simulated_over_wall_time(clock):
     assert slow.overruns == 20
 
 
-def test_a_long_stall_is_dropped_and_counted(clock):
+def test_deadlines_of_a_long_stall_are_dropped_and_counted(clock):
     loop = RateLoop(0.01)
     starts = run(loop, clock, [0.001, 3.0] + [0.001] * 10)
     assert loop.dropped in (298, 299)
     assert np.diff(starts)[-5:] == pytest.approx([0.01] * 5)
 
 
-def test_percentiles_are_of_the_work(clock):
+def test_percentiles_are_those_of_the_work_time(clock):
     loop = RateLoop(0.01)
     run(loop, clock, [0.001] * 99 + [0.009])
-    median, worst = loop.work_ms(50, 100)
+    median, maximum = loop.work_ms(50, 100)
     assert median == pytest.approx(1.0)
-    assert worst == pytest.approx(9.0)
+    assert maximum == pytest.approx(9.0)
 
 
-def test_steps_come_at_100_hz_by_the_real_clock():
-    """F91: over a second, whatever the machine does beside; deadlines given up after a stall are counted."""
+def test_steps_run_at_100_hz_by_the_real_clock():
+    """F91: over a second, under any load of the machine; deadlines dropped after a stall are counted."""
     loop = RateLoop(0.01)
-    begun = time.perf_counter()
+    start = time.perf_counter()
     for _ in range(101):
         loop.begin()
         loop.end()
-    assert (100 + loop.dropped) / (time.perf_counter() - begun) == pytest.approx(100.0, rel=0.1)
+    assert (100 + loop.dropped) / (time.perf_counter() - start) == pytest.approx(100.0, rel=0.1)
     assert loop.overruns <= 5
+
+
+def test_a_log_gives_the_statistics_of_a_part_of_the_run(clock, tmp_path):
+    loop = RateLoop(0.01)
+    run(loop, clock, [0.002] * 50 + [0.015] + [0.004] * 50)
+    loop.log().save(tmp_path / "ticks.npz")
+    log = module.TickLog.load(tmp_path / "ticks.npz")
+    start = log.begins[0]
+    early, late = log.between(start, start + 0.4), log.between(start + 0.6, np.inf)
+    assert early["tick_p99_ms"] == pytest.approx(2.0, rel=1e-3)
+    assert late["tick_p50_ms"] == pytest.approx(4.0, rel=1e-3)
+    assert late["tick_hz"] == pytest.approx(100.0)
+    assert log.between(start, np.inf)["overruns"] == 1
+    with pytest.raises(ValueError, match="0 steps"):
+        log.between(start - 2.0, start - 1.0)
+
+
+def test_a_log_that_is_full_keeps_the_newest_in_order(clock):
+    loop = RateLoop(0.01, capacity=8)
+    starts = run(loop, clock, [0.001] * 11)
+    log = loop.log()
+    assert log.begins - log.begins[0] == pytest.approx(starts[3:] - starts[3])

@@ -1,4 +1,4 @@
-"""The recorder over a bus in memory: what it writes, what it must not change, and what it asks for when told to."""
+"""The recorder over a bus in memory: recorded messages, unchanged traffic, and observers for a whole area."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ EPOCH = 1.7e9
 
 
 class World:
-    """Two light clients, a server that tells the time and keeps facts, and a recorder if one is wanted."""
+    """Two minimal clients, a server with a clock and one retained record, and optionally a recorder."""
 
-    def __init__(self, path: pathlib.Path | None, apart: float = 2.0, **options) -> None:
+    def __init__(self, path: pathlib.Path | None, distance: float = 2.0, **options) -> None:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
         server.declare_queryable(
-            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + self.hub.time)
+            "clock", lambda payload: messages.encode_time(messages.decode_time(payload)[0], EPOCH + self.hub.time)
         )
-        fact = RetainedRecord(object_id(ObjectKind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
-        server.declare_queryable("snap/0/0", lambda _: messages.encode_records([fact]))
-        self.ada, self.bob = MinimalClient(self.hub.bus("ada"), 0.5), MinimalClient(self.hub.bus("bob"), 0.5 + apart)
+        record = RetainedRecord(object_id(ObjectKind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
+        server.declare_queryable("snap/0/0", lambda _: messages.encode_records([record]))
+        self.ada, self.bob = MinimalClient(self.hub.bus("ada"), 0.5), MinimalClient(self.hub.bus("bob"), 0.5 + distance)
         self.clients = [self.ada, self.bob]
         self.steps = [lambda: None]
         if path is not None:
@@ -53,75 +53,80 @@ class World:
                 step()
 
     def touch(self) -> None:
-        """Ada bends a tree for a second, then lets it rest."""
+        """Ada bends a tree for a second, then it rests."""
         for number in range(100):
             self.ada.bend(0, 0.5 * np.sin(0.1 * number))
             self.run(TICK)
         self.ada.touched = set()
         self.run(0.5)
 
-    def tape(self) -> Recording:
+    def recorded(self) -> Recording:
         self.recording.close()
         return read_recording(self.recording.path)
 
 
-def families(tape: Recording) -> set[str]:
-    return {entry.key.partition("/")[0] for entry in tape.messages}
+def families(recorded: Recording) -> set[str]:
+    return {entry.key.partition("/")[0] for entry in recorded.messages}
 
 
-def test_what_was_said_is_on_the_tape(tmp_path):
+def test_all_messages_are_recorded(tmp_path):
     world = World(tmp_path / "run.mcap")
     world.run(1.0)
     world.touch()
     world.bob.bus.close()
     world.clients.remove(world.bob)
     world.run(0.5)
-    tape = world.tape()
-    assert tape.damage == ""
-    assert families(tape) == {"a", "c", "own", "hello", "live", "snap"}
+    recorded = world.recorded()
+    assert recorded.damage == ""
+    assert families(recorded) == {"a", "c", "own", "hello", "live", "snap"}
     about = {"scene": "rows", "seed": "5", "digest": vineyard().digest(), "world": "memory", "protocol": "1"}
-    assert tape.metadata.items() >= about.items()
-    assert [(e.key, bool(e.payload)) for e in tape.messages if e.key.startswith("live")] == [
+    assert recorded.metadata.items() >= about.items()
+    assert [(e.key, bool(e.payload)) for e in recorded.messages if e.key.startswith("live")] == [
         ("live/ada", True), ("live/bob", True), ("live/bob", False),
     ]  # fmt: skip
-    assert {messages.decode_hello(e.payload).name for e in tape.messages if e.key.startswith("hello")} == {"ada", "bob"}
+    assert {messages.decode_hello(e.payload).name for e in recorded.messages if e.key.startswith("hello")} == {
+        "ada",
+        "bob",
+    }
 
-    # all that bob heard of trees and events is there, in the same order and to the bit
-    heard = [messages.decode_trees(e.payload) for e in tape.messages if e.key == "c/0/0/ada"]
-    assert len(heard) > 90
+    # all tree updates and events that bob received are recorded, in order and bitwise
+    updates = [messages.decode_trees(e.payload) for e in recorded.messages if e.key == "c/0/0/ada"]
+    assert len(updates) > 90
     last = [
-        e for e in tape.messages if e.key == "own/0/0/ada" and messages.kind_of(e.payload) == messages.MessageKind.TREES
+        e
+        for e in recorded.messages
+        if e.key == "own/0/0/ada" and messages.kind_of(e.payload) == messages.MessageKind.TREES
     ][-1]
     rest = messages.decode_trees(last.payload)
     np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.ada.read(0)[0])
     np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.bob.read(0)[0])
 
-    # log time is network time: a journey, and a poll, after what the author wrote
-    for entry in tape.messages:
+    # log time is network time: a delay and a poll after the author's time stamp
+    for entry in recorded.messages:
         if entry.key == "c/0/0/ada":
             assert 0.0 < entry.time - messages.time_of(entry.payload) < 0.03
-    assert tape.start == pytest.approx(EPOCH, abs=0.2)
+    assert recorded.start == pytest.approx(EPOCH, abs=0.2)
 
 
-def test_the_recorder_changes_not_one_byte(tmp_path):
-    """The same second of touching, near and far from the other one, with and without a recorder."""
+def test_a_recorder_does_not_change_traffic(tmp_path):
+    """The same contact, near and far from the other client, with and without a recorder."""
     sent = {}
-    for apart in (2.0, 40.0):
-        for path in (None, tmp_path / f"{apart}.mcap"):
-            world = World(path, apart)
+    for distance in (2.0, 40.0):
+        for path in (None, tmp_path / f"{distance}.mcap"):
+            world = World(path, distance)
             world.run(2.0)
             before = [client.bus.bytes_out for client in world.clients]
             world.touch()
-            sent[apart, path is None] = [c.bus.bytes_out - b for c, b in zip(world.clients, before, strict=True)]
-            if apart > INTEREST_RADIUS:
+            sent[distance, path is None] = [c.bus.bytes_out - b for c, b in zip(world.clients, before, strict=True)]
+            if distance > INTEREST_RADIUS:
                 assert world.ada.environment() == 0
             else:
                 assert world.ada.environment() > 5_000
             if path is not None:
-                tape = world.tape()
-                assert ("c" in families(tape)) == (apart < INTEREST_RADIUS)
-                fast = sum(entry.key == "a/ada" for entry in tape.messages)
-                assert (fast > 100) == (apart < INTEREST_RADIUS)
+                recorded = world.recorded()
+                assert ("c" in families(recorded)) == (distance < INTEREST_RADIUS)
+                fast = sum(entry.key == "a/ada" for entry in recorded.messages)
+                assert (fast > 100) == (distance < INTEREST_RADIUS)
     assert sent[2.0, True] == sent[2.0, False]
     assert sent[40.0, True] == sent[40.0, False]
     assert sent[40.0, True][0] > 0  # slow poses
@@ -134,27 +139,27 @@ def test_an_actor_alone_sends_nothing_for_a_recorder(tmp_path):
     world.run(1.0)
     world.touch()
     assert world.ada.bus.bytes_out == 0
-    assert families(world.tape()) == {"live", "hello", "snap"}  # what it was told because it asked
+    assert families(world.recorded()) == {"live", "hello", "snap"}  # replies to its own queries
 
 
-def test_a_recorder_that_asks_for_everything_hears_one_who_is_alone(tmp_path):
+def test_an_observer_records_an_actor_that_is_alone(tmp_path):
     world = World(tmp_path / "run.mcap", everything=True)
     world.bob.bus.close()
     world.clients.remove(world.bob)
     digest = vineyard().digest()
-    stand = Observer(world.hub.bus("recorder-1"), (0.5, 3.0), "rows", digest, world.hub.time)
+    observer = Observer(world.hub.bus("recorder-1"), (0.5, 3.0), "rows", digest, world.hub.time)
     world.recorder.observers.add("recorder-1")
-    world.steps.append(lambda: stand.step(world.hub.time))
+    world.steps.append(lambda: observer.step(world.hub.time))
     world.run(2.0)
     world.touch()
-    tape = world.tape()
-    assert families(tape) == {"a", "c", "own", "hello", "live", "snap"}
-    assert sum(entry.key == "a/ada" for entry in tape.messages) > 150
-    assert sum(entry.key == "c/0/0/ada" for entry in tape.messages) > 90
-    assert not any("recorder" in entry.key for entry in tape.messages)
+    recorded = world.recorded()
+    assert families(recorded) == {"a", "c", "own", "hello", "live", "snap"}
+    assert sum(entry.key == "a/ada" for entry in recorded.messages) > 150
+    assert sum(entry.key == "c/0/0/ada" for entry in recorded.messages) > 90
+    assert not any("recorder" in entry.key for entry in recorded.messages)
 
 
-def test_two_recorders_do_not_keep_each_other_listening(tmp_path):
+def test_two_recorders_do_not_keep_each_others_subscriptions(tmp_path):
     world = World(tmp_path / "run.mcap")
     with RecordingWriter(tmp_path / "other.mcap") as recording:
         other = Recorder(world.hub.bus("other", live=False), recording, clock=lambda: world.hub.time)
@@ -167,17 +172,17 @@ def test_two_recorders_do_not_keep_each_other_listening(tmp_path):
 
 
 @pytest.mark.parametrize("only", FAMILIES)
-def test_only(tmp_path, only):
+def test_only_selected_families_are_recorded(tmp_path, only):
     world = World(tmp_path / "run.mcap", only=[only])
     world.run(0.5)
     world.touch()
     expected = {
         "poses": {"a"}, "trees": {"c"}, "things": set(), "events": {"own"}, "facts": {"snap"}, "forces": set(),
     }  # fmt: skip
-    assert families(world.tape()) == {"live", "hello"} | expected[only]
+    assert families(world.recorded()) == {"live", "hello"} | expected[only]
 
 
-def test_another_vineyard_is_refused_and_a_late_stranger_ignored(tmp_path):
+def test_another_scene_is_refused_and_ignored_from_a_late_peer(tmp_path):
     world = World(tmp_path / "other.mcap", digest="elsewhere")
     with pytest.raises(WorldMismatch, match=r"'(ada|bob)' has scene 'rows' .*elsewhere.*same|used there"):
         world.run(0.5)
@@ -185,17 +190,17 @@ def test_another_vineyard_is_refused_and_a_late_stranger_ignored(tmp_path):
 
     world = World(tmp_path / "run.mcap")
     world.run(0.5)
-    MinimalClient(world.hub.bus("eve"), 1.0, digest="elsewhere")  # it serves its greeting
+    MinimalClient(world.hub.bus("late"), 1.0, digest="elsewhere")  # it serves its hello
     world.run(0.5)
-    greetings = {e.key for e in world.tape().messages if e.key.startswith("hello/")}
+    greetings = {e.key for e in world.recorded().messages if e.key.startswith("hello/")}
     assert greetings == {"hello/ada", "hello/bob"}
 
 
-def test_the_official_reader_reads_words_and_numbers(tmp_path):
+def test_the_official_reader_reads_the_json(tmp_path):
     world = World(tmp_path / "run.mcap")
     world.run(1.0)
     world.touch()
-    path = world.tape().path
+    path = world.recorded().path
     with path.open("rb") as file:
         reader = make_reader(file)
         summary = reader.get_summary()
@@ -225,23 +230,23 @@ def test_the_official_reader_reads_words_and_numbers(tmp_path):
     assert messages_of["hello/ada"][0][2]["scene"] == "rows"
 
 
-def test_the_grid_leaves_nothing_out():
+def test_the_grid_of_observers_covers_the_area():
     for area in ((0.0, 0.0, 1.0, 1.0), (-3.0, -3.0, 25.0, 25.0), (0.0, 0.0, 100.0, 5.0)):
-        stands = np.array(observer_grid(area))
+        observers = np.array(observer_grid(area))
         x, y = np.meshgrid(np.linspace(area[0], area[2], 60), np.linspace(area[1], area[3], 60))
-        away = np.hypot(x[..., None] - stands[:, 0], y[..., None] - stands[:, 1]).min(-1)
-        assert away.max() <= INTEREST_RADIUS
-    for wrong in ((0.0, 0.0, 40.0, 40.0), (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, float("nan"), 1.0)):
+        distances = np.hypot(x[..., None] - observers[:, 0], y[..., None] - observers[:, 1]).min(-1)
+        assert distances.max() <= INTEREST_RADIUS
+    for invalid in ((0.0, 0.0, 40.0, 40.0), (1.0, 0.0, 0.0, 1.0), (0.0, 0.0, float("nan"), 1.0)):
         with pytest.raises(AreaTooLarge, match="give"):
-            observer_grid(wrong)
+            observer_grid(invalid)
 
 
-def test_nonsense_is_kept_and_counted(tmp_path):
+def test_malformed_messages_are_recorded_and_counted(tmp_path):
     world = World(tmp_path / "run.mcap")
-    fool = world.hub.bus("fool").publisher("own/0/0/fool")
+    faulty_publisher = world.hub.bus("faulty").publisher("own/0/0/faulty")
     world.run(0.5)
-    assert fool.put(b"not a message")
+    assert faulty_publisher.put(b"not a message")
     world.run(0.1)
-    tape = world.tape()
-    assert [entry.payload for entry in tape.messages if entry.key == "own/0/0/fool"] == [b"not a message"]
+    recorded = world.recorded()
+    assert [entry.payload for entry in recorded.messages if entry.key == "own/0/0/faulty"] == [b"not a message"]
     assert world.recorder.malformed == 1

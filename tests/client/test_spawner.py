@@ -1,4 +1,4 @@
-"""Robots that join while the ticks go on: nobody waits for them, and what stood stays where it stands."""
+"""Remote robots that join without delaying a tick or changing the state of others."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 
 
-class Deferred(concurrent.futures.Executor):
-    """Does what it is asked to when the test says so."""
+class DeferredExecutor(concurrent.futures.Executor):
+    """An executor that runs its work when the test calls ``work``."""
 
     def __init__(self) -> None:
         self.waiting: list[tuple[Callable, concurrent.futures.Future]] = []
@@ -44,12 +44,12 @@ def vinebot() -> RobotDescription:
     return load_description("vinebot")
 
 
-def greeting(description: RobotDescription, name: str = "guest", **change) -> Hello:
-    usual = {"robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7}
-    return Hello(name, **{**usual, **change})
+def hello(description: RobotDescription, name: str = "guest", **change) -> Hello:
+    defaults = {"robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7}
+    return Hello(name, **{**defaults, **change})
 
 
-def standing(description: RobotDescription, x: float) -> RobotUpdate:
+def update_at(description: RobotDescription, x: float) -> RobotUpdate:
     position = description.home.copy()
     position[0] += 0.05
     return RobotUpdate("guest", 0.0, frames.pose([x, 0.0, 0.0]), np.zeros(6), position, np.zeros_like(position))
@@ -62,25 +62,25 @@ def world(description: RobotDescription) -> Physics:
 
 
 def test_no_tick_waits_for_a_robot_that_joins(vinebot):
-    physics, deferred = world(vinebot), Deferred()
+    physics, deferred = world(vinebot), DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
-    spawner.enqueue(greeting(vinebot))
+    spawner.enqueue(hello(vinebot))
     for tick in range(5):
-        assert spawner.spawn("guest", standing(vinebot, 0.1 * tick)) is None
+        assert spawner.spawn("guest", update_at(vinebot, 0.1 * tick)) is None
         physics.step()
     assert physics.rigid.robots == ("host",)
     deferred.work()
-    guest = spawner.spawn("guest", standing(vinebot, 0.5))
+    guest = spawner.spawn("guest", update_at(vinebot, 0.5))
     assert guest is not None
     assert guest.name == "guest"
     assert "guest" not in spawner
     position, velocity, *_ = physics.rigid.joint_measurements("guest")
-    np.testing.assert_allclose(position, standing(vinebot, 0.5).position, atol=1e-12)
+    np.testing.assert_allclose(position, update_at(vinebot, 0.5).position, atol=1e-12)
     assert not velocity.any()
     assert physics.rigid.base_state("guest")[0][0] == pytest.approx(0.5)
 
 
-def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_came_at_once(vinebot):
+def test_a_prepared_and_an_immediate_join_give_the_same_bits(vinebot):
     def run(prepared: bool) -> bytes:
         physics = world(vinebot)
         physics.rigid.command("host", vinebot.home + 0.2)
@@ -100,11 +100,11 @@ def test_who_was_there_goes_on_to_the_bit_whether_the_newcomer_was_prepared_or_c
     assert run(True) == run(False)
 
 
-def test_a_world_that_changed_meanwhile_is_compiled_again(vinebot):
-    physics, deferred = world(vinebot), Deferred()
+def test_a_world_that_changed_during_compilation_is_compiled_again(vinebot):
+    physics, deferred = world(vinebot), DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
-    spawner.enqueue(greeting(vinebot))
-    update = standing(vinebot, 0.0)
+    spawner.enqueue(hello(vinebot))
+    update = update_at(vinebot, 0.0)
     spawner.spawn("guest", update)
     deferred.work()
     physics.rigid.add_robot(vinebot.to_spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
@@ -117,10 +117,10 @@ def test_a_world_that_changed_meanwhile_is_compiled_again(vinebot):
 
 
 def test_an_actor_that_leaves_before_being_ready_is_not_spawned(vinebot):
-    physics, deferred = world(vinebot), Deferred()
+    physics, deferred = world(vinebot), DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
-    spawner.enqueue(greeting(vinebot))
-    spawner.spawn("guest", standing(vinebot, 0.0))
+    spawner.enqueue(hello(vinebot))
+    spawner.spawn("guest", update_at(vinebot, 0.0))
     spawner.cancel("guest")
     deferred.work()
     assert "guest" not in spawner
@@ -128,29 +128,29 @@ def test_an_actor_that_leaves_before_being_ready_is_not_spawned(vinebot):
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "reason"),
     [
         ({"joints": 3}, "announces 3 joints"),
         ({"urdf": "<robot name='x'/>", "robot": "x"}, "cannot be shown"),
         ({"urdf": "no xml", "robot": "../../tmp/x"}, "cannot be shown"),
     ],
 )
-def test_a_robot_that_cannot_be_loaded_is_logged_once(vinebot, caplog, change, words):
+def test_a_robot_that_cannot_be_loaded_is_logged_once(vinebot, caplog, change, reason):
     physics = world(vinebot)
     spawner = RemoteSpawner(physics.rigid, vinebot)
-    spawner.enqueue(greeting(vinebot, **change))
-    assert spawner.spawn("guest", standing(vinebot, 0.0)) is None
+    spawner.enqueue(hello(vinebot, **change))
+    assert spawner.spawn("guest", update_at(vinebot, 0.0)) is None
     assert "guest" not in spawner
     (record,) = caplog.records
-    assert words in record.getMessage()
+    assert reason in record.getMessage()
     physics.step()
     assert physics.rigid.robots == ("host",)
 
 
-def test_a_name_from_the_network_is_no_path(vinebot, tmp_path, monkeypatch):
-    """The name in a greeting names a file; it must stay in the folder made for it."""
+def test_a_robot_name_from_the_network_is_not_a_path(vinebot, tmp_path, monkeypatch):
+    """The robot name in a hello names a file, which must stay in its folder."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     text = vinebot.urdf.replace("<robot ", "<!-- another --><robot ", 1)
-    found = resolve_description(greeting(vinebot, urdf=text, robot="../escaped"), vinebot)
+    found = resolve_description(hello(vinebot, urdf=text, robot="../escaped"), vinebot)
     assert found.joints == vinebot.joints
     assert list(tmp_path.rglob("*")) == []

@@ -1,4 +1,4 @@
-"""The spectator: sees what happens near it, live and from a tape, and touches nothing."""
+"""The spectator: displays what happens near it, live and in a replay, and changes nothing."""
 
 from __future__ import annotations
 
@@ -35,50 +35,50 @@ def bent(tmp_path_factory) -> Recording:
     world.run(1.0)
     world.touch()
     world.run(0.3)
-    return world.tape()
+    return world.recorded()
 
 
-def watch(tape: Recording) -> tuple[list[bytes], dict[int, np.ndarray]]:
-    """States of all plants of a spectator beside the tree, tick by tick; those of the tree by the tick's number."""
-    bus = ReplayBus(tape, "viewer")
+def watch(recording: Recording) -> tuple[list[bytes], dict[int, np.ndarray]]:
+    """States of all plants of a spectator beside the tree, tick by tick; those of the tree by tick index."""
+    bus = ReplayBus(recording, "viewer")
     pose = standing_view(1.5, 0.0, np.pi)
     spectator = Spectator(load_scene("demo"), vineyard(), None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
-    here = vineyard().bodies_of(0)
+    bodies = vineyard().bodies_of(0)
     states, tree = [], {}
     while not bus.ended:
         bus.play(TICK)
         spectator.tick()
         states.append(spectator.physics.state.joint_q.tobytes() + spectator.physics.state.joint_qd.tobytes())
         if 0 in spectator._remote_trees:
-            tree[len(states)] = spectator.physics.state.joint_q[here].copy()
+            tree[len(states)] = spectator.physics.state.joint_q[bodies].copy()
     return states, tree
 
 
-def test_a_replay_moves_the_trees_the_same_way_twice(bent):
+def test_two_replays_move_the_trees_equally(bent):
     (first, tree), (second, _) = watch(bent), watch(bent)
     assert first == second
     assert len(set(first)) > 80
-    # what it shows follows what was recorded
+    # the displayed state follows the recorded one
     times = {number: bent.start + number * TICK for number in tree}
     records = recorded_trees(bent)
-    worst = []
-    for number, shown in tree.items():
-        said = [record for record in records if record.time <= times[number] - 0.1]
-        if said and not said[-1].flags[0] & messages.RESTING:
+    errors = []
+    for number, displayed in tree.items():
+        earlier = [record for record in records if record.time <= times[number] - 0.1]
+        if earlier and not earlier[-1].flags[0] & messages.RESTING:
             nearest = min(
-                float(np.abs((record.joint_q * shown).sum(1)).min() - 1.0) ** 2
+                float(np.abs((record.joint_q * displayed).sum(1)).min() - 1.0) ** 2
                 for record in records
                 if abs(record.time - times[number]) < 0.15
             )
-            worst.append(nearest)
-    assert len(worst) > 50
-    assert max(worst) < 1e-4
+            errors.append(nearest)
+    assert len(errors) > 50
+    assert max(errors) < 1e-4
 
 
-def test_a_spectator_owns_nothing_even_when_an_owner_goes():
+def test_a_spectator_owns_nothing_even_when_an_owner_leaves():
     hub = MemoryHub(delay=0.004)
     ada = MinimalClient(hub.bus("ada"), 0.5)
-    onlooker = MinimalClient(hub.bus("aaa"), 0.6, kind="spectator", joints=0)
+    spectator = MinimalClient(hub.bus("aaa"), 0.6, kind="spectator", joints=0)
     bob = MinimalClient(hub.bus("bob"), 3.0)
 
     def run(*clients: MinimalClient, seconds: float = 0.5) -> None:
@@ -87,46 +87,48 @@ def test_a_spectator_owns_nothing_even_when_an_owner_goes():
             for client in clients:
                 client.tick(hub.time)
 
-    run(ada, onlooker, bob)
+    run(ada, spectator, bob)
     for number in range(30):
         ada.bend(0, 0.02 * number)
-        run(ada, onlooker, bob, seconds=TICK)
-    assert onlooker.replicator.owner(0) == "ada"
-    bob.moving = onlooker.moving = {0}
+        run(ada, spectator, bob, seconds=TICK)
+    assert spectator.replicator.owner(0) == "ada"
+    bob.moving = spectator.moving = {0}
     ada.bus.close()
-    run(onlooker, bob)
-    # it stands nearer, and has the lower name
+    run(spectator, bob)
+    # the spectator is nearer and has the lower name
     assert bob.replicator.owner(0) == "bob"
-    assert onlooker.replicator.owner(0) == "bob"
-    assert onlooker.environment() == 0
+    assert spectator.replicator.owner(0) == "bob"
+    assert spectator.environment() == 0
 
 
-def test_eyes():
-    eyes = standing_view(2.0, 3.0, np.pi / 2)
-    np.testing.assert_allclose(frames.rotate(eyes[3:], np.array([1.0, 0.0, 0.0])), [0.0, 1.0, 0.0], atol=1e-9)
+def test_views_stand_and_follow():
+    view = standing_view(2.0, 3.0, np.pi / 2)
+    np.testing.assert_allclose(frames.rotate(view[3:], np.array([1.0, 0.0, 0.0])), [0.0, 1.0, 0.0], atol=1e-9)
     for yaw in (0.0, 2.5, -1.0):
         robot = frames.pose([1.0, -2.0, 0.0], frames.from_yaw(yaw))
-        eyes = follow_view(robot)
-        ahead = frames.rotate(eyes[3:], np.array([1.0, 0.0, 0.0]))
-        assert eyes[2] == EYE_HEIGHT
-        np.testing.assert_allclose(eyes[:2] + FOLLOW_DISTANCE * ahead[:2], robot[:2], atol=1e-9)
+        view = follow_view(robot)
+        ahead = frames.rotate(view[3:], np.array([1.0, 0.0, 0.0]))
+        assert view[2] == EYE_HEIGHT
+        np.testing.assert_allclose(view[:2] + FOLLOW_DISTANCE * ahead[:2], robot[:2], atol=1e-9)
 
 
 @pytest.fixture(scope="module")
-def robot_tape(tmp_path_factory) -> pathlib.Path:
-    """Two seconds of a real robot that turns its head, seen by a live spectator."""
+def robot_recording(tmp_path_factory) -> pathlib.Path:
+    """Two seconds of a robot that turns its head, with a live spectator."""
     path = tmp_path_factory.mktemp("robot") / "run.mcap"
     hub = MemoryHub(delay=0.004)
     clock = hub.bus("server", live=False)
-    clock.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e9 + hub.time))
+    clock.declare_queryable(
+        "clock", lambda payload: messages.encode_time(messages.decode_time(payload)[0], 1e9 + hub.time)
+    )
     scene = load_scene("demo")
     model = generate(scene)
     start = spawn_pose(scene, 0)
     picker = Client(
         scene, model, load_robot("vinebot"), hub.bus("picker"), name="picker", pose=start, clock=lambda: hub.time
     )
-    eyes = follow_view(start)
-    spectator = Spectator(scene, model, None, hub.bus("viewer"), name="viewer", pose=eyes, clock=lambda: hub.time)
+    view = follow_view(start)
+    spectator = Spectator(scene, model, None, hub.bus("viewer"), name="viewer", pose=view, clock=lambda: hub.time)
     with RecordingWriter(path) as recording:
         recorder = Recorder(hub.bus("recorder", live=False), recording, clock=lambda: hub.time)
         picker.robot.command_position([0.5], ["head_1_joint"])
@@ -143,14 +145,14 @@ def robot_tape(tmp_path_factory) -> pathlib.Path:
     return path
 
 
-def options(file: pathlib.Path, out: pathlib.Path, **more) -> dict:
-    given = {"connect": None, "listen": None, "world": "vineyard", "speed": 1.0, "start": 0.0, "end": None}
-    return given | {"file": file, "out": out, "pose": None, "scene": None, "seed": None} | more
+def options(file: pathlib.Path, out: pathlib.Path, **changes) -> dict:
+    defaults = {"connect": None, "listen": None, "world": "vineyard", "speed": 1.0, "start": 0.0, "end": None}
+    return defaults | {"file": file, "out": out, "pose": None, "scene": None, "seed": None} | changes
 
 
-def test_a_replay_is_looked_at(robot_tape, tmp_path, capsys):
-    assert read_recording(robot_tape).metadata.items() >= {"scene": "demo", "seed": "7"}.items()
-    assert replay(**options(robot_tape, tmp_path, end=1.5)) == 0
+def test_a_replay_is_rendered(robot_recording, tmp_path, capsys):
+    assert read_recording(robot_recording).metadata.items() >= {"scene": "demo", "seed": "7"}.items()
+    assert replay(**options(robot_recording, tmp_path, end=1.5)) == 0
     assert "picker" in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir())[:4] == ["depth.png", "depth_mm.png", "labels.png", "rgb.png"]
     labels = cv2.imread(str(tmp_path / "labels.png"))
@@ -159,9 +161,9 @@ def test_a_replay_is_looked_at(robot_tape, tmp_path, capsys):
     assert (tmp_path / "view_00001.00.png").exists()
 
 
-def test_another_vineyard_is_refused(robot_tape, tmp_path):
+def test_another_scene_is_refused(robot_recording, tmp_path):
     with pytest.raises(InvalidRecording, match=r"digest .*: give its --scene and --seed"):
-        replay(**options(robot_tape, tmp_path / "out", seed=8))
+        replay(**options(robot_recording, tmp_path / "out", seed=8))
     assert not (tmp_path / "out").exists()
     with pytest.raises(UsageError, match=r"lasts \d"):
-        replay(**options(robot_tape, tmp_path / "out", start=60.0))
+        replay(**options(robot_recording, tmp_path / "out", start=60.0))

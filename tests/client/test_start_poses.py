@@ -1,4 +1,4 @@
-"""Where robots start and what they reach, in every vineyard that a seed may grow."""
+"""Start poses of robots and bunches within their reach, in generated vineyards."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from vinesim.scene.spec import load_scene, with_seed
 
 
 @pytest.mark.parametrize("seed", [0, 6, 11, 14, 29])
-def test_before_some_bunch_a_robot_finds_room(seed):
+def test_there_is_space_for_a_robot_before_some_bunch(seed):
     scene = with_seed(load_scene("demo"), seed)
     model = generate(scene)
     bunch, pose = start_poses.find_push_pose(model, start_poses.spawn_pose(scene, 0)[:2])
@@ -21,12 +21,12 @@ def test_before_some_bunch_a_robot_finds_room(seed):
 
     goal = start_poses.find_approach_pose(model, pose, 14.0)
     back = frames.rotate(goal[3:], np.array([-1.0, 0.0, 0.0]))[:2]
-    way = goal[:2] + np.linspace(0, 14, 200)[:, None] * back
-    assert start_poses.ground_clearance(model, way).min() > 0.45
-    assert np.linalg.norm(way - pose[:2], axis=1).min() > 1.0
+    path = goal[:2] + np.linspace(0, 14, 200)[:, None] * back
+    assert start_poses.ground_clearance(model, path).min() > 0.45
+    assert np.linalg.norm(path - pose[:2], axis=1).min() > 1.0
 
 
-def test_vsp_bunches_hang_too_low_and_that_is_said():
+def test_a_vineyard_with_too_low_bunches_is_refused():
     scene = load_scene("vsp")
     with pytest.raises(start_poses.PlacementError, match="no bunch of this vineyard can be pushed"):
         start_poses.find_push_pose(generate(scene), np.zeros(2))
@@ -39,6 +39,6 @@ def test_a_start_place_moves_back_along_its_heading():
     assert local == pytest.approx([-3.0, 0.0, 0.0], abs=1e-9)
 
 
-def test_a_place_the_scene_does_not_have_is_named_with_those_it_has():
+def test_an_unknown_start_place_is_refused_with_the_known_ones():
     with pytest.raises(start_poses.PlacementError, match=r"no start place 9; it has: 0 left, 1 right"):
         start_poses.spawn_pose(load_scene("demo"), 9)

@@ -1,4 +1,4 @@
-"""Tasks in a client: planned from the scene, begun with its robot, done step by step, without a peer on the network."""
+"""Tasks in a client: planned from the scene, started with its robot, run step by step, without peers."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from vinesim.scene.spec import load_scene
 def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Task]:
     scene = load_scene("harvest")
     model = generate(scene)
-    begin, start = plan_task(job, model, start_poses.spawn_pose(scene, spawn))
+    start_task, start = plan_task(job, model, start_poses.spawn_pose(scene, spawn))
     now = iter(range(1_000_000))
     client = Client(
         scene, model, load_robot(robot), MemoryHub().bus("worker"), name="worker", pose=start,
         clock=lambda: 0.01 * next(now),
     )  # fmt: skip
-    task = begin(client.physics, client.robot)
+    task = start_task(client.physics, client.robot)
     client.pre_step += [task.control, LookAt(client.robot, task.focus)]
     return client, task
 
@@ -49,8 +49,8 @@ def run_to_the_end(client: Client, task: Task) -> Task:
     return task
 
 
-def test_a_client_picks():
-    """F51, farming: the client's own bunch leaves its vine, is carried to a box and rests in it."""
+def test_a_client_runs_the_pick_task():
+    """F51, farming: a bunch is cut, carried to a box and rests in it."""
     client, task = client_with("pick", "vinebot", 0)
     assert isinstance(task, PickBunch)
     while not task.is_done and task.phase != "tuck":
@@ -65,8 +65,8 @@ def test_a_client_picks():
     assert (np.abs(local[:2]) < 0.5 * client.physics.model.box_size[task.plan.box, :2]).all()
 
 
-def test_a_client_exchanges():
-    """F51, logistics: the full box leaves on the carrier with its bunches, the empty one stands where it stood."""
+def test_a_client_runs_the_exchange_task():
+    """F51, logistics: the full box is carried away with its bunches, the empty one takes its place."""
     client, task = client_with("exchange", "logistic", 1)
     assert isinstance(task, SwapBoxes)
     place = task.box_pose(task.plan.full_box)[:2].copy()
@@ -80,82 +80,88 @@ def test_a_client_exchanges():
     assert task.box_pose(task.plan.full_box)[2] > 0.1
 
 
-def test_an_unknown_job_is_told():
+def test_an_unknown_task_is_refused_with_the_known_ones():
     scene = load_scene("harvest")
     with pytest.raises(UnknownTask, match="no job 'dance'; give pick or exchange"):
         plan_task("dance", generate(scene), start_poses.spawn_pose(scene, 0))
 
 
-# ---------------------------------------------------------------------- what ROS asks
+# ---------------------------------------------------------------------- commands by ROS
 
 
 JOINTS = ("arm_left_1_joint", "arm_left_2_joint")
 FAR = np.array([0.6, 0.0])
 
 
-class Asked:
-    """A robot alone in the world, and a queue of commands for it."""
+class CommandedRobot:
+    """A robot alone in a world, and a queue of ROS commands for it."""
 
     def __init__(self) -> None:
         self.robot = Robot(RigidWorld(assemble([])), load_robot("vinebot"), "anna")
         self.queue: list[Command] = []
-        self.obey = RosCommandHandler(self.robot, self._take)
+        self.handle_commands = RosCommandHandler(self.robot, self._take)
         self.time = 0.0
-        self.at = self.robot.joint_indices(JOINTS)
+        self.joints = self.robot.joint_indices(JOINTS)
 
     def _take(self) -> list[Command]:
-        taken, self.queue = self.queue, []
-        return taken
+        commands, self.queue = self.queue, []
+        return commands
 
-    def go(self, seconds: float) -> np.ndarray:
-        """Positions [2] of :data:`JOINTS` after so long."""
+    def run(self, seconds: float) -> np.ndarray:
+        """Positions [2] of :data:`JOINTS` after ``seconds``."""
         for _ in range(round(100 * seconds)):
-            self.obey(self.time)
+            self.handle_commands(self.time)
             self.robot.control(self.time)
             self.robot.rigid.predict()
             self.robot.rigid.integrate()
             self.time += 0.01
-        return self.robot.rigid.joint_measurements("anna")[0][self.at]
+        return self.robot.rigid.joint_measurements("anna")[0][self.joints]
 
 
-def way(*positions: tuple[float, float], joints: tuple[str, ...] = JOINTS, seconds: float = 1.0) -> JointTrajectory:
+def trajectory(
+    *positions: tuple[float, float], joints: tuple[str, ...] = JOINTS, seconds: float = 1.0
+) -> JointTrajectory:
     times = seconds * np.arange(1.0, len(positions) + 1.0)
     return JointTrajectory("arm_left_controller", 0.0, joints, times, np.reshape(positions, (-1, 2)), None)
 
 
-def test_a_trajectory_goes_straight_from_point_to_point_and_ends_where_it_should():
-    asked = Asked()
-    start = asked.go(0.1)
+def test_a_trajectory_is_linear_between_its_points():
+    commanded = CommandedRobot()
+    start = commanded.run(0.1)
     first, last = start + np.array([0.3, -0.2]), start + np.array([0.1, 0.0])
-    asked.queue = [way(first, last)]
-    np.testing.assert_allclose(asked.go(0.5), 0.5 * (start + first), atol=0.01)
-    np.testing.assert_allclose(asked.go(0.5), first, atol=0.01)
-    np.testing.assert_allclose(asked.go(0.5), 0.5 * (first + last), atol=0.01)
-    np.testing.assert_allclose(asked.go(1.5), last, atol=1e-3)
+    commanded.queue = [trajectory(first, last)]
+    np.testing.assert_allclose(commanded.run(0.5), 0.5 * (start + first), atol=0.01)
+    np.testing.assert_allclose(commanded.run(0.5), first, atol=0.01)
+    np.testing.assert_allclose(commanded.run(0.5), 0.5 * (first + last), atol=0.01)
+    np.testing.assert_allclose(commanded.run(1.5), last, atol=1e-3)
 
 
-def test_a_newer_trajectory_takes_over_an_empty_one_stops_and_positions_count_at_once():
-    asked = Asked()
-    start = asked.go(0.1)
-    asked.queue = [way(start + FAR, seconds=2.0)]
-    middle = asked.go(1.0)
-    asked.queue = [way(start)]
-    np.testing.assert_allclose(asked.go(1.5), start, atol=1e-3)
-    asked.queue = [way(start + FAR, seconds=2.0)]
-    stopped = asked.go(1.0)
+def test_newer_empty_and_position_commands_replace_a_trajectory():
+    commanded = CommandedRobot()
+    start = commanded.run(0.1)
+    commanded.queue = [trajectory(start + FAR, seconds=2.0)]
+    middle = commanded.run(1.0)
+    commanded.queue = [trajectory(start)]
+    np.testing.assert_allclose(commanded.run(1.5), start, atol=1e-3)
+    commanded.queue = [trajectory(start + FAR, seconds=2.0)]
+    stopped = commanded.run(1.0)
     np.testing.assert_allclose(stopped, middle, atol=0.01)
-    asked.queue = [way()]
-    np.testing.assert_allclose(asked.go(1.0), stopped, atol=0.01)
-    whole = asked.robot.setpoint.copy()
-    whole[asked.at] = start
-    asked.queue = [way(start + FAR, seconds=2.0), JointPositions("forward_position_controller", whole)]
-    np.testing.assert_allclose(asked.go(2.0), start, atol=1e-3)
+    commanded.queue = [trajectory()]
+    np.testing.assert_allclose(commanded.run(1.0), stopped, atol=0.01)
+    setpoint = commanded.robot.setpoint.copy()
+    setpoint[commanded.joints] = start
+    commanded.queue = [trajectory(start + FAR, seconds=2.0), JointPositions("forward_position_controller", setpoint)]
+    np.testing.assert_allclose(commanded.run(2.0), start, atol=1e-3)
 
 
-def test_what_makes_no_sense_is_counted_and_changes_nothing():
-    asked = Asked()
-    start = asked.go(0.1)
+def test_invalid_commands_are_counted_and_ignored():
+    commanded = CommandedRobot()
+    start = commanded.run(0.1)
     late = JointTrajectory("arm_left_controller", 0.0, JOINTS, np.array([2.0, 1.0]), np.zeros((2, 2)), None)
-    asked.queue = [way(start + 0.2, joints=("arm_left_1_joint", "no_joint")), late, way(start + np.nan)]
-    np.testing.assert_allclose(asked.go(0.5), start, atol=1e-4)
-    assert asked.obey.rejected_count == 3
+    commanded.queue = [
+        trajectory(start + 0.2, joints=("arm_left_1_joint", "no_joint")),
+        late,
+        trajectory(start + np.nan),
+    ]
+    np.testing.assert_allclose(commanded.run(0.5), start, atol=1e-4)
+    assert commanded.handle_commands.rejected_count == 3

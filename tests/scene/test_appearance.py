@@ -1,4 +1,4 @@
-"""What people and crates look like: as large as what touches, closed, mirrored, labelled, and read from files."""
+"""Visual shapes of humans and crates: size against collision shapes, closed meshes, symmetry, labels, files."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene import rigid_primitives
 
-ROOM = 0.06
-"""[m] So much of what touches may lie outside what is seen: hips are wider than a waist in trousers."""
+TOLERANCE = 0.06
+"""[m] Collision shapes may extend so far beyond visual ones: hips are wider than a waist in trousers."""
 SIZES = [(0.6, 0.4, 0.15), (0.6, 0.4, 0.24), (0.6, 0.4, 0.3), (0.4, 0.3, 0.24)]
 
 
-def person(name: str, height: float = 1.75) -> RigidWorld:
+def posed_human(name: str, height: float = 1.75) -> RigidWorld:
     rigid = RigidWorld(sensor_scenes.empty())
     pose = appearance.apply_posture(standing_pose(frames.pose(np.zeros(3)), height), name, height)
     rigid.add_human(HumanSpec("eva", 4, pose, height))
@@ -39,59 +39,64 @@ def person(name: str, height: float = 1.75) -> RigidWorld:
     return rigid
 
 
-def silhouette(shapes: tuple[RigidVisual, ...], poses: np.ndarray, eye: np.ndarray) -> np.ndarray:
-    """Pixels [height, width] that show a person who stands at the origin."""
+def silhouette(shapes: tuple[RigidVisual, ...], poses: np.ndarray, camera_position: np.ndarray) -> np.ndarray:
+    """Pixels [height, width] that show a human at the origin."""
     primitives, _ = sensor_scenes.world(*shapes, at=poses)
-    _, seen = sensor_scenes.raster(primitives, look_at(eye, np.array([0.0, 0.0, 0.95])))
-    names = np.where(seen >= 0, primitives.label[np.maximum(seen, 0)], 0)
+    _, drawn = sensor_scenes.raster(primitives, look_at(camera_position, np.array([0.0, 0.0, 0.95])))
+    names = np.where(drawn >= 0, primitives.label[np.maximum(drawn, 0)], 0)
     return names == label(Organ.HUMAN, 4)
 
 
 @pytest.mark.parametrize("side", [0.0, 0.8, 1.6, 3.14, 4.4])
 @pytest.mark.parametrize("height", [1.6, 1.9])
-def test_a_person_looks_as_large_as_what_touches(side: float, height: float) -> None:
-    """From anywhere what is drawn, grown by a few centimetres, covers the bodies that touch, and nearly the reverse."""
-    rigid = person("stand", height)
-    eye = 4.0 * np.array([np.cos(side), np.sin(side), 0.0]) + [0.0, 0.0, 1.3]
-    seen = silhouette(rigid.visuals(), rigid.visual_q(), eye)
+def test_visuals_of_a_human_match_the_collision_shapes(side: float, height: float) -> None:
+    """From any side the visuals, dilated by a few centimetres, cover the collision shapes, and nearly the reverse."""
+    rigid = posed_human("stand", height)
+    camera_position = 4.0 * np.array([np.cos(side), np.sin(side), 0.0]) + [0.0, 0.0, 1.3]
+    drawn = silhouette(rigid.visuals(), rigid.visual_q(), camera_position)
     touching = dict(zip(BODY_PARTS, ((shape,) for shape in body_shapes(height)), strict=True))
     touching |= {f"{hand}_hand": hand_shapes(hand) for hand in ("left", "right")}
     rows = [i for i, link in enumerate(rigid.visuals()) if link.name.partition("/")[2] in touching]
     named = [rigid.visuals()[i].name for i in rows]
     bodies = tuple(RigidVisual(name, Organ.HUMAN, 4, touching[name.partition("/")[2]]) for name in named)
-    felt = silhouette(bodies, rigid.visual_q()[rows], eye)
-    reach = round(ROOM * sensor_scenes.SMALL.fx / 4.0)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    assert felt.sum() > 500
-    assert not (felt & (cv2.dilate(seen.astype(np.uint8), disc) == 0)).any()
-    # arms, neck and a hat's brim touch nothing
-    assert (seen & (cv2.dilate(felt.astype(np.uint8), disc) == 0)).sum() < 0.25 * seen.sum()
+    collision = silhouette(bodies, rigid.visual_q()[rows], camera_position)
+    pixels = round(TOLERANCE * sensor_scenes.SMALL.fx / 4.0)
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
+    assert collision.sum() > 500
+    assert not (collision & (cv2.dilate(drawn.astype(np.uint8), disc) == 0)).any()
+    # arms, neck and a hat's brim have no collision shape
+    assert (drawn & (cv2.dilate(collision.astype(np.uint8), disc) == 0)).sum() < 0.25 * drawn.sum()
 
 
-def test_everything_drawn_of_somebody_carries_that_label() -> None:
-    rigid = person("pick")
+def test_all_primitives_of_a_human_have_its_label() -> None:
+    rigid = posed_human("pick")
     primitives, _ = sensor_scenes.world(*rigid.visuals(), at=rigid.visual_q())
-    mine = primitives.label == label(Organ.HUMAN, 4)
+    labelled = primitives.label == label(Organ.HUMAN, 4)
     shapes = [shape for link in rigid.visuals() for shape in link.shapes]
-    assert mine.sum() == sum(len(shape.mesh.corners) if shape.mesh else 1 for shape in shapes)
-    assert mine.sum() == len(primitives.label) - 1  # the stand-in for plants
-    assert mine.sum() < 5000
+    assert labelled.sum() == sum(len(shape.mesh.corners) if shape.mesh else 1 for shape in shapes)
+    assert labelled.sum() == len(primitives.label) - 1  # the placeholder for plants
+    assert labelled.sum() < 5000
 
 
-def test_left_mirrors_right() -> None:
+def test_left_parts_mirror_right_parts() -> None:
     parts = appearance.load_human_model(1.75).parts
     for name in (name for name in parts if name.startswith("left_")):
-        for one, other in zip(parts[name], parts[name.replace("left_", "right_")], strict=True):
-            assert (one.kind, one.size, one.rgba, one.surface) == (other.kind, other.size, other.rgba, other.surface)
-            if one.mesh and other.mesh:
-                flipped = np.sort((one.mesh.corners * [1, -1, 1]).reshape(-1, 3), 0)
-                assert np.allclose(flipped, np.sort(other.mesh.corners.reshape(-1, 3), 0))
-            elif not name[-1].isdigit():  # a finger's own axis is no mirror image: see its root
-                assert one.pose[:3] * [1, -1, 1] == pytest.approx(other.pose[:3])
+        for left, right in zip(parts[name], parts[name.replace("left_", "right_")], strict=True):
+            assert (left.kind, left.size, left.rgba, left.surface) == (
+                right.kind,
+                right.size,
+                right.rgba,
+                right.surface,
+            )
+            if left.mesh and right.mesh:
+                flipped = np.sort((left.mesh.corners * [1, -1, 1]).reshape(-1, 3), 0)
+                assert np.allclose(flipped, np.sort(right.mesh.corners.reshape(-1, 3), 0))
+            elif not name[-1].isdigit():  # a finger's axis is not mirrored: compare its root
+                assert left.pose[:3] * [1, -1, 1] == pytest.approx(right.pose[:3])
 
 
 def volume(corners: np.ndarray) -> float:
-    """Enclosed by triangles that run counter-clockwise seen from outside (divergence theorem)."""
+    """Volume within triangles that are counter-clockwise from outside (divergence theorem)."""
     return float(np.einsum("fi,fi->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
 
 
@@ -104,13 +109,13 @@ def test_meshes_face_outward() -> None:
     for mesh in meshes():
         face = np.cross(mesh.corners[:, 1] - mesh.corners[:, 0], mesh.corners[:, 2] - mesh.corners[:, 0])
         size = np.linalg.norm(face, axis=1)
-        there = size > 1e-9
-        cosine = np.einsum("fi,fki->fk", face[there] / size[there, None], mesh.normals[there])
+        valid = size > 1e-9
+        cosine = np.einsum("fi,fki->fk", face[valid] / size[valid, None], mesh.normals[valid])
         assert cosine.min() > 0.6
         assert np.linalg.norm(mesh.normals, axis=2) == pytest.approx(1.0)
 
 
-def test_a_head_is_as_large_as_a_head() -> None:
+def test_a_head_has_the_volume_of_a_head() -> None:
     """Volume of a head of 197 mm x 154 mm x 231 mm, between its ellipsoid and its box."""
     corners = np.concatenate(
         [s.mesh.corners for s in appearance.load_human_model(1.75).parts["head"][:8] if s.mesh and s.surface == "skin"]
@@ -119,9 +124,9 @@ def test_a_head_is_as_large_as_a_head() -> None:
     assert 0.9 * ellipsoid < volume(corners) < 0.197 * 0.154 * 0.231
 
 
-def test_normals_survive_their_packing() -> None:
-    way = frames.normalize(np.random.default_rng(3).normal(size=(4000, 3)))
-    code = rigid_primitives.pack_normals(way)
+def test_packed_normals_are_unpacked() -> None:
+    normals = frames.normalize(np.random.default_rng(3).normal(size=(4000, 3)))
+    code = rigid_primitives.pack_normals(normals)
     assert (code == np.round(code)).all()
     assert code.min() >= 1.0
     assert code.max() < 2**24
@@ -129,12 +134,12 @@ def test_normals_survive_their_packing() -> None:
     xy = np.stack([k % 2047, k // 2047], -1) * (2.0 / 2046.0) - 1.0
     z = 1.0 - np.abs(xy).sum(-1)
     fold = np.maximum(-z, 0.0)
-    found = frames.normalize(np.concatenate([xy - np.where(xy >= 0.0, 1.0, -1.0) * fold[:, None], z[:, None]], -1))
-    assert np.arccos(np.clip((found * way).sum(-1), -1.0, 1.0)).max() < 2e-3
+    unpacked = frames.normalize(np.concatenate([xy - np.where(xy >= 0.0, 1.0, -1.0) * fold[:, None], z[:, None]], -1))
+    assert np.arccos(np.clip((unpacked * normals).sum(-1), -1.0, 1.0)).max() < 2e-3
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_crate_is_as_large_as_it_says_and_free_inside(size: tuple[float, float, float]) -> None:
+def test_a_crate_has_its_size_and_is_empty_inside(size: tuple[float, float, float]) -> None:
     boxes = appearance.crate_shapes(size, 0)
     low = np.array([b.pose[:3] - b.size for b in boxes])
     high = np.array([b.pose[:3] + b.size for b in boxes])
@@ -158,7 +163,7 @@ def test_every_surface_has_its_material() -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "words"),
+    ("line", "reason"),
     [
         ('neck = [{ kind = "cone", paint = "gold" }]', r"parts\.neck\[0\]\.paint is 'gold'; give one of: skin"),
         ('neck = [{ kind = "blob", paint = "skin" }]', r"parts\[\.\.\.\]\[0\]\.kind: Invalid enum value 'blob'"),
@@ -169,22 +174,22 @@ def test_every_surface_has_its_material() -> None:
         ),
     ],
 )
-def test_what_is_wrong_with_a_figure_is_said_in_one_line(tmp_path, line: str, words: str) -> None:
+def test_an_invalid_human_model_is_refused_in_one_line(tmp_path, line: str, reason: str) -> None:
     text = find_data_file("figures", "worker", ".toml").read_text()
     file = tmp_path / "odd.toml"
     file.write_text(text[: text.index("[parts]")] + f"[parts]\n{line}\n")
-    with pytest.raises(AppearanceError, match=words) as said:
+    with pytest.raises(AppearanceError, match=reason) as caught:
         appearance.load_human_model(1.75, str(file))
-    assert "\n" not in str(said.value)
+    assert "\n" not in str(caught.value)
 
 
-def test_an_unknown_posture_is_said() -> None:
+def test_an_unknown_posture_is_refused_with_the_known_ones() -> None:
     with pytest.raises(AppearanceError, match="posture 'dance' is unknown; give one of: stand, pick"):
         appearance.apply_posture(standing_pose(frames.pose(np.zeros(3))), "dance", 1.75)
 
 
-def test_a_cone_tapers_the_way_it_says() -> None:
-    """Thin above, thick below: silhouette widths of a round cone on its axis."""
+def test_a_cone_tapers_from_bottom_to_top() -> None:
+    """Thin at the top, thick at the bottom: silhouette widths of a round cone on its axis."""
     cone = Shape("cone", (0.2, 0.05, 0.4), frames.pose(np.array([2.0, 0.0, 1.0])))
     primitives, _ = sensor_scenes.world(sensor_scenes.thing(cone))
     depth, _ = sensor_scenes.raster(primitives, sensor_scenes.AHEAD)
@@ -195,8 +200,8 @@ def test_a_cone_tapers_the_way_it_says() -> None:
     assert rows[high] == pytest.approx(2 * 0.05 * scale, abs=3)
 
 
-def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
-    """F48: an open hand before a camera shows gaps between fingers and reaches further than a fist."""
+def test_a_depth_camera_distinguishes_a_fist_from_an_open_hand() -> None:
+    """F48: an open hand before a camera shows gaps between fingers and extends further than a fist."""
     views = {}
     for name, bent in (("open", 0.0), ("fist", 1.0)):
         pose = standing_pose(frames.pose(np.zeros(3)))
@@ -211,21 +216,21 @@ def test_a_depth_camera_tells_a_fist_from_an_open_hand() -> None:
     scale = sensor_scenes.SMALL.fx / 0.6
     assert rows["fist"].min() - rows["open"].min() > 0.04 * scale
     across = [np.abs(np.diff(row.astype(int))).sum() for row in views["open"]]
-    assert max(across) >= 8  # four fingers or more side by side
+    assert max(across) >= 8  # at least four fingers side by side
     assert max(np.abs(np.diff(row.astype(int))).sum() for row in views["fist"][: rows["fist"].min() + 10]) < 8
 
 
-def test_a_lamp_is_seen_in_its_colour() -> None:
-    """F41: the lit tier of a robot's signal tower is the greenest thing in a picture of it, in the shade too."""
+def test_a_lamp_has_its_colour_in_a_picture() -> None:
+    """F41: the lit tier of a robot's signal tower is the greenest object in a picture of it, also in the shade."""
     rigid = RigidWorld(sensor_scenes.empty())
     rigid.add_robot(load_description("vinebot").to_spec("bot"))
     primitives, _ = sensor_scenes.world(*rigid.visuals(), at=rigid.visual_q())
     pose = look_at(np.array([-1.2, -0.5, 0.7]), np.array([-0.4, -0.15, 0.46]))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.6, 0.3, 0.5)).render(primitives, pose)
-    _, seen = sensor_scenes.raster(primitives, pose)
+    _, drawn = sensor_scenes.raster(primitives, pose)
     material = primitives.materials.material.numpy()
     tint = primitives.materials.tint.numpy()
-    lit = (seen >= 0) & (material[seen] == int(materials.LAMP)) & (tint[seen][..., 1] > 2.0 * tint[seen][..., 0])
+    lit = (drawn >= 0) & (material[drawn] == int(materials.LAMP)) & (tint[drawn][..., 1] > 2.0 * tint[drawn][..., 0])
     assert lit.sum() > 20
     green = frame.rgb[..., 1].astype(int) - frame.rgb[..., 0]
     assert np.median(green[lit]) > 60

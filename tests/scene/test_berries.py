@@ -1,4 +1,4 @@
-"""Berries: packed, not overlapping, many touching; the count asked for; the same for the same seed."""
+"""Berries: packed without overlap, requested count, deterministic by seed."""
 
 import numpy as np
 import pytest
@@ -9,20 +9,20 @@ from vinesim.scene.spec import load_scene
 
 
 def distances(bunch, radius):
-    apart = np.linalg.norm(bunch.position[:, None] - bunch.position[None], axis=2)
-    return apart + np.diag(np.full(len(radius), np.inf)), radius[:, None] + radius[None]
+    distance = np.linalg.norm(bunch.position[:, None] - bunch.position[None], axis=2)
+    return distance + np.diag(np.full(len(radius), np.inf)), radius[:, None] + radius[None]
 
 
 @pytest.mark.parametrize("which", range(len(berries.prototypes())))
-def test_prototypes_are_tight_and_do_not_overlap(which):
+def test_prototypes_are_dense_and_do_not_overlap(which):
     bunch = berries.prototypes()[which]
-    apart, touching = distances(bunch, bunch.radius)
-    assert (touching - apart).max() < 0.04 * bunch.radius.mean()
-    assert (apart < 1.03 * touching).sum(1).mean() > 5.0
+    distance, touching = distances(bunch, bunch.radius)
+    assert (touching - distance).max() < 0.04 * bunch.radius.mean()
+    assert (distance < 1.03 * touching).sum(1).mean() > 5.0
     assert np.linalg.norm(bunch.position - bunch.foot, axis=1).max() < 6.0
 
 
-def test_shapes_differ_and_are_no_columns():
+def test_shapes_differ_and_taper():
     """Slenderness varies, and most bunches are wider at the shoulder than near the tip."""
     slender, taper = [], []
     for bunch in berries.prototypes():
@@ -43,8 +43,8 @@ def test_a_bunch_has_its_count_and_fits_its_hull(count, variety):
     assert len(bunch.position) == len(bunch.radius) == len(bunch.axis) == len(bunch.foot) == count
     assert bunch.radius.mean() == pytest.approx(kind.radius, rel=0.03)
     full = bunch.radius * kind.elongation ** (1.0 / 3.0)
-    apart, touching = distances(bunch, full)
-    assert (touching - apart).max() < 0.04 * kind.volume_radius
+    distance, touching = distances(bunch, full)
+    assert (touching - distance).max() < 0.04 * kind.volume_radius
     assert (bunch.position[:, 0] + full).max() == pytest.approx(length, rel=1e-3)
     assert (bunch.position[:, 0] - full).min() > -1e-6
     across = np.hypot(*bunch.position[:, 1:].T) + full
@@ -54,24 +54,24 @@ def test_a_bunch_has_its_count_and_fits_its_hull(count, variety):
 
 def test_neighbours_are_the_nearest():
     bunch = berries.lay_out_berries(0.18, 0.05, 90, 0, 1)
-    apart = distances(bunch, bunch.radius)[0]
+    distance = distances(bunch, bunch.radius)[0]
     for i in range(90):
         near = bunch.neighbours[i][bunch.neighbours[i] >= 0]
         assert near.max() < 90
-        assert apart[i].argmin() in near
-        assert (np.diff(apart[i][near]) >= 0.0).all()
+        assert distance[i].argmin() in near
+        assert (np.diff(distance[i][near]) >= 0.0).all()
 
 
-def test_same_seed_same_berries_another_seed_others():
+def test_berries_are_determined_by_the_seed():
     one, two, other = (berries.lay_out_berries(0.18, 0.05, 90, 0, seed) for seed in (4, 4, 5))
     berries._scaled.cache_clear()
-    again = berries.lay_out_berries(0.18, 0.05, 90, 0, 4)
+    recomputed = berries.lay_out_berries(0.18, 0.05, 90, 0, 4)
     assert np.array_equal(one.position, two.position)
-    assert np.array_equal(one.position, again.position)
+    assert np.array_equal(one.position, recomputed.position)
     assert not np.array_equal(one.position, other.position)
 
 
-def test_the_library_is_packed_alike_each_time():
+def test_prototypes_are_deterministic():
     before = [b.position.copy() for b in berries.prototypes()]
     berries.prototypes.cache_clear()
     assert all(np.array_equal(a, b.position) for a, b in zip(before, berries.prototypes(), strict=True))
@@ -82,7 +82,7 @@ def test_too_many_berries_are_refused():
         berries.lay_out_berries(0.2, 0.05, 141, 0, 0)
 
 
-def test_bunches_of_a_model_weigh_what_their_berries_weigh():
+def test_mass_of_a_bunch_is_that_of_its_berries():
     model = generate(load_scene("demo"))
     for i in range(0, len(model.bunch_body), 7):
         kind = berries.VARIETIES[model.bunch_variety[i]]

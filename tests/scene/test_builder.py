@@ -1,4 +1,4 @@
-"""Wood to bodies: mass and stiffness of a rod, and springs turned so that the drawn shape is the shape at rest."""
+"""The tree builder: mass and stiffness of rods, and springs whose rest pose is the drawn shape."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def beam(pieces=16, load=0.0, length=1.0, radius=0.004):
     return tree
 
 
-def test_a_rod_weighs_what_its_wood_weighs():
+def test_mass_of_a_rod_is_that_of_its_wood():
     tree = builder.TreeBuilder(POSE)
     tree.add_rod(-1, 1.2, (0.005, 0.002), CANE, 9)
     cone = np.pi * 1.2 * (0.005**2 + 0.005 * 0.002 + 0.002**2) / 3.0
@@ -36,22 +36,22 @@ def test_springs_are_ei_over_h_and_twice_that_at_the_root():
     assert model.joint_damping == pytest.approx(0.01 * model.joint_stiffness, rel=1e-6)
 
 
-def test_a_joint_of_unlike_pieces_is_half_of_each():
-    """Springs of the halves one after the other, and each wood's damping in its share of the bend."""
+def test_a_joint_between_different_pieces_is_two_halves_in_series():
+    """Springs of the halves in series, and each wood's damping in its share of the bend."""
     tree = builder.TreeBuilder(POSE)
     below = tree.add_rod(-1, 0.5, (0.006, 0.005), CANE, 5)[-1]
     green = builder.RodMaterial(modulus=1e9, density=900.0, damping=0.05)
     on = tree.add_rod(below, 0.4, (0.004, 0.002), green, 8)[0]
-    ours, theirs = (2.0 * e * np.pi * r**4 / 4.0 / h for e, r, h in ((1e9, 0.004, 0.05), (5e9, 0.005, 0.1)))
+    upper, lower = (2.0 * e * np.pi * r**4 / 4.0 / h for e, r, h in ((1e9, 0.004, 0.05), (5e9, 0.005, 0.1)))
     stiffness, damping = (tree.bodies[on][name] for name in ("stiffness", "damping"))
-    assert stiffness[1:] == pytest.approx(ours * theirs / (ours + theirs), rel=1e-12)
+    assert stiffness[1:] == pytest.approx(upper * lower / (upper + lower), rel=1e-12)
     assert stiffness[0] == pytest.approx(stiffness[1] / 1.3, rel=1e-12)
-    share = stiffness[1] / theirs
+    share = stiffness[1] / lower
     assert damping[1] == pytest.approx(stiffness[1] * (0.01 * share + 0.05 * (1.0 - share)), rel=1e-12)
 
 
-def test_a_fork_bends_with_what_it_grows_on():
-    """Sideways on a like piece: its tip is a joint of half twist, half bend; its middle or before is a clamp."""
+def test_a_fork_bends_with_its_parent():
+    """Sideways on an equal piece: at its tip half twist and half bend in series; at its middle or before a clamp."""
     tree = builder.TreeBuilder(POSE)
     below = tree.add_rod(-1, 1.0, (0.004, 0.004), CANE, 10)[-1]
     aside = frames.from_yaw(np.pi / 2)
@@ -73,7 +73,7 @@ def test_inertia_of_a_piece_is_that_of_a_cylinder():
     assert inertia == pytest.approx([mass * 0.01**2 / 2, *[mass * (3 * 0.01**2 + 0.1**2) / 12] * 2], rel=1e-12)
 
 
-def test_settle_keeps_the_drawn_shape_and_carries_the_load():
+def test_solve_rest_pose_keeps_the_drawn_shape_under_load():
     tree = beam(load=0.3)
     tree.bodies[4]["rest"] = frames.exp(np.array([0.1, 0.3, -0.2]))
     drawn = builder.assemble([tree]).forward_kinematics(np.tile(frames.IDENTITY, (17, 1)))
@@ -88,7 +88,7 @@ def test_settle_keeps_the_drawn_shape_and_carries_the_load():
 
 
 def test_a_weighted_beam_bends_by_the_angle_of_beam_theory():
-    """A beam held straight under its load is bent without it, by w L^3 / 6 EI + m g L^2 / 2 EI at its tip."""
+    """A beam that is straight under its load is bent without it, by w L^3 / 6 EI + m g L^2 / 2 EI at its tip."""
     load, length = 0.05, 1.0
     tree = beam(pieces=64, load=load)
     tree.solve_rest_pose()
@@ -98,16 +98,16 @@ def test_a_weighted_beam_bends_by_the_angle_of_beam_theory():
     assert angle == pytest.approx(weight * length**3 / (6.0 * ei) + load * 9.81 * length**2 / (2.0 * ei), rel=2e-3)
 
 
-def test_settling_all_at_once_is_settling_each():
+def test_rest_poses_of_all_trees_are_those_of_each():
     trees = [beam(pieces=n, load=0.1) for n in (3, 8)]
-    together = builder.solve_rest_pose(builder.assemble(trees))
+    all_trees = builder.solve_rest_pose(builder.assemble(trees))
     for number, tree in enumerate(trees):
         tree.solve_rest_pose()
-        alone = builder.assemble([tree])
-        assert np.array_equal(together.joint_settled[together.bodies_of(number)], alone.joint_settled)
+        single = builder.assemble([tree])
+        assert np.array_equal(all_trees.joint_settled[all_trees.bodies_of(number)], single.joint_settled)
 
 
-def test_fork_parents_and_numbers():
+def test_parents_and_indices_of_a_fork():
     tree = beam(4)
     side = tree.add_rod(1, 0.2, (0.002, 0.001), CANE, 2, rest=frames.from_yaw(0.5))
     model = builder.assemble([beam(2), tree])
@@ -116,18 +116,18 @@ def test_fork_parents_and_numbers():
     assert model.body_offset[6, 0] == pytest.approx(0.25)
 
 
-def test_nonsense_is_refused_in_words():
+def test_invalid_trees_are_refused_with_the_reason():
     with pytest.raises(ValueError, match="all must be positive"):
         builder.TreeBuilder(POSE).add_rod(-1, -1.0, (0.01, 0.01), CANE, 3)
     with pytest.raises(ValueError, match="names parent 3"):
         builder.TreeBuilder(POSE).add_body(3)
-    slack = builder.TreeBuilder(POSE)
-    slack.add_body(-1, mass=1.0)
+    without_springs = builder.TreeBuilder(POSE)
+    without_springs.add_body(-1, mass=1.0)
     with pytest.raises(ValueError, match="body 0 has joint stiffness"):
-        slack.solve_rest_pose()
+        without_springs.solve_rest_pose()
 
 
-def hung(clusters: bool = True) -> builder.TreeBuilder:
+def cane_with_bunch(clusters: bool = True) -> builder.TreeBuilder:
     tree = beam(4)
     stalk = tree.add_rod(
         3, 0.06, (0.0022, 0.0022), CANE, 2, organ=Organ.PEDUNCLE, rest=frames.exp(np.array([0.0, np.pi / 2, 0.0]))
@@ -136,8 +136,8 @@ def hung(clusters: bool = True) -> builder.TreeBuilder:
     return tree
 
 
-def test_a_bunch_hung_on_a_tree_brings_its_clusters():
-    model = builder.assemble([hung(), hung()])
+def test_a_bunch_has_its_clusters_behind_the_core():
+    model = builder.assemble([cane_with_bunch(), cane_with_bunch()])
     n = int(model.bunch_clusters[0])
     assert model.tree_core.tolist() == [7, 7]
     assert model.tree_size.tolist() == [7 + n, 7 + n]
@@ -150,8 +150,8 @@ def test_a_bunch_hung_on_a_tree_brings_its_clusters():
     assert 0.10 < model.bunch_length[0] < 0.2
 
 
-def test_a_bunch_with_clusters_weighs_once_when_it_settles():
-    fine, whole = hung(), hung(clusters=False)
+def test_clusters_do_not_change_the_rest_pose():
+    fine, whole = cane_with_bunch(), cane_with_bunch(clusters=False)
     for tree in (fine, whole):
         tree.solve_rest_pose()
     models = [builder.assemble([tree]) for tree in (fine, whole)]

@@ -45,11 +45,11 @@ def test_measured_points_project_to_their_pixels() -> None:
 def test_every_second_row_and_column() -> None:
     frame = _frame()
     frame.depth[0, :3] = 1.0
-    whole = measured_points(frame).reshape(4, 6)
-    assert np.array_equal(measured_points(frame, step=2).reshape(2, 3), whole[::2, ::2])
+    all_points = measured_points(frame).reshape(4, 6)
+    assert np.array_equal(measured_points(frame, step=2).reshape(2, 3), all_points[::2, ::2])
 
 
-def test_what_is_behind_the_camera_has_no_pixel() -> None:
+def test_a_point_behind_the_camera_has_no_pixel() -> None:
     assert np.isnan(project_points(np.array([0.1, 0.2, -1.0]), INFO)).all()
 
 

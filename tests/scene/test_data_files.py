@@ -1,11 +1,11 @@
-"""Where data lies: a path wins over a name, and an unknown name tells what there is."""
+"""Data files: a path wins over a name, and an unknown name lists the known ones."""
 
 import pytest
 
 from vinesim.scene.data_files import DataFileNotFound, data_dir, find_data_file
 
 
-def test_a_name_finds_what_ships():
+def test_a_name_finds_a_shipped_file():
     assert (
         find_data_file("scenes", "demo", ".toml")
         == find_data_file("scenes", "demo.toml", ".toml")
@@ -19,11 +19,11 @@ def test_a_path_wins_over_a_name(tmp_path, monkeypatch):
     assert find_data_file("scenes", "demo", ".toml").read_text() == "mine"
 
 
-def test_an_unknown_name_lists_the_known():
+def test_an_unknown_name_lists_the_known_ones():
     with pytest.raises(DataFileNotFound, match=r"no file 'moon'.*data/scenes.*demo, harvest, tendone, vsp"):
         find_data_file("scenes", "moon", ".toml")
 
 
-def test_an_unknown_kind_has_none():
+def test_an_unknown_kind_has_no_files():
     with pytest.raises(DataFileNotFound, match="one of: none"):
         find_data_file("ships", "moon", ".toml")

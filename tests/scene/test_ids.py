@@ -1,4 +1,4 @@
-"""Labels: organ and index go into one int32 and come out again."""
+"""Labels: organ and index are packed into an int32 and unpacked."""
 
 import numpy as np
 import pytest
@@ -8,16 +8,16 @@ from vinesim.scene.ids import LABEL_STRIDE, Organ, label, unlabel
 
 @pytest.mark.parametrize("organ", list(Organ))
 @pytest.mark.parametrize("index", [0, 1, 9999, LABEL_STRIDE - 1])
-def test_there_and_back_within_int32(organ, index):
+def test_labels_are_unpacked_and_fit_an_int32(organ, index):
     value = label(organ, index)
     assert int(np.int32(value)) == value
     assert unlabel(value) == (organ, index)
 
 
-def test_labels_are_one_to_one():
+def test_labels_are_unique():
     values = {label(o, i) for o in Organ for i in range(50)}
     assert len(values) == len(Organ) * 50
 
 
-def test_nothing_is_zero():
+def test_the_label_of_nothing_is_zero():
     assert label(Organ.NOTHING, 0) == 0

@@ -1,4 +1,4 @@
-"""The model: forward kinematics against composing poses by hand, depth, digest."""
+"""The model: forward kinematics against composed transforms, depth, digest."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def model():
     return builder.assemble(trees)
 
 
-def test_forward_is_the_chain_of_transforms(model):
+def test_forward_kinematics_is_the_chain_of_transforms(model):
     joint_q = Rotation.random(len(model.body_mass), random_state=5).as_quat()
     found = model.forward_kinematics(joint_q)
 
@@ -53,15 +53,15 @@ def test_bodies_of_a_tree(model):
     assert model.tree_vine.tolist() == [0, 1, 2]
 
 
-def test_the_digest_sees_one_bit(model):
-    before, twin = model.digest(), model.copy()
-    assert twin.digest() == before
-    twin.body_mass[3] = np.nextafter(twin.body_mass[3], np.float32(1.0))
-    assert twin.digest() != before
+def test_the_digest_depends_on_every_bit(model):
+    before, changed = model.digest(), model.copy()
+    assert changed.digest() == before
+    changed.body_mass[3] = np.nextafter(changed.body_mass[3], np.float32(1.0))
+    assert changed.digest() != before
     assert len(before) == 16
 
 
-def test_an_empty_model_stands():
+def test_an_empty_model_is_valid():
     empty = builder.assemble([])
     assert empty.forward_kinematics(empty.joint_settled).shape == (0, 7)
     assert set(empty.counts().values()) == {0}

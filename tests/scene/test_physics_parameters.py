@@ -30,7 +30,7 @@ def test_every_parameter_has_a_unit_and_a_source(name):
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("options", "message"),
     [
         ({"dt": -0.01}, "physics.dt is -0.01; give a number above 0"),
         ({"gravity": float("nan")}, "physics.gravity is nan; give a finite number"),
@@ -41,9 +41,9 @@ def test_every_parameter_has_a_unit_and_a_source(name):
         ({"fast_joint_rate": 80.0}, "physics.fast_joint_rate is 80.0, max_joint_rate 50.0, .* in increasing order"),
     ],
 )
-def test_a_parameter_out_of_range_is_refused(given, message):
+def test_a_parameter_out_of_range_is_refused(options, message):
     with pytest.raises(ParameterError, match=f"^{message}$"):
-        PhysicsParameters(**given)
+        PhysicsParameters(**options)
 
 
 def scene_with(tmp_path, table):
@@ -67,15 +67,15 @@ def test_a_scene_file_overrides_parameters(tmp_path):
         ("max_joint_rate = 1", "physics.fast_joint_rate is 5.0, max_joint_rate 1.0"),
     ],
 )
-def test_a_scene_file_with_a_bad_parameter_is_refused_in_one_line(tmp_path, table, message):
-    with pytest.raises(SceneError, match=message.replace("?", r"\?")) as refused:
+def test_a_scene_file_with_an_invalid_parameter_is_refused_in_one_line(tmp_path, table, message):
+    with pytest.raises(SceneError, match=message.replace("?", r"\?")) as caught:
         scene_with(tmp_path, table)
-    assert "\n" not in str(refused.value)
-    assert "other.toml" in str(refused.value)
+    assert "\n" not in str(caught.value)
+    assert "other.toml" in str(caught.value)
 
 
-def ticks_until_asleep(**given):
-    physics = Physics(rows_of_canes(1), parameters=PhysicsParameters(**given))
+def ticks_until_asleep(**options):
+    physics = Physics(rows_of_canes(1), parameters=PhysicsParameters(**options))
     physics.plants.wake(np.array([0]))
     for tick in range(1000):
         physics.step()
@@ -84,7 +84,7 @@ def ticks_until_asleep(**given):
     return 0
 
 
-def test_durations_are_in_seconds_whatever_the_step():
+def test_durations_are_in_seconds_for_any_time_step():
     assert [ticks_until_asleep(dt=dt) * dt for dt in (0.005, 0.01)] == pytest.approx([0.5, 0.5])
     assert ticks_until_asleep(sleep_duration=1.0) == 100
 

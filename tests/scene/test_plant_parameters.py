@@ -1,4 +1,4 @@
-"""Plant parameters: every number has a unit, a grade and a source; a wrong unit is caught."""
+"""Plant parameters: every number has a unit, a grade and a source; a wrong unit is refused."""
 
 import collections
 import pathlib
@@ -40,7 +40,7 @@ def test_every_number_is_graded_and_explained():
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/validation.md"])
-def test_the_pages_count_the_guesses(page):
+def test_the_pages_state_the_number_of_guesses(page):
     grades = collections.Counter(number.grade for number in numbers(plant_parameters.load_plant("vine")))
     text = (pathlib.Path(__file__).parents[2] / page).read_text()
     counted = re.search(r"(\d+) of (\d+) plant parameters are guesses", text)
@@ -48,7 +48,7 @@ def test_the_pages_count_the_guesses(page):
     assert tuple(map(int, counted.groups())) == (grades["GUESSED"], sum(grades.values()))
 
 
-def test_a_wrong_unit_is_told(tmp_path):
+def test_a_wrong_unit_is_refused(tmp_path):
     file = tmp_path / "oak.toml"
     text = find_data_file("plants", "vine", ".toml").read_text()
     assert text.count('unit = "Pa"') >= 3
@@ -57,6 +57,6 @@ def test_a_wrong_unit_is_told(tmp_path):
         plant_parameters.load_plant(str(file))
 
 
-def test_a_range_is_walked_from_end_to_end():
+def test_a_range_is_interpolated_from_end_to_end():
     length = plant_parameters.load_plant("vine").cane.length
     assert (length.at(0.0), length.at(1.0)) == length.value

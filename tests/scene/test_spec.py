@@ -1,4 +1,4 @@
-"""Scene files: those that ship load, and each kind of mistake is told in one line with file, place and remedy."""
+"""Scene files: shipped ones load, and each kind of error is one line with file, place and remedy."""
 
 import math
 import pathlib
@@ -37,7 +37,7 @@ y = 1.0
 
 
 @pytest.mark.parametrize("path", sorted((data_dir() / "scenes").glob("*.toml")), ids=lambda p: p.stem)
-def test_every_scene_that_ships_loads_by_its_name(path):
+def test_every_shipped_scene_loads_by_its_name(path):
     assert spec.load_scene(path.stem).name == path.stem
 
 
@@ -51,7 +51,7 @@ def test_defaults_and_values(tmp_path):
 
 
 MANY = "".join(f'\n[[spawns]]\nname = "r{i}"\nx = {i}.0\ny = 0.0\n' for i in range(10))
-MISTAKES = {
+ERRORS = {
     "unknown field": (("row_spacing", "row_spacng"), ["layout.row_spacng", "did you mean 'row_spacing'?"]),
     "unknown table": (("[fruit]", "[friut]"), ["friut", "did you mean 'fruit'?"]),
     "unknown in a list": (('name = "here"\nx', 'name = "here"\nhight = 2\nx'), ["spawns[0].hight", "remove it"]),
@@ -82,9 +82,9 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_line_with_file_place_and_remedy(mistake, tmp_path):
-    (old, new), expected = MISTAKES[mistake]
+@pytest.mark.parametrize("error", ERRORS)
+def test_an_error_is_one_line_with_file_place_and_remedy(error, tmp_path):
+    (old, new), expected = ERRORS[error]
     assert old in GOOD
     file = tmp_path / "broken.toml"
     file.write_text(GOOD.replace(old, new))
@@ -96,20 +96,20 @@ def test_a_mistake_is_one_line_with_file_place_and_remedy(mistake, tmp_path):
     assert [e for e in expected if e not in text] == [], text
 
 
-def test_an_unknown_scene_names_those_that_ship():
+def test_an_unknown_scene_is_refused_with_the_shipped_ones():
     with pytest.raises(spec.SceneError, match=r"'vineyard'.*demo, harvest, tendone, vsp"):
         spec.load_scene("vineyard")
 
 
-def test_a_folder_or_binary_is_no_scene(tmp_path):
+def test_a_binary_file_is_not_a_scene(tmp_path):
     binary = pathlib.Path(tmp_path / "x.toml")
     binary.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(spec.SceneError, match="UTF-8"):
         spec.load_scene(binary)
 
 
-def test_the_sun_of_an_equinox() -> None:
-    """Due south at noon and as high as the latitude is far from the pole; due west at six, on the horizon."""
+def test_sun_direction_at_the_equinox() -> None:
+    """South at noon at 90 degrees less the latitude; west at six in the evening, on the horizon."""
     latitude = math.radians(41.6)
     assert sun_direction(12.0, 0.0, latitude) == pytest.approx(
         [0.0, -math.sin(latitude), math.cos(latitude)], abs=1e-12
@@ -118,8 +118,8 @@ def test_the_sun_of_an_equinox() -> None:
     assert math.hypot(*sun_direction(15.3, 0.2, latitude)) == pytest.approx(1.0)
 
 
-def test_a_sun_with_an_hour_moves() -> None:
-    """From nine in the morning to noon in three hours; day 80 is the equinox, to the half degree of the formula."""
+def test_the_sun_moves_with_the_hour() -> None:
+    """From nine in the morning to noon in three hours; day 80 is the equinox within the half degree of the formula."""
     sun = Sun(hour=9.0, day=80, latitude=0.7)
     east, north, up = sun.direction(3 * 3600.0)
     assert (east, north) == pytest.approx((0.0, -math.sin(0.7)), abs=0.01)

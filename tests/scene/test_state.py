@@ -1,4 +1,4 @@
-"""A fresh state: everything asleep, attached, and where the model's settled joints put it."""
+"""A new state: all trees asleep, bunches attached, at the model's rest pose."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
 
 
-def test_at_rest_is_the_settled_shape():
+def test_a_new_state_is_the_rest_pose():
     tree = builder.TreeBuilder(np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0]))
     tip = tree.add_rod(-1, 1.0, (0.004, 0.003), builder.RodMaterial(5e9, 900.0), 8)[-1]
     stalk = tree.add_rod(tip, 0.06, (0.002, 0.002), builder.RodMaterial(3e8, 900.0), 2, organ=Organ.PEDUNCLE)[-1]

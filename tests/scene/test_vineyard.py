@@ -1,4 +1,4 @@
-"""Generation: the same bits twice, local randomness, the plant file's numbers, and equilibrium by other means."""
+"""Generation of vineyards: determinism, local randomness, statistics of the plant file, and equilibrium."""
 
 import math
 
@@ -22,36 +22,36 @@ def vineyard(request):
     return scene, generate(scene)
 
 
-def grown(scene, **layout):
+def with_layout(scene, **layout):
     return msgspec.structs.replace(scene, layout=msgspec.structs.replace(scene.layout, **layout))
 
 
-def test_twice_the_same_bits_and_another_seed_others(vineyard):
+def test_generation_is_deterministic_by_seed(vineyard):
     scene, model = vineyard
     assert generate(scene).digest() == model.digest()
     assert generate(msgspec.structs.replace(scene, seed=scene.seed + 1)).digest() != model.digest()
 
 
-def test_one_row_more_moves_nobody(vineyard):
+def test_another_row_changes_no_tree_of_the_others(vineyard):
     scene, model = vineyard
-    more = generate(grown(scene, rows=scene.layout.rows + 1))
+    more = generate(with_layout(scene, rows=scene.layout.rows + 1))
     for name, dim in model.array_fields().items():
         if dim.shape[0] in ("tree", "body", "bunch", "leaf"):
-            old = getattr(model, name)
-            assert np.array_equal(old, getattr(more, name)[: len(old)]), name
+            before = getattr(model, name)
+            assert np.array_equal(before, getattr(more, name)[: len(before)]), name
 
 
-def test_a_longer_row_leaves_its_first_vine_as_it_was(vineyard):
+def test_a_longer_row_does_not_change_its_first_vine(vineyard):
     scene, model = vineyard
-    more = generate(grown(scene, vines=scene.layout.vines + 1))
-    old, new = (np.isin(m.body_tree, np.flatnonzero(m.tree_vine == 0)) for m in (model, more))
+    more = generate(with_layout(scene, vines=scene.layout.vines + 1))
+    before, after = (np.isin(m.body_tree, np.flatnonzero(m.tree_vine == 0)) for m in (model, more))
     for name in ("body_rest", "body_mass", "joint_settled"):
-        assert np.array_equal(getattr(model, name)[old], getattr(more, name)[new]), name
+        assert np.array_equal(getattr(model, name)[before], getattr(more, name)[after]), name
 
 
 @pytest.mark.parametrize("training", ["tendone", "vsp"])
-def test_the_smallest_and_barest_vineyard_stands(training):
-    bare = scenes.Scene(
+def test_the_smallest_vineyard_is_generated(training):
+    empty = scenes.Scene(
         name="bare",
         seed=0,
         training=training,
@@ -59,12 +59,12 @@ def test_the_smallest_and_barest_vineyard_stands(training):
         season=scenes.Season(leafiness=0.0),
         fruit=scenes.Fruit(bunches=(0, 0), varieties=("black",)),
     )
-    counts = generate(bare).counts()
+    counts = generate(empty).counts()
     assert (counts["bunch"], counts["leaf"], counts["box"]) == (0, 0, 0)
     assert counts["tree"] > 20
 
 
-def test_bodies_of_a_tree_lie_together_parents_first(vineyard):
+def test_bodies_of_a_tree_are_contiguous_parents_first(vineyard):
     model = vineyard[1]
     for tree in range(len(model.tree_first)):
         bodies = np.arange(len(model.body_mass))[model.bodies_of(tree)]
@@ -86,7 +86,7 @@ def test_some_shoots_fork(vineyard):
     assert 0.15 < (children >= 2).sum() / len(model.tree_first) < 0.45
 
 
-def test_bunches_end_their_peduncles_and_hang_plumb(vineyard):
+def test_bunches_are_at_the_end_of_peduncles_and_hang_vertically(vineyard):
     model = vineyard[1]
     bunch = model.bunch_body
     assert (model.body_organ[bunch] == Organ.BUNCH).all()
@@ -96,31 +96,31 @@ def test_bunches_end_their_peduncles_and_hang_plumb(vineyard):
     assert frames.rotate(q[bunch, 3:], np.array([1.0, 0.0, 0.0]))[:, 2].max() < -0.98
 
 
-def test_bunches_are_drawn_as_the_plant_file_asks(vineyard):
-    """Mass within its range, mean and variation as asked for; berries of the varieties' mass; hulls in the range given.
+def test_bunches_have_the_statistics_of_the_plant_file(vineyard):
+    """Mass within its range, with its mean and variation; berries of the varieties' mass; hulls within their range.
 
-    The numbers of the file are mostly GUESSED: this shows that generation follows the file, not that real bunches do.
+    The file's numbers are mostly GUESSED: this tests generation against the file, not against real bunches.
     """
     scene, model = vineyard
-    asked = plant_parameters.load_plant(scene.plants).bunch
+    parameters = plant_parameters.load_plant(scene.plants).bunch
     mass = model.body_mass[model.bunch_body].astype(float)
-    low, high = asked.mass_range.value
+    low, high = parameters.mass_range.value
     assert low * (1.0 - 1e-5) <= mass.min() <= mass.max() <= high * (1.0 + 1e-5)
     error = mass.std() / np.sqrt(len(mass))
-    assert abs(mass.mean() - asked.mass.value) < 4.0 * error
+    assert abs(mass.mean() - parameters.mass.value) < 4.0 * error
     assert mass.std() / mass.mean() == pytest.approx(
-        asked.mass_variation.value, rel=0.35
-    )  # the range cuts its ends off
-    shortest, longest = asked.length_range.value
+        parameters.mass_variation.value, rel=0.35
+    )  # the range truncates the distribution
+    shortest, longest = parameters.length_range.value
     assert shortest <= model.bunch_length.min() <= model.bunch_length.max() <= longest
     for variety in np.unique(model.bunch_variety):
-        mine = model.bunch_variety == variety
-        berries = mass[mine].sum() * (1.0 - asked.stem_share.value) / model.bunch_berries[mine].sum()
-        assert berries == pytest.approx(VARIETIES[variety].mass, rel=0.1)  # counts are whole, 40 to 140
+        of_variety = model.bunch_variety == variety
+        berries = mass[of_variety].sum() * (1.0 - parameters.stem_share.value) / model.bunch_berries[of_variety].sum()
+        assert berries == pytest.approx(VARIETIES[variety].mass, rel=0.1)  # counts are integers, 40 to 140
 
 
-def test_clusters_are_a_chain_behind_the_core_that_weighs_what_the_bunch_weighs(vineyard):
-    """Head and clusters, where they hang at rest, have together the mass, centre and moments of the compound."""
+def test_clusters_are_a_chain_behind_the_core_with_the_mass_of_the_bunch(vineyard):
+    """Head and clusters at rest have together the mass, centre and moments of the compound."""
     model = vineyard[1]
     assert 4 <= model.bunch_clusters.min() < model.bunch_clusters.max() <= 8
     long = model.bunch_length > np.median(model.bunch_length)
@@ -132,7 +132,7 @@ def test_clusters_are_a_chain_behind_the_core_that_weighs_what_the_bunch_weighs(
         assert (model.body_parent[parts] == [body, *parts[:-1]]).all()
         assert (parts >= model.tree_first[model.body_tree[body]] + model.tree_core[model.body_tree[body]]).all()
         local = frames.compose(frames.inverse(q[body]), q[parts])
-        assert np.abs(np.abs(local[:, 6]) - 1.0).max() < 1e-6  # as drawn, all look one way
+        assert np.abs(np.abs(local[:, 6]) - 1.0).max() < 1e-6  # drawn with equal rotations
         mass = np.append(model.bunch_head_mass[bunch], model.body_mass[parts]).astype(float)
         com = np.concatenate([model.bunch_head_com[bunch, None], local[:, :3] + model.body_com[parts]])
         inertia = np.concatenate([model.bunch_head_inertia[bunch, None], model.body_inertia[parts]])
@@ -149,7 +149,7 @@ def test_shoots_are_tied_where_they_pass_wires(vineyard):
     scene, model = vineyard
     q = model.forward_kinematics(model.joint_settled)[model.tie_body]
     at = q[:, :3] + frames.rotate(q[:, 3:], model.tie_point.astype(float))
-    assert np.abs(at - model.tie_anchor).max() < 1e-5  # slack as drawn
+    assert np.abs(at - model.tie_anchor).max() < 1e-5  # unstretched as drawn
     wire = model.fixed_organ == Organ.WIRE
     start, end = model.fixed_start[wire].astype(float), model.fixed_end[wire].astype(float)
     gap = np.array([to_segment(point, start, end).min() for point in at])
@@ -161,11 +161,10 @@ def test_shoots_are_tied_where_they_pass_wires(vineyard):
     assert 500.0 < model.tie_stiffness.min() <= model.tie_stiffness.max() < 3000.0
 
 
-def test_drag_is_coefficient_times_the_area_seen_from_the_side(vineyard):
-    """Silhouettes are measured strip by strip: trapezia of wood, ellipses of bunches; leaves by their one-sided
-    area."""
+def test_drag_is_coefficient_times_side_area(vineyard):
+    """Silhouettes are summed in strips: trapezia of wood, ellipses of bunches; leaves by their one-sided area."""
     scene, model = vineyard
-    asked = plant_parameters.load_plant(scene.plants)
+    parameters = plant_parameters.load_plant(scene.plants)
     wood = model.body_organ != Organ.BUNCH
     along = (np.arange(200) + 0.5) / 200
     start, end = model.body_radius[wood].T.astype(float)
@@ -173,16 +172,15 @@ def test_drag_is_coefficient_times_the_area_seen_from_the_side(vineyard):
     stems = (width.mean(1) * model.body_length[wood]).sum()
     height = 2.0 * model.bunch_radius[:, None] * np.sqrt(1.0 - (2.0 * along - 1.0) ** 2)
     bunches = (height.mean(1) * model.bunch_length).sum()
-    expected = asked.cane.drag.value * stems + asked.bunch.drag.value * bunches
-    expected += asked.leaf.drag.value * total_leaf_area(model)
+    expected = parameters.cane.drag.value * stems + parameters.bunch.drag.value * bunches
+    expected += parameters.leaf.drag.value * total_leaf_area(model)
     assert model.body_drag.sum() == pytest.approx(expected, rel=2e-3)
     clusters = (model.body_organ == Organ.BUNCH) & ~np.isin(np.arange(len(wood)), model.bunch_body)
     assert not model.body_drag[clusters].any()
 
 
 def test_a_peduncle_breaks_where_its_outer_fibre_reaches_the_strength(vineyard):
-    """Moment of a linear stress over a round section, summed over the section: the strength is in the outermost
-    fibre."""
+    """Moment of a linear stress over a round section whose outermost fibre is at the strength."""
     scene, model = vineyard
     strength = plant_parameters.load_plant(scene.plants).peduncle.bend_strength.value
     radius = model.body_radius[model.body_parent[model.bunch_body], 1].astype(float)
@@ -204,7 +202,7 @@ def test_tendone_heights_and_leaves():
     assert 1.0 < np.median(shoot) < 1.5
 
 
-def test_hedge_heights():
+def test_vsp_heights():
     scene = scenes.load_scene("vsp")
     model = generate(scene)
     q = State.at_rest(model).body_q
@@ -217,8 +215,8 @@ def test_hedge_heights():
 
 def to_segment(point, start, end):
     along = end - start
-    share = np.clip(((point - start) * along).sum(-1) / (along * along).sum(-1), 0.0, 1.0)
-    return np.linalg.norm(point - start - share[..., None] * along, axis=-1)
+    fraction = np.clip(((point - start) * along).sum(-1) / (along * along).sum(-1), 0.0, 1.0)
+    return np.linalg.norm(point - start - fraction[..., None] * along, axis=-1)
 
 
 def test_every_bunch_hangs_clear_of_wood_ground_and_other_bunches(vineyard):
@@ -227,10 +225,14 @@ def test_every_bunch_hangs_clear_of_wood_ground_and_other_bunches(vineyard):
     top = q[model.bunch_body, :3]
     tip = top + frames.rotate(q[model.bunch_body, 3:], np.array([1.0, 0.0, 0.0])) * model.bunch_length[:, None]
     assert tip[:, 2].min() > 0.4
-    hard = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
-    start, end, radius = (getattr(model, f"fixed_{k}")[hard].astype(float) for k in ("start", "end", "radius"))
-    for share in (0.0, 0.5, 1.0):
-        gap = to_segment((top + share * (tip - top))[:, None], start, end) - radius.max(1) - model.bunch_radius[:, None]
+    solid = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
+    start, end, radius = (getattr(model, f"fixed_{k}")[solid].astype(float) for k in ("start", "end", "radius"))
+    for fraction in (0.0, 0.5, 1.0):
+        gap = (
+            to_segment((top + fraction * (tip - top))[:, None], start, end)
+            - radius.max(1)
+            - model.bunch_radius[:, None]
+        )
         assert gap.min() > 0.0
     level = (
         np.linalg.norm(top[:, None, :2] - top[None, :, :2], axis=-1) - model.bunch_radius[:, None] - model.bunch_radius
@@ -241,7 +243,7 @@ def test_every_bunch_hangs_clear_of_wood_ground_and_other_bunches(vineyard):
 
 
 def as_heads(model):
-    """The model with heads only where bunches have clusters: no weight counts twice."""
+    """The model with only the heads of bunches, so that mass of clusters does not count twice."""
     model = model.copy()
     for name in ("mass", "com", "inertia"):
         getattr(model, f"body_{name}")[model.bunch_body] = getattr(model, f"bunch_head_{name}")
@@ -249,14 +251,14 @@ def as_heads(model):
 
 
 def test_the_drawn_shape_is_an_equilibrium(vineyard):
-    """At ``joint_settled`` each spring carries the moment of everything that hangs below it, summed body by body."""
+    """At ``joint_settled`` each spring carries the moment of all bodies beyond it, summed body by body."""
     model = as_heads(vineyard[1])
     q = model.forward_kinematics(model.joint_settled)
     centre = q[:, :3] + frames.rotate(q[:, 3:], model.body_com.astype(float))
     weight = np.outer(model.body_mass.astype(float), [0.0, 0.0, -9.81])
     angle = frames.log(model.joint_settled.astype(float))
-    laden = np.unique(model.body_tree[model.bunch_body])
-    for tree in [*laden[:25], *range(5)]:
+    bunch_count = np.unique(model.body_tree[model.bunch_body])
+    for tree in [*bunch_count[:25], *range(5)]:
         bodies = range(*model.bodies_of(tree).indices(len(q)))
         carried = {b: {b} for b in bodies}
         for b in reversed(bodies):
@@ -297,16 +299,16 @@ def modes(model, tree):
     for i in reversed(range(1, n)):
         below[parent[i]] |= below[i]
     ties = np.flatnonzero((model.tie_body >= bodies.start) & (model.tie_body < bodies.stop))
-    held, pull = model.tie_body[ties] - first, model.tie_stiffness[ties, None].astype(float)
+    tied, pull = model.tie_body[ties] - first, model.tie_stiffness[ties, None].astype(float)
 
     def unbalanced(angle):
         q, axes, centre = place(angle)
         weight = np.outer(mass, [0.0, 0.0, -9.81])
-        at = q[held, :3] + frames.rotate(q[held, 3:], model.tie_point[ties].astype(float))
+        at = q[tied, :3] + frames.rotate(q[tied, 3:], model.tie_point[ties].astype(float))
         force = pull * (model.tie_anchor[ties] - at)
         moment = [
             np.cross(centre[below[i]] - q[i, :3], weight[below[i]]).sum(0)
-            + np.cross(at[below[i, held]] - q[i, :3], force[below[i, held]]).sum(0)
+            + np.cross(at[below[i, tied]] - q[i, :3], force[below[i, tied]]).sum(0)
             for i in range(n)
         ]
         return (model.joint_stiffness[bodies] * angle - frames.rotate(frames.conjugate(axes), np.array(moment))).ravel()
@@ -329,44 +331,46 @@ def modes(model, tree):
     return square.real[order], shape.real[:, order], inertia
 
 
-def test_shoots_stand_and_bunches_swing_as_the_peduncle_was_chosen_for(vineyard):
-    """Every equilibrium is stable, and a laden bunch swings at 0.9-1.6 Hz, for which ``peduncle.modulus`` was chosen.
+def test_shoots_are_stable_and_bunches_swing_in_the_chosen_band(vineyard):
+    """Every equilibrium is stable, and a bunch swings at 0.9-1.6 Hz, for which ``peduncle.modulus`` was chosen.
 
     The band is a GUESSED target: no measurement of swinging grape bunches is at hand.
     """
     model = vineyard[1]
-    laden = np.bincount(model.body_tree[model.bunch_body], minlength=len(model.tree_first))
+    bunch_count = np.bincount(model.body_tree[model.bunch_body], minlength=len(model.tree_first))
     swings = []
     for count in (0, 1, 2):
-        for tree in np.flatnonzero(laden == count)[:: 9 if count == 0 else 1][:6]:
+        for tree in np.flatnonzero(bunch_count == count)[:: 9 if count == 0 else 1][:6]:
             square, shape, inertia = modes(model, tree)
-            assert square[0] > 0.0, f"tree {tree} with {count} bunches falls over"
+            assert square[0] > 0.0, f"tree {tree} with {count} bunches is unstable"
             if count == 1:
                 stalk = slice(3 * int(model.tree_core[tree] - 3), None)  # two pieces of stalk and the bunch
-                own = np.array([abs(v[stalk] @ (inertia @ v)[stalk]) / abs(v @ inertia @ v) for v in shape.T])
-                swings.append(math.sqrt(square[np.argmax(np.where(square < 200.0, own, 0.0))]) / (2.0 * math.pi))
+                bunch_share = np.array([abs(v[stalk] @ (inertia @ v)[stalk]) / abs(v @ inertia @ v) for v in shape.T])
+                swings.append(
+                    math.sqrt(square[np.argmax(np.where(square < 200.0, bunch_share, 0.0))]) / (2.0 * math.pi)
+                )
     assert 0.9 < np.median(swings) < 1.6, swings
 
 
-def test_the_demo_offers_a_bunch_to_two_robots():
-    """Start places 1.1-1.3 m apart, a bunch before both within 0.75 m, and nothing to run into."""
+def test_two_robots_of_the_demo_reach_one_bunch():
+    """Start places 1.1-1.3 m apart, a bunch before both within 0.75 m, and no obstacle near."""
     scene = scenes.load_scene("demo")
     model = generate(scene)
     top = State.at_rest(model).body_q[model.bunch_body, :3]
     a, b = (np.array([s.x, s.y]) for s in scene.spawns)
     assert 1.1 < np.linalg.norm(a - b) < 1.3
-    far = np.maximum(np.linalg.norm(top[:, :2] - a, axis=1), np.linalg.norm(top[:, :2] - b, axis=1))
-    shared = np.argmin(far)
-    assert far[shared] < 0.75
+    distance = np.maximum(np.linalg.norm(top[:, :2] - a, axis=1), np.linalg.norm(top[:, :2] - b, axis=1))
+    nearest = np.argmin(distance)
+    assert distance[nearest] < 0.75
     for spawn in scene.spawns:
         ahead = np.array([math.cos(spawn.yaw), math.sin(spawn.yaw)])
-        assert ahead @ (top[shared, :2] - [spawn.x, spawn.y]) > 0.6
+        assert ahead @ (top[nearest, :2] - [spawn.x, spawn.y]) > 0.6
         wood = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
         assert np.linalg.norm(model.fixed_start[wood, :2] - [spawn.x, spawn.y], axis=1).min() > 0.6
         assert np.linalg.norm(model.box_pose[:, :2] - [spawn.x, spawn.y], axis=1).min() > 0.8
 
 
-def test_the_table_counts_what_the_model_holds(vineyard):
+def test_the_summary_counts_match_the_model(vineyard):
     scene, model = vineyard
     rows = {name: (value, unit) for name, value, unit in summary_rows(scene, model)}
     assert rows["bunches"][0] == str(len(model.bunch_body))

@@ -12,6 +12,7 @@ from vinesim.sensors.camera.camera import QUALITIES, Camera, CameraSpec
 from vinesim.sensors.camera.stereo import Stereo
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import pinhole
+from vinesim.sensors.raster.primitive_arrays import LEAF
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.spec_file import noise_rng
 
@@ -93,3 +94,29 @@ def test_a_pool_shares_tasks_and_raises_their_errors() -> None:
         pool.share([lambda: 1 // 0] * 2)
     pool.share([lambda: done.append(20)])
     assert done[-1] == 20
+
+
+@pytest.mark.parametrize("pose", [ALONG_THE_ROW, AT_A_BUNCH], ids=["row", "bunch"])
+@pytest.mark.parametrize("info", [SPEC.info("optical"), ODD], ids=["640x480", "136x102"])
+def test_eight_points_at_once_are_lit_as_each_alone(primitives, pose, info) -> None:
+    """The kernels of live pictures against those of all others, at the same points: one look."""
+    batched, single = (Camera(SPEC, info, quality="fast") for _ in range(2))
+    assert batched._live_light is not None
+    single._live_light = None
+    mine, theirs = (camera.render(primitives, pose, outputs=CameraOutput.RGB).rgb for camera in (batched, single))
+    apart = np.abs(mine.astype(int) - theirs)
+    assert apart.mean() < 0.2
+    assert (apart > 8).mean() < 1e-3
+    assert mine.std() > 20.0
+
+
+def test_actors_and_the_autumn_are_lit_alike(tmp_path) -> None:
+    """Robots, crates and people are in no class of their own, and every leaf may have turned."""
+    primitives = sensor_scenes.everything(tmp_path)
+    pose = look_at(np.array([0.2, 0.4, 1.2]), np.array([1.6, 1.3, 0.9]))
+    leaves = primitives.shapes.kind.numpy() == LEAF
+    primitives.shapes.d.numpy()[leaves, 3] = np.linspace(0.0, 1.0, leaves.sum())
+    batched, single = (Camera(SPEC, INFO, quality="fast") for _ in range(2))
+    single._live_light = None
+    mine, theirs = (camera.render(primitives, pose, outputs=CameraOutput.RGB).rgb for camera in (batched, single))
+    assert np.abs(mine.astype(int) - theirs).mean() < 0.2

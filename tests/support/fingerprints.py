@@ -45,10 +45,10 @@ def push() -> str:
     physics = Physics(model)
     robot = Robot(physics.rigid, load_description("vinebot"), "anna", pose=stand)
     body = model.bunch_body[bunch]
-    plan = PushBunch(robot, "left", lambda: physics.state.body_q[body, :3])
+    task = PushBunch(robot, "left", lambda: physics.state.body_q[body, :3])
     h = hashlib.blake2b(digest_size=16)
     for _ in range(300):
-        plan.control(physics.time)
+        task.control(physics.time)
         robot.control(physics.time)
         physics.step()
         test_determinism.digest(physics, h)

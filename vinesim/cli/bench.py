@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 
 from vinesim.scene.values import Measurement
 
@@ -46,12 +47,6 @@ def _camera() -> Iterator[Measurement]:
     from vinesim.bench.camera import camera
 
     return camera()
-
-
-def _eyes() -> Iterator[Measurement]:
-    from vinesim.bench.live_camera import eyes
-
-    return eyes()
 
 
 def _lidar() -> Iterator[Measurement]:
@@ -96,6 +91,14 @@ def _link() -> Iterator[Measurement]:
     return link()
 
 
+def _live(rows: Sequence[str] = ()) -> Iterator[Measurement]:
+    from vinesim.bench.live import ROWS, live
+
+    if unknown := sorted(set(rows) - ROWS.keys()):
+        raise NoSuchBench(f"bench live has no row {unknown[0]!r}; there are: {', '.join(ROWS)}")
+    return live(rows, lambda line: print(line, file=sys.stderr, flush=True))
+
+
 RAISED = {
     "torso_lift_joint": 0.45,
     **{f"arm_{side}_{i}_joint": q for side in ("left", "right") for i, q in ((1, 0.6), (2, 0.1), (4, 1.8))},
@@ -110,7 +113,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "camera": _camera,
     "lidar": _lidar,
     "sensors": _sensors,
-    "eyes": _eyes,
+    "live": _live,
     "sync": _sync,
     "link": _link,
     "traffic": _traffic,
@@ -123,10 +126,13 @@ class NoSuchBench(ValueError):
     """There is no benchmark of that name; the text lists all."""
 
 
-def _measurements(name: str, plot: pathlib.Path | None) -> Iterator[Measurement]:
+def _measurements(name: str, plot: pathlib.Path | None, rows: Sequence[str]) -> Iterator[Measurement]:
     drawn = {"sync": _sync, "sensors": _sensors}.get(name)
     try:
-        yield from drawn(plot) if drawn else BENCHES[name]()
+        if name == "live":
+            yield from _live(rows)
+        else:
+            yield from drawn(plot) if drawn else BENCHES[name]()
     except ModuleNotFoundError as missing:
         if not (missing.name or "").startswith("vinesim.bench.support"):
             raise
@@ -135,16 +141,18 @@ def _measurements(name: str, plot: pathlib.Path | None) -> Iterator[Measurement]
         ) from None
 
 
-def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None) -> int:
+def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = ()) -> int:
     """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
-    ``plot``: the file that sync draws, or the folder for the plots of sensors.
+    ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none.
     """
+    if rows and "live" not in names:
+        raise NoSuchBench("--row chooses rows of the bench live; leave it out")
     for name in names:
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in _measurements(name, plot):
+        for m in _measurements(name, plot, rows):
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

@@ -66,6 +66,7 @@ class ClientOptions:
     status: str
     sensor_hz: float | None
     renderer: str
+    tick_log: pathlib.Path | None
 
 
 def check_role(role: str, given: Collection[str]) -> None:

@@ -32,6 +32,8 @@ SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
 STATUS_PERIOD = 1.0
 """Wall time between two status lines [s]."""
+FIRST_STATUS = 0.1
+"""Wall time from the first step to the first status line [s]: whoever waits for a client learns that it runs."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -100,14 +102,15 @@ class ClientSession:
 
     def run(
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
-        publish: Callable[[dict[str, Any]], None] = lambda _: None,
+        sensors: Callable[[], dict[str, Any]] = dict, publish: Callable[[dict[str, Any]], Any] = lambda _: None,
     ) -> Status:  # fmt: skip
         """Step in real time until a signal, the time limit or the end of the ``task``; returns the final status.
 
-        ``sent`` counts the ROS messages by topic, ``publish`` takes every status for /diagnostics.
+        ``sent`` counts the ROS messages by topic, ``sensors`` gives the status of sensors, ``publish`` takes every
+        status for /diagnostics.
         """
         loop = RateLoop(client.physics.dt)
-        status = Status(client, loop, sent, task)
+        status = Status(client, loop, sent, task, sensors)
         reporter = threading.Thread(
             target=report_status, args=(status, publish, self.options.status, self._stop), name="status"
         )
@@ -116,6 +119,8 @@ class ClientSession:
         self._stack.callback(self._stop.set)
         is_done = (lambda: False) if task is None else (lambda: task.is_done)
         run_loop(self._stop, client.tick, loop, self.options.seconds, client.physics.dt, is_done)
+        if self.options.tick_log is not None:
+            loop.log().save(self.options.tick_log)
         return status
 
 
@@ -149,10 +154,12 @@ def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
     partial.replace(out / "report.json")
 
 
-def report_status(status: Status, publish: Callable[[dict[str, Any]], None], form: str, stop: threading.Event) -> None:
+def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form: str, stop: threading.Event) -> None:
     """Every second hand the status to ``publish`` and print it as text or JSON; runs until ``stop``."""
+    period = FIRST_STATUS
     try:
-        while not stop.wait(STATUS_PERIOD):
+        while not stop.wait(period):
+            period = STATUS_PERIOD
             values = status.current()
             publish(values)
             if form == "json":
@@ -168,5 +175,6 @@ def status_line(values: dict[str, Any]) -> str:
     return (
         f"{values['time']:7.1f} s  {values['tick_hz']:6.2f} Hz  p99 {values['tick_p99_ms']:5.2f} ms  "
         f"awake {values['awake']:3d}  force {values['force']:6.2f} N  "
+        f"dropped {values['frames_dropped']} frames {values['messages_dropped']} messages  "
         f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'nobody'}"
     )

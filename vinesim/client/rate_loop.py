@@ -2,9 +2,49 @@
 
 from __future__ import annotations
 
+import dataclasses
+import pathlib
 import time
 
 import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class TickLog:
+    """A record of steps, for statistics of any part of a run."""
+
+    begins: np.ndarray
+    """[step] when each began, by ``time.monotonic`` of this machine [s]."""
+    work: np.ndarray
+    """[step] how long it took [s]."""
+    dt: float
+    """[s]"""
+
+    def between(self, since: float, until: float) -> dict[str, float]:
+        """Rate, percentiles of the work, overruns and real-time factor of the steps that began in a span of time [s].
+
+        :class:`ValueError` if there are fewer than two.
+        """
+        part = slice(*np.searchsorted(self.begins, (since, until)))
+        begins, work = self.begins[part], self.work[part]
+        if len(begins) < 2:
+            raise ValueError(f"{len(begins)} steps began between {since:.3f} and {until:.3f} s")
+        hz = float((len(begins) - 1) / (begins[-1] - begins[0]))
+        p50, p99 = (1e3 * float(value) for value in np.percentile(work, (50, 99)))
+        return {
+            "tick_hz": hz, "tick_p50_ms": p50, "tick_p99_ms": p99, "overruns": int((work > self.dt).sum()),
+            "real_time_factor": hz * self.dt,
+        }  # fmt: skip
+
+    def save(self, path: pathlib.Path) -> None:
+        """Write it as a NumPy archive."""
+        np.savez(path, begins=self.begins, work=self.work, dt=self.dt)
+
+    @classmethod
+    def load(cls, path: pathlib.Path) -> TickLog:
+        """Read what :meth:`save` wrote."""
+        with np.load(path) as archive:
+            return cls(archive["begins"], archive["work"], float(archive["dt"]))
 
 
 class RateLoop:
@@ -25,6 +65,7 @@ class RateLoop:
         self.dropped = 0
         """Deadlines dropped after a stall."""
         self._work = np.zeros(capacity, np.float32)
+        self._begins = np.zeros(capacity)
         self._began = self._start = self._deadline = 0.0
 
     def begin(self) -> None:
@@ -47,6 +88,7 @@ class RateLoop:
         """End the measurement of this step's work."""
         work = time.perf_counter() - self._began
         self._work[self.ticks % len(self._work)] = work
+        self._begins[self.ticks % len(self._work)] = self._began
         self.overruns += work > self.dt
         self.ticks += 1
 
@@ -66,6 +108,11 @@ class RateLoop:
         """Simulated time over wall time at the end of the last step."""
         span = self._began - self._start + float(self._work[(self.ticks - 1) % len(self._work)])
         return self.ticks * self.dt / span if span > 0.0 else 0.0
+
+    def log(self) -> TickLog:
+        """When the last steps began and how long they took, as many as there was room for."""
+        order = np.arange(max(self.ticks - len(self._work), 0), self.ticks) % len(self._work)
+        return TickLog(self._begins[order], self._work[order].astype(float), self.dt)
 
     def work_ms(self, *percentiles: float) -> list[float]:
         """Percentiles (0 to 100) of the work of a step [ms]."""

@@ -50,6 +50,9 @@ Push = Annotated[int | None, typer.Option(hidden=True, help="Of a robot: reach f
 Watch = Annotated[
     int | None, typer.Option(hidden=True, help="Of a robot: record force and displacement of this bunch.")
 ]
+TickLog = Annotated[
+    pathlib.Path | None, typer.Option(hidden=True, help="Write when each tick began and its work (.npz).")
+]
 Walk = Annotated[tuple[float, float] | None, typer.Option(hidden=True, help="Of a human: walk to this point, x y [m].")]
 Reach = Annotated[
     int | None, typer.Option(hidden=True, help="Of a human: walk to this bunch, hold it, pull, let go, repeatedly.")
@@ -63,7 +66,7 @@ def client(
     walk: Walk = None, reach: Reach = None, height: Height = 1.75, watch: Watch = None,
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
-    sensor_hz: SensorRate = None, renderer: Renderer = "warp",
+    sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None,
 ) -> None:  # fmt: skip
     """Join the vineyard as one actor, with a simulation of its own.
 

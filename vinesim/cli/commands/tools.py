@@ -11,6 +11,10 @@ import typer
 def bench(
     names: Annotated[list[str], typer.Argument(help="plants, camera, sync; several are run one after the other.")],
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
+    row: Annotated[
+        list[str] | None,
+        typer.Option(help="Of live, only demo, camera, lidar, tendone, render, generate or cold; may repeat."),
+    ] = None,
     plot: Annotated[
         pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
     ] = None,
@@ -18,20 +22,22 @@ def bench(
     """Measure, beside a peer that runs in the same process on the same scene.
 
     Of physics: plants, contact, tick, asleep. Of sensors: camera and lidar (speed), sensors (what they measure, beside
-    the truth), eyes (the tick beside pictures). Of the network: sync (what delay does, in simulated time), link (real
-    clients over emulated links; needs root), traffic (bytes a client receives), load (many clients), fuzz (broken
-    messages).
+    the truth). Of the whole: live (demo, clients and commands as users start them, beside budgets). Of the network:
+    sync (what delay does, in simulated time), link (real clients over emulated links; needs root), traffic (bytes a
+    client receives), load (many clients), fuzz (broken messages).
 
     \b
     Examples:
       vinesim bench plants --json
       vinesim bench plants camera
+      vinesim bench live --json
+      vinesim bench live --row demo --row camera
       vinesim bench sync --json --plot docs/pictures/network-sync.png
       vinesim bench sensors --plot docs/pictures
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json, plot))
+    raise typer.Exit(run(names, json, plot, row or ()))
 
 
 def ros_build_interfaces(

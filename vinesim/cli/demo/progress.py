@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vinesim.cli.demo.processes import REPORT_TIMEOUT, Process
+from vinesim.client.processes.child_process import REPORT_TIMEOUT, Process
 
 PICKER, VISITOR = "picker", "visitor"
 """The actors of a demo: the robot that touches or works, and the one that comes near."""
@@ -28,7 +28,7 @@ def show_progress(
 ) -> None:  # fmt: skip
     """Show the status of both clients until the picker ends, or ``is_over`` and then the picker is interrupted.
 
-    :class:`DemoFailed` if any process ends too early or the picker fails.
+    :class:`ProcessFailed` if any process ends too early or the picker fails.
     """
     live = contextlib.nullcontext() if headless or not console.is_terminal else Live(console=console, transient=True)
     with live as view:

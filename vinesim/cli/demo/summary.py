@@ -2,18 +2,46 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pathlib
 import shutil
-from typing import Any
+import time
+from collections.abc import Mapping
+from typing import Any, Self
 
 from rich.table import Table
 
 from vinesim.cli.demo.progress import PICKER, VISITOR
+from vinesim.client.rate_loop import TickLog
 from vinesim.client.recording import contact_force_plot
 from vinesim.client.recording.bunch_trace import Rows, remote_error
 
+SMALL_TOPICS = ("/clock", "/joint_states", "/tf")
+"""Topics that every step publishes, and every ROS program needs."""
 LOOP_KEYS = ("tick_hz", "tick_p50_ms", "tick_p99_ms", "overruns", "real_time_factor")
+
+
+@dataclasses.dataclass(frozen=True)
+class Window:
+    """The part of a run that is measured, by ``time.monotonic`` [s]."""
+
+    since: float
+    until: float = float("inf")
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has no end yet."""
+        return self.until == float("inf")
+
+    @classmethod
+    def begin(cls) -> Self:
+        """From now on."""
+        return cls(time.monotonic())
+
+    def end(self) -> Window:
+        """Until now."""
+        return dataclasses.replace(self, until=time.monotonic())
 
 
 def write_summary(out: pathlib.Path, summary: dict[str, Any]) -> None:
@@ -31,9 +59,14 @@ def report_of(out: pathlib.Path, name: str) -> dict[str, Any]:
 
 
 def push_summary(
-    out: pathlib.Path, bunch: int, received: dict[str, Any], no_ros: str | None, scene: str, seed: int, seconds: float
-) -> dict[str, Any]:
-    """What was measured of a push; draws ``touch.png``. ``received``: statistics of the topic monitor, by topic."""
+    out: pathlib.Path, bunch: int, received: dict[str, Any], *, no_ros: str | None, scene: str, seed: int,
+    seconds: float, window: Window, starts: Mapping[str, float],
+) -> dict[str, Any]:  # fmt: skip
+    """What was measured of a push; draws ``touch.png``.
+
+    ``received``: statistics of the listener, by topic; ``starts``: times from the demo's start to the first event of
+    each client and topic [s].
+    """
     reports = {name: report_of(out, name) for name in (PICKER, VISITOR)}
     traces = {name: Rows.load(out / name / "trace.npz") for name in (PICKER, VISITOR)}
     contact_force_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
@@ -41,24 +74,56 @@ def push_summary(
         "touch_to_motion_ticks", "force_peak_n", "environment_bytes_when_far", "ticks_touching_when_far",
         "environment_bytes_out",
     )  # fmt: skip
+    loops = {name: TickLog.load(out / name / "ticks.npz").between(window.since, window.until) for name in reports}
     return {
-        "scene": scene, "seed": seed, "seconds": seconds, "bunch": bunch,
-        **{key: reports[PICKER][key] for key in (*LOOP_KEYS, *touch_keys)},
+        "scene": scene, "seed": seed, "seconds": seconds, "bunch": bunch, "start_s": dict(starts),
+        **loops[PICKER], **{key: reports[PICKER][key] for key in touch_keys}, "loops": loops,
         "remote_displacement_error_mm": remote_error(traces[PICKER], traces[VISITOR]),
         "ros": no_ros or "used",
         "ros_received": {topic: entry["count"] for topic, entry in sorted(received.items())},
+        "ros_hz": {topic: entry["hz"] for topic, entry in sorted(received.items())},
+        "ros_lost": lost_messages(received, reports[PICKER]),
         "ros_detail": received,
         "clients": reports,
     }  # fmt: skip
 
 
+def lost_messages(received: Mapping[str, Mapping[str, Any]], report: Mapping[str, Any]) -> dict[str, Any]:
+    """Messages of :data:`SMALL_TOPICS` that were lost: on the way, by the listener's count, and before they were sent.
+
+    The latter are of the whole run of the robot whose ``report`` it is. ``share``: of all that should have come.
+    """
+    dropped = report.get("ros_dropped", {})
+    topics = [topic for topic in SMALL_TOPICS if topic in received]
+    lost = {
+        topic: {
+            "on_the_way": received[topic]["lost"] or 0,
+            "before_sending": sum(dropped.get(name, 0) for name in (topic, topic.removeprefix("/"))),
+        }
+        for topic in topics
+    }
+    count = sum(sum(entry.values()) for entry in lost.values())
+    total = count + sum(received[topic]["count"] for topic in topics)
+    return {"topics": lost, "share": count / total if total else None}
+
+
 def push_table(summary: dict[str, Any]) -> Table:
     """The most important values of :func:`push_summary`, to print."""
-    error = summary["remote_displacement_error_mm"]
+    error, lost = summary["remote_displacement_error_mm"], summary["ros_lost"]["share"]
     table = Table(title="what was measured", title_justify="left", show_header=False)
     for label, text in (
-        ("tick rate", f"{summary['tick_hz']:.2f} Hz, p99 {summary['tick_p99_ms']:.2f} ms of 10"),
+        ("ready", f"{summary['start_s']['ready']:.1f} s after the start"),
+        *(
+            (f"tick rate of {name}", f"{loop['tick_hz']:.2f} Hz, p99 {loop['tick_p99_ms']:.2f} ms of 10")
+            for name, loop in summary["loops"].items()
+        ),
         ("real-time factor", f"{summary['real_time_factor']:.4f}"),
+        *(
+            (topic, f"{entry['hz'] or 0.0:.1f} Hz, {entry['slowest_second']} in the slowest second")
+            for topic, entry in summary["ros_detail"].items()
+            if topic in SMALL_TOPICS or topic.endswith(("rgb/image_raw", "depth/image_raw", "/points"))
+            if entry["count"]
+        ),
         ("touch to motion", f"{summary['touch_to_motion_ticks']} ticks"),
         ("largest force", f"{summary['force_peak_n']:.1f} N"),
         (
@@ -67,6 +132,7 @@ def push_table(summary: dict[str, Any]) -> Table:
         ),
         ("bytes of touched plants, nobody near", f"{summary['environment_bytes_when_far']}"),
         ("ROS messages received by a stock node", f"{sum(summary['ros_received'].values())}"),
+        ("lost of /clock, /joint_states, /tf", "none came" if lost is None else f"{100.0 * lost:.2f} %"),
     ):
         table.add_row(label, text)
     return table

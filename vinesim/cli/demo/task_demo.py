@@ -8,9 +8,9 @@ import pathlib
 from rich.console import Console
 
 from vinesim.cli.demo.placement import visitor_pose
-from vinesim.cli.demo.processes import START_TIMEOUT, process_group
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
+from vinesim.client.processes.child_process import START_TIMEOUT, process_group
 from vinesim.client.tasks.task_registry import UnknownTask
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware

@@ -1,10 +1,14 @@
-"""A monitor of ROS topics: subscribes with stock rclpy and reports counts, rates, latencies and losses.
+"""A monitor of ROS topics: subscribes with stock rclpy and reports counts, rates, latencies, ages and losses.
 
 ``python -m vinesim.ros.tools.topic_monitor --seconds 10`` subscribes to every topic (``--topic`` names some) and
-prints one JSON object: per topic the type and its hash, messages, rate, bytes, the median time from publishing to here
-(the age,
-for what was latched), the messages lost (gaps in the publisher's numbering) and whether the stamps ever went back.
-Without ``--seconds`` it runs until its standard input is closed.
+prints one JSON object: per topic the type and its hash, messages, rate, the fewest messages in any second, bytes, the
+median time from publishing to here (the age, for what was latched), the age of the stamp at arrival by /clock, the
+messages lost (gaps in the publisher's numbering) and whether the stamps ever went back. Without ``--seconds`` it runs
+until its standard input is closed; a line "restart" there begins the counts anew.
+
+With ``--announce`` it prints a JSON object when it listens and for the first message of every topic, each on a line,
+as the report then. With
+``--once TOPIC`` a topic is left after its first message, so that it costs its publisher nothing from then on.
 
 It takes messages in their serialised form, so that counting costs next to nothing; the first one of every topic is
 deserialised, to check that it is well-formed. It runs without vinesim's middleware profile, as any other node.
@@ -18,50 +22,84 @@ import dataclasses
 import importlib
 import json
 import pathlib
+import queue
 import statistics
 import struct
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 
-DISCOVERY_PERIOD = 0.2
-"""Time between two searches for new topics [s]."""
+DISCOVERY_PERIOD = 0.05
+"""Time between two searches for new topics, until all that were named are found [s]."""
 EXCLUDED_TOPICS = ("/rosout", "/parameter_events")
 """Topics of every node, not monitored unless named."""
+CLOCK = "/clock"
+QUEUE_DEPTH = 10
+"""Messages that wait for this node: rclpy's default."""
+
+
+class SimulationClock:
+    """Simulated time by the /clock messages of the last second, the quickest of which is taken for undelayed."""
+
+    def __init__(self) -> None:
+        self._offsets: deque[int] = deque(maxlen=100)
+
+    def add(self, arrival: int, stamp: int) -> None:
+        """A /clock message of simulated time ``stamp`` [ns] arrived at wall time ``arrival`` [ns]."""
+        self._offsets.append(arrival - stamp)
+
+    def age(self, arrival: int, stamp: int) -> int | None:
+        """Simulated time since ``stamp`` at ``arrival`` [ns]; None without a clock."""
+        return arrival - stamp - min(self._offsets) if self._offsets else None
 
 
 class TopicStats:
     """Statistics of one topic."""
 
-    def __init__(self, type_name: str, type_hash: str, message: type, publishers: int) -> None:
+    def __init__(
+        self, type_name: str, type_hash: str, message: type, publishers: int, clock: SimulationClock | None = None
+    ) -> None:
         self.type_name, self.type_hash = type_name, type_hash
         self.publishers = publishers
-        self.count = self.bytes = self.lost = 0
-        self.first = self.last = 0.0
-        self.stamps_rise = True
+        self.first: float | None = None
+        """Wall time of the first message [s since the epoch]."""
+        self.is_clock = False
+        """Whether these messages set ``clock``."""
+        self._clock = clock or SimulationClock()
         self._message = message
         self._stamp_at = _stamp_offset(message)
         self._stamp = (-1, 0)
         self._sequence: int | None = None
+        self.restart(None)
+
+    def restart(self, since: float | None) -> None:
+        """Forget all counts; rates are from the wall time ``since`` [s] on, or from the first message on if None."""
+        self.since = since
+        self.count = self.bytes = self.lost = 0
+        self.stamps_rise = True
+        self._by_second: Counter[int] = Counter()
         self._latencies: deque[int] = deque(maxlen=10_000)
+        self._ages: deque[int] = deque(maxlen=10_000)
 
     def add(self, message: bytes, info: dict[str, Any]) -> None:
         """Count one serialised message with its meta-data from the middleware."""
         now = time.time_ns()
-        if not self.count:
+        if self.first is None:
             from rclpy.serialization import deserialize_message
 
             deserialize_message(message, self._message)
             self.first = now * 1e-9
-        self.last = now * 1e-9
+        if self.since is None:
+            self.since = now * 1e-9
         self.count += 1
         self.bytes += len(message)
+        self._by_second[int(now * 1e-9 - self.since)] += 1
         self._latencies.append(now - info["source_timestamp"])
         sequence = info["publication_sequence_number"]
         if sequence is not None:
@@ -69,21 +107,31 @@ class TopicStats:
                 self.lost += max(sequence - self._sequence - 1, 0)
             self._sequence = sequence
         if self._stamp_at is not None and len(message) >= self._stamp_at + 8:
-            order = "<" if message[1] & 1 else ">"
-            stamp = struct.unpack_from(order + "iI", message, self._stamp_at)
-            self.stamps_rise &= stamp >= self._stamp
-            self._stamp = stamp
+            self._add_stamp(now, struct.unpack_from(("<" if message[1] & 1 else ">") + "iI", message, self._stamp_at))
 
-    def report(self) -> dict[str, Any]:
-        """The statistics as plain values; ``lost`` is None if several publishers number their messages apart."""
-        span = self.last - self.first
+    def _add_stamp(self, now: int, stamp: tuple[int, int]) -> None:
+        self.stamps_rise &= stamp >= self._stamp
+        self._stamp = stamp
+        simulated = stamp[0] * 1_000_000_000 + stamp[1]
+        if self.is_clock:
+            self._clock.add(now, simulated)
+        if (age := self._clock.age(now, simulated)) is not None:
+            self._ages.append(age)
+
+    def report(self, until: float | None = None) -> dict[str, Any]:
+        """The statistics until a wall time [s] as plain values; ``lost`` is None if several publishers number their
+        messages apart."""
+        span = (time.time() if until is None else until) - (self.since or 0.0)
         return {
             "type": self.type_name,
             "type_hash": self.type_hash,
+            "first": self.first,
             "count": self.count,
-            "hz": round((self.count - 1) / span, 2) if self.count > 1 and span > 0.0 else None,
+            "hz": round(self.count / span, 2) if self.count > 1 and span > 0.0 else None,
+            "slowest_second": min((self._by_second[i] for i in range(int(span))), default=None) if self.count else None,
             "bytes": self.bytes,
             "latency_ms": round(statistics.median(self._latencies) * 1e-6, 3) if self._latencies else None,
+            "age_ms": _percentiles_ms(self._ages),
             "lost": self.lost if self.publishers <= 1 else None,
             "stamps_rise": self.stamps_rise if self._stamp_at is not None else None,
         }
@@ -92,34 +140,55 @@ class TopicStats:
 class TopicMonitor:
     """Subscribes to topics as they appear."""
 
-    def __init__(self, topics: Sequence[str] = ()) -> None:
+    def __init__(
+        self, topics: Sequence[str] = (), once: Sequence[str] = (), announce: Callable[[str, float], None] | None = None
+    ) -> None:
+        """``topics`` and ``once`` name the topics, all if both are empty; ``announce`` is called with each topic and
+        the wall time of its first message [s]."""
         from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
 
         self.stats: dict[str, TopicStats] = {}
-        self._topics = tuple(topics)
+        self._topics, self._once = {*topics, *once}, set(once)
+        self._announce = announce
+        self._unannounced: set[str] = set()
+        self._clock = SimulationClock()
         self._context = Context()
         self._context.init([])
         self._node = Node("topic_monitor", context=self._context, enable_rosout=False, start_parameter_services=False)
+        self._subscriptions: dict[str, Any] = {}
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
 
-    def run(self, until: threading.Event, seconds: float | None) -> None:
-        """Count messages until the event, or for so many ``seconds`` [s] after the first message."""
+    def run(self, requests: queue.SimpleQueue[str], seconds: float | None) -> None:
+        """Count messages until a request "stop", or for so many ``seconds`` [s] after the first message."""
         next_look = 0.0
         deadline = None
-        while not until.is_set() and (deadline is None or time.monotonic() < deadline):
-            if time.monotonic() >= next_look:
+        while deadline is None or time.monotonic() < deadline:
+            if time.monotonic() >= next_look and not (self._topics and self._topics <= self.stats.keys()):
                 self._discover()
                 next_look = time.monotonic() + DISCOVERY_PERIOD
             self._executor.spin_once(timeout_sec=DISCOVERY_PERIOD)
+            if self._unannounced:
+                self._announce_first()
             if seconds is not None and deadline is None and any(topic.count for topic in self.stats.values()):
                 deadline = time.monotonic() + seconds
+            while not requests.empty():
+                if requests.get() == "stop":
+                    return
+                self.restart()
+
+    def restart(self) -> None:
+        """Begin all counts anew."""
+        now = time.time()
+        for topic in self.stats.values():
+            topic.restart(now)
 
     def report(self) -> dict[str, dict[str, Any]]:
         """The statistics of each topic."""
-        return {name: topic.report() for name, topic in sorted(self.stats.items())}
+        now = time.time()
+        return {name: topic.report(now) for name, topic in sorted(self.stats.items())}
 
     def close(self) -> None:
         """Leave the graph."""
@@ -144,14 +213,32 @@ class TopicMonitor:
         reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in offered)
         latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in offered)
         qos = QoSProfile(
-            depth=20,
+            depth=QUEUE_DEPTH,
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        topic = TopicStats(type_name, str(offered[0].topic_type_hash), message, len(offered))
+        topic = TopicStats(type_name, str(offered[0].topic_type_hash), message, len(offered), self._clock)
+        topic.is_clock = name == CLOCK
         self.stats[name] = topic
+        self._unannounced.add(name)
         add: Any = topic.add  # rclpy hands over what the signature has room for, its annotations know less
-        self._node.create_subscription(message, name, add, qos, raw=True)
+        self._subscriptions[name] = self._node.create_subscription(message, name, add, qos, raw=True)
+
+    def _announce_first(self) -> None:
+        for name in [name for name in self._unannounced if self.stats[name].first is not None]:
+            self._unannounced.remove(name)
+            if self._announce is not None:
+                self._announce(name, self.stats[name].first or 0.0)
+            if name in self._once:
+                self._node.destroy_subscription(self._subscriptions.pop(name))
+
+
+def _percentiles_ms(times: Sequence[int]) -> dict[str, float] | None:
+    """Median and 95th percentile [ms] of times [ns]; None if there are none."""
+    if not times:
+        return None
+    ordered = sorted(times)
+    return {f"p{p}": round(ordered[min(p * len(ordered) // 100, len(ordered) - 1)] * 1e-6, 3) for p in (50, 95)}
 
 
 def _message_class(type_name: str) -> type | None:
@@ -175,6 +262,8 @@ class Arguments:
     """Options of the command line."""
 
     topics: list[str]
+    once: list[str]
+    announce: bool
     seconds: float | None
     out: pathlib.Path | None
 
@@ -185,10 +274,12 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
         prog="python -m vinesim.ros.tools.topic_monitor", description="Count what arrives on ROS topics."
     )
     parser.add_argument("--topic", action="append", default=[], help="monitor this one only (may be repeated)")
+    parser.add_argument("--once", action="append", default=[], help="only until its first message (may be repeated)")
+    parser.add_argument("--announce", action="store_true", help="print a JSON line for each topic's first message")
     parser.add_argument("--seconds", type=float, help="from the first message on; default: until stdin is closed")
     parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
     given = parser.parse_args(arguments)
-    return Arguments(given.topic, given.seconds, given.out)
+    return Arguments(given.topic, given.once, given.announce, given.seconds, given.out)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -200,19 +291,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     middleware.clear_profile()
     message_packages.ensure_importable(["tf2_msgs"])
-    stop = threading.Event()
+    requests: queue.SimpleQueue[str] = queue.SimpleQueue()
     if given.seconds is None:
-        threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
-    monitor = TopicMonitor(given.topics)
+        threading.Thread(target=_read_requests, args=(requests,), daemon=True).start()
+    monitor = TopicMonitor(given.topics, given.once, _print_first if given.announce else None)
+    if given.announce:
+        _print_line({"listening": time.time()})
     with contextlib.suppress(KeyboardInterrupt):
-        monitor.run(stop, given.seconds)
-    text = json.dumps(monitor.report(), indent=1)
+        monitor.run(requests, given.seconds)
+    text = json.dumps(monitor.report(), indent=None if given.announce else 1)
     monitor.close()
     if given.out is None:
         sys.stdout.write(text + "\n")
     else:
         given.out.write_text(text)
     return 0
+
+
+def _read_requests(requests: queue.SimpleQueue[str]) -> None:
+    """Pass the lines of standard input on, and "stop" at its end."""
+    for line in sys.stdin:
+        requests.put(line.strip())
+    requests.put("stop")
+
+
+def _print_first(topic: str, first: float) -> None:
+    _print_line({"topic": topic, "first": first})
+
+
+def _print_line(values: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(values) + "\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":

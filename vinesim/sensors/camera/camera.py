@@ -20,12 +20,14 @@ from vinesim.kernels.launch import ThreadPool, usable_cores
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.sensing import stereo_rows
-from vinesim.kernels.shading import deferred, shadow_maps
+from vinesim.kernels.shading import deferred, light_plants, light_points, shadow_maps
 from vinesim.kernels.shading.shadow_maps import ShadowMap
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput
 from vinesim.sensors import spec_file
 from vinesim.sensors.camera.exposure import Exposure
+from vinesim.sensors.camera.live_light import LiveLight
+from vinesim.sensors.camera.live_light import shadow_maps as shadow_maps_of
 from vinesim.sensors.camera.stereo import Stereo, StereoSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN, Sunlight, SunPath
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole, supersampled
@@ -91,16 +93,17 @@ class Quality:
     """Samples, squared, of one pixel's colour."""
     shadow_texel_divisor: int
     """Divides the texels of the shadow map nearby."""
-    second_from_first: bool
-    """Whether the second view of a stereo camera is moved out of the first one, or rendered."""
+    is_live: bool
+    """Whether a CPU lights eight points at once (:mod:`vinesim.sensors.camera.live_light`), and moves the second view
+    of a stereo camera out of the first one instead of rendering it."""
 
 
 MAX_THREADS = 4
 """A picture is not shared by more threads than this: the gain is used up."""
 QUALITIES = {
-    "fast": Quality(taps=-1, block=2, samples=1, shadow_texel_divisor=1, second_from_first=True),
-    "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1, second_from_first=False),
-    "still": Quality(taps=12, block=2, samples=2, shadow_texel_divisor=2, second_from_first=False),
+    "fast": Quality(taps=-1, block=2, samples=1, shadow_texel_divisor=1, is_live=True),
+    "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1, is_live=False),
+    "still": Quality(taps=12, block=2, samples=2, shadow_texel_divisor=2, is_live=False),
 }
 """``fast`` for live robots, ``full`` for spectators, ``still`` for pictures that are not live."""
 
@@ -108,7 +111,7 @@ QUALITIES = {
 @functools.cache
 def load_camera_kernels() -> None:
     """Compile the CPU kernels of cameras, or read them from the cache: threads must not do so at the same time."""
-    for module in (camera_raster, camera_raster_plants, deferred, shadow_maps, stereo_rows):
+    for module in (camera_raster, camera_raster_plants, deferred, shadow_maps, light_points, light_plants, stereo_rows):
         wp.load_module(module, device="cpu")
 
 
@@ -153,6 +156,7 @@ class Camera:
             self.sun, taps=quality.taps, period=period, fine=quality.shadow_texel_divisor, device=self.device
         )
         self._exposure = Exposure(width, height, samples, self.exposure, self.device, workers)
+        self._live_light = LiveLight(self.rasterizer) if quality.is_live and self.device == "cpu" else None
         self._host_buffers: dict[int, wp.array] = {}
         reach = self.spec.nearest.value, self.spec.farthest.value
         self._stereo = self.spec.stereo and Stereo(
@@ -160,7 +164,7 @@ class Camera:
             self.info,
             reach,
             self.device,
-            second_from_first=quality.second_from_first,
+            second_from_first=quality.is_live,
             workers=workers,
         )
 
@@ -245,8 +249,12 @@ class Camera:
             seen.draw(primitives, lens)
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         near, far = self._sunlight.update(primitives, pose[:3], forward, time)
-        shade = functools.partial(self._shade, primitives, near, far)
-        seen.workers.share([functools.partial(shade, band) for band in seen.bands(lens)])
+        if self._live_light is not None:
+            maps = shadow_maps_of(near, far, self._sunlight.depth)
+            self._live_light.shade(primitives, self._sunlight.light, maps, lens, self._exposure.radiance)
+        else:
+            shade = functools.partial(self._shade, primitives, near, far)
+            seen.workers.share([functools.partial(shade, band) for band in seen.bands(lens)])
         self._exposure.add_glare(primitives, seen.primitive)
         return self._exposure.tone_map(self._sunlight.balance, time, self._sunlight.brightness)
 

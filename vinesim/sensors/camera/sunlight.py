@@ -34,11 +34,14 @@ def _pairs(x: np.ndarray, y: np.ndarray, device: str) -> wp.array:
 class _ShadowMap:
     """One square of depths seen from the sun, around a focus that moves in steps."""
 
-    def __init__(self, texel: float, side: int, ahead: float, slack: float, rigid: bool, device: str) -> None:
+    def __init__(
+        self, texel: float, side: int, ahead: float, slack: float, rigid: bool, depth: wp.array, device: str
+    ) -> None:
+        """``depth`` [side * side] holds the map."""
         self.ahead, self.slack, self.rigid, self.device = ahead, slack, rigid, device
         self._every, self._known = wp.empty(0, dtype=wp.int32, device=device), -1
         self.struct = shadow_maps.ShadowMap()
-        self.struct.depth = wp.empty(side * side, dtype=float, device=device)
+        self.struct.depth = depth
         self.struct.texel, self.struct.side = float(texel), side
         self.half = 0.5 * texel * side
 
@@ -172,8 +175,12 @@ class Sunlight:
         turn = np.arange(64) * (2.0 * np.pi / 64)
         light.sample_rotations = _pairs(np.cos(turn), np.sin(turn), device)
         self.light = light
-        self._near = _ShadowMap(0.007 / fine, 1024 * fine, 2.5, 0.8, True, device)
-        self._far = _ShadowMap(0.035, 1024, 12.0, 4.0, False, device)
+        side = 1024 * fine
+        self.depth = wp.empty(side * side + 1024 * 1024, dtype=float, device=device)
+        """Depths of both shadow maps [texel]: the near one, then the far one."""
+        near, far = self.depth[: side * side], self.depth[side * side :]
+        self._near = _ShadowMap(0.007 / fine, side, 2.5, 0.8, True, near, device)
+        self._far = _ShadowMap(0.035, 1024, 12.0, 4.0, False, far, device)
 
     def _update_light(self, time: float) -> None:
         """Take the light from where the sun is now, if it has moved."""

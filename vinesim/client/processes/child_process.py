@@ -1,4 +1,4 @@
-"""The processes of a demo: started, read, and ended together."""
+"""Child processes that run Python modules: started, read, and ended together."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 EXIT_TIMEOUT = 1.6
-"""Time between SIGINT and SIGKILL when the demo is left [s]."""
+"""Time between SIGINT and SIGKILL when the group is left [s]."""
 START_TIMEOUT = 300.0
 """Longest start of a client; a first run compiles kernels [s]."""
 REPORT_TIMEOUT = 60.0
@@ -23,8 +23,8 @@ STDERR_LINES = 40
 """Lines of standard error that are kept."""
 
 
-class DemoFailed(RuntimeError):
-    """A process of the demo ended too early or printed nothing; the text names it and its last line on stderr."""
+class ProcessFailed(RuntimeError):
+    """A process ended too early or printed nothing; the text names it and its last line on stderr."""
 
     exit_code = 4
 
@@ -35,18 +35,21 @@ class Process:
 
     name: str
     child: subprocess.Popen[str]
+    started: float
+    """Wall time [s since the epoch]."""
     stdout_lines: queue.Queue[str]
     """An empty string marks the end."""
     stderr_tail: list[str]
 
     @classmethod
     def start(cls, name: str, *arguments: str, **environ: str) -> Process:
-        """Run ``python ARGUMENTS`` in a session of its own, so that Ctrl-C reaches it only through the demo."""
+        """Run ``python ARGUMENTS`` in a session of its own, so that Ctrl-C reaches it only through its parent."""
+        started = time.time()
         child = subprocess.Popen(
             [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             text=True, start_new_session=True, env={**os.environ, **environ},
         )  # fmt: skip
-        process = cls(name, child, queue.Queue(), [])
+        process = cls(name, child, started, queue.Queue(), [])
         threading.Thread(target=process._read_stdout, daemon=True).start()
         threading.Thread(target=process._read_stderr, daemon=True).start()
         return process
@@ -63,14 +66,30 @@ class Process:
             self.stderr_tail = [*self.stderr_tail[-STDERR_LINES:], line.rstrip("\n")]
 
     def next_line(self, timeout: float) -> str:
-        """The next line of output; :class:`DemoFailed` if it ended or printed nothing for ``timeout`` [s]."""
+        """The next line of output; :class:`ProcessFailed` if it ended or printed nothing for ``timeout`` [s]."""
         try:
             line = self.stdout_lines.get(timeout=timeout)
         except queue.Empty:
-            raise DemoFailed(f"{self.name} printed nothing for {timeout:.0f} s; {self._stderr_summary()}") from None
+            raise self.fault(f"{self.name} printed nothing for {timeout:.0f} s") from None
         if not line:
             raise self.failure()
         return line
+
+    def new_lines(self) -> list[str]:
+        """The lines of output that have come since the last call; :class:`ProcessFailed` if it has ended."""
+        lines = []
+        with contextlib.suppress(queue.Empty):
+            while line := self.stdout_lines.get_nowait():
+                lines.append(line)
+            raise self.failure()
+        return lines
+
+    def write_line(self, line: str) -> None:
+        """Write a line to its standard input."""
+        assert self.child.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it has ended, which the next read reports
+            self.child.stdin.write(line + "\n")
+            self.child.stdin.flush()
 
     def remaining_output(self, timeout: float) -> str:
         """Close its standard input and return everything that it prints until its end."""
@@ -81,14 +100,16 @@ class Process:
             lines.append(line)
         return "\n".join(lines)
 
-    def failure(self) -> DemoFailed:
+    def failure(self) -> ProcessFailed:
         """The error to raise for a process that ended too early."""
         self.wait_or_kill(REPORT_TIMEOUT)
-        return DemoFailed(f"{self.name} ended with exit code {self.child.returncode}; {self._stderr_summary()}")
+        return self.fault(f"{self.name} ended with exit code {self.child.returncode}")
 
-    def _stderr_summary(self) -> str:
+    def fault(self, text: str) -> ProcessFailed:
+        """An error to raise, with the last line of standard error."""
         lines = [line for line in self.stderr_tail if line.strip()]
-        return f"its last line on stderr: {lines[-1]}" if lines else "nothing on stderr"
+        summary = f"last line of {self.name} on stderr: {lines[-1]}" if lines else f"nothing on stderr of {self.name}"
+        return ProcessFailed(f"{text}; {summary}")
 
     def interrupt(self) -> None:
         """Send SIGINT; :meth:`wait_or_kill` waits for the end."""
@@ -104,7 +125,7 @@ class Process:
             self.child.wait()
 
     def finish(self) -> None:
-        """Interrupt it and wait for its report; :class:`DemoFailed` if it fails."""
+        """Interrupt it and wait for its report; :class:`ProcessFailed` if it fails."""
         self.interrupt()
         self.wait_or_kill(REPORT_TIMEOUT)
         if self.child.returncode:
@@ -112,11 +133,11 @@ class Process:
 
 
 class ProcessGroup:
-    """The processes of one demo, with ROS on this machine only unless the user has chosen otherwise."""
+    """Processes that belong together, with ROS on this machine only unless the user has chosen otherwise."""
 
-    def __init__(self) -> None:
+    def __init__(self, environ: Mapping[str, str]) -> None:
         self.processes: list[Process] = []
-        self._environ = {}
+        self._environ = dict(environ)
         if "ROS_AUTOMATIC_DISCOVERY_RANGE" not in os.environ:
             self._environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
@@ -132,13 +153,16 @@ class ProcessGroup:
 
 
 @contextlib.contextmanager
-def process_group() -> Iterator[ProcessGroup]:
-    """Processes that end with the block, all within :data:`EXIT_TIMEOUT`, however it is left."""
-    group = ProcessGroup()
+def process_group(exit_timeout: float = EXIT_TIMEOUT, **environ: str) -> Iterator[ProcessGroup]:
+    """Processes that end with the block, all within ``exit_timeout`` [s], however it is left.
+
+    ``environ`` is added to the environment of each.
+    """
+    group = ProcessGroup(environ)
     try:
         yield group
     finally:
-        deadline = time.monotonic() + EXIT_TIMEOUT
+        deadline = time.monotonic() + exit_timeout
         for process in group.processes:
             process.interrupt()
         for process in group.processes:

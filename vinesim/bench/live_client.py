@@ -1,0 +1,89 @@
+"""One client as its users start it, and a stock ROS node: how soon, how often and how old its messages come."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import os
+import pathlib
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from vinesim.client.processes.child_process import EXIT_TIMEOUT, START_TIMEOUT, ProcessGroup, process_group
+from vinesim.client.processes.ros_listener import RosListener, TopicReport
+from vinesim.client.rate_loop import TickLog
+from vinesim.ros import middleware
+
+POLL_PERIOD = 0.02
+"""Wall time between two looks for first messages [s]."""
+RGB, DEPTH, LIDAR = "/head_front_camera/rgb/image_raw", "/head_front_camera/depth/image_raw", "/lidar/points"
+"""Sensor topics of vinebot."""
+CLOCK = "/clock"
+
+
+class RosMissing(RuntimeError):
+    """The measurement needs ROS 2; the text says why it cannot be used."""
+
+    exit_code = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class LiveRun:
+    """What was measured of a client."""
+
+    first: dict[str, float]
+    """Time from its start to the first message of each topic [s]."""
+    topics: TopicReport
+    """Statistics of each topic, from when all had a message."""
+    loop: dict[str, float]
+    """Rate and work of its ticks in the same span of time: see :meth:`TickLog.between`."""
+    status: dict[str, Any]
+    """Its last status line."""
+
+
+@contextlib.contextmanager
+def own_processes(**environ: str) -> Iterator[ProcessGroup]:
+    """Processes in a ROS domain of their own, unless the user has chosen one; each may end its own children first."""
+    domain = {} if "ROS_DOMAIN_ID" in os.environ else {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100)}
+    with process_group(3.0 * EXIT_TIMEOUT, **domain, **environ) as group:
+        yield group
+
+
+def run_client(options: Sequence[str], topics: Sequence[str], seconds: float, **environ: str) -> LiveRun:
+    """Start ``vinesim client OPTIONS``, subscribe to ``topics``, and measure for ``seconds`` once all have come.
+
+    ``environ`` is added to its environment. :class:`RosMissing`, or :class:`ProcessFailed` if the client ends or a
+    topic stays silent.
+    """
+    if (reason := middleware.unavailable_reason()) is not None:
+        raise RosMissing(reason)
+    with own_processes(**environ) as group, tempfile.TemporaryDirectory() as folder:
+        log = pathlib.Path(folder) / "ticks.npz"
+        listener = RosListener(group, topics)
+        listener.wait_until_listening()
+        client = group.start(
+            "client", "-m", "vinesim.cli", "client", "--role", "robot", "--status", "json", "--tick-log", str(log),
+            *options,
+        )  # fmt: skip
+        deadline = time.monotonic() + START_TIMEOUT
+        status: dict[str, Any] = {}
+        while missing := listener.missing():
+            for line in client.new_lines():
+                status = json.loads(line)
+            if time.monotonic() > deadline:
+                raise client.fault(f"no message of {', '.join(missing)} within {START_TIMEOUT:.0f} s")
+            time.sleep(POLL_PERIOD)
+        listener.restart()
+        since = time.monotonic()
+        while time.monotonic() < since + seconds:
+            for line in client.new_lines():
+                status = json.loads(line)
+            time.sleep(POLL_PERIOD)
+        until = time.monotonic()
+        listener.stop()
+        client.finish()
+        first = {topic: moment - client.started for topic, moment in listener.first.items()}
+        return LiveRun(first, listener.report(), TickLog.load(log).between(since, until), status)

@@ -1,0 +1,463 @@
+"""Light of leaves, grass, berries and ground in live pictures, eight points at once
+(:mod:`vinesim.kernels.shading.light_points`)."""
+
+import warp as wp
+
+from vinesim.kernels.raster.pinhole import BATCH, FloatBatch, Pinhole
+from vinesim.kernels.raster.primitives import scale_along
+from vinesim.kernels.shading.deferred import Light, ambient_light
+from vinesim.kernels.shading.light_points import (
+    BERRIES,
+    BLADES,
+    CLASS_COUNT,
+    GROUND,
+    INLINE_ALL,
+    FloatTables,
+    Points,
+    ShadowMaps,
+    falling_exp,
+    haze,
+    point_ray,
+    sun_share,
+    unit,
+    write_light,
+)
+from vinesim.kernels.shading.materials import GRASS, Materials, mix, row_greenness, smoothstep
+
+wp.set_module_options({"enable_backward": False, "fast_math": True, "cpu_compiler_flags": INLINE_ALL})
+
+
+@wp.func
+def row3(table: wp.array2d(dtype=wp.float32), i: int) -> wp.vec3:
+    return wp.vec3(table[i, 0], table[i, 1], table[i, 2])
+
+
+@wp.struct
+class Texels:
+    """Four texels of a table around a place, and their shares."""
+
+    a: int
+    b: int
+    c: int
+    d: int
+    wa: float
+    wb: float
+    wc: float
+    wd: float
+
+
+@wp.func
+def texels_around(x: float, y: float) -> Texels:
+    """Bilinear sample of a 256 x 256 table of period 1."""
+    fx = (x - wp.floor(x)) * 256.0
+    fy = (y - wp.floor(y)) * 256.0
+    i = int(fx) & 255
+    j = int(fy) & 255
+    ax = fx - float(i)
+    ay = fy - float(j)
+    k = (i + 1) & 255
+    n = (j + 1) & 255
+    o = Texels()
+    o.a = j * 256 + i
+    o.b = j * 256 + k
+    o.c = n * 256 + i
+    o.d = n * 256 + k
+    o.wa = (1.0 - ax) * (1.0 - ay)
+    o.wb = ax * (1.0 - ay)
+    o.wc = (1.0 - ax) * ay
+    o.wd = ax * ay
+    return o
+
+
+@wp.func
+def sampled(table: wp.array2d(dtype=wp.float32), t: Texels, channel: int) -> float:
+    """One channel of a table [texel, channel], mixed from four texels."""
+    return (
+        table[t.a, channel] * t.wa
+        + table[t.b, channel] * t.wb
+        + table[t.c, channel] * t.wc
+        + table[t.d, channel] * t.wd
+    )
+
+
+@wp.kernel
+def light_blades(
+    # model
+    tables: FloatTables,
+    materials: Materials,
+    # in
+    light: Light,
+    maps: ShadowMaps,
+    lens: Pinhole,
+    points: Points,
+    first_list: int,
+    # out
+    radiance_out: wp.array(dtype=wp.vec3),
+):
+    """One thread lights the points of one list that lie on leaves or grass.
+
+    first_list: of the first thread; radiance: [pixel] linear RGB.
+    """
+    number = first_list + wp.tid()
+    start = (number * CLASS_COUNT + BLADES) * points.capacity
+    end = start + points.count[number, BLADES]
+    back = wp.transpose(lens.rotation)
+    red = FloatBatch()
+    green = FloatBatch()
+    blue = FloatBatch()
+    for first in range(start, end, BATCH):
+        count = wp.min(end - first, BATCH)
+        whole = (count + 7) // 8 * 8
+        m = wp.int32(0)
+        while m < whole:
+            slot = first + wp.min(m, count - 1)
+            colour = blade_light(tables, materials, light, maps, lens, back, points, slot)
+            red[m] = colour[0]
+            green[m] = colour[1]
+            blue[m] = colour[2]
+            m += 1
+        for k in range(count):
+            write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
+
+
+@wp.func
+def autumn_colour(tables: FloatTables, albedo: wp.vec3, i: int, u: float, v: float, share: float) -> wp.vec3:
+    """Colour of leaf ``i`` at (u, v) as it turns yellow from the edge, then brown; ``share`` 0 leaves it as it is."""
+    age = wp.max(tables.d[i, 3] - 0.42, 0.0) * 1.7 * share
+    seed = tables.c[i, 3]
+    x = u * 0.13 + seed * 5.3
+    y = v * 0.13 + seed * 2.7
+    at = (int((y - wp.floor(y)) * 256.0) & 255) * 256 + (int((x - wp.floor(x)) * 256.0) & 255)
+    row = wp.clamp(int((v + 0.75) * 128.0), 0, 255)
+    column = wp.clamp(int((u + 1.0) * 128.0), 0, 255)
+    edge = float(tables.outline[(int(tables.b[i, 3]) * 256 + row) * 256 + column]) * 0.0025
+    yellow = age * smoothstep(0.16 + 0.1 * age, 0.0, edge - 0.10 * tables.noise[at, 1])
+    yellow += 0.7 * smoothstep(0.62, 0.9, age) * tables.noise[at, 0]
+    yellow = wp.where(age > 0.02, wp.clamp(yellow, 0.0, 1.0), 0.0)
+    brown = smoothstep(0.03, 0.0, edge - 0.05 * tables.noise[at, 2] * age) * smoothstep(0.35, 0.6, age)
+    return mix(mix(albedo, wp.vec3(0.40, 0.34, 0.05), yellow), wp.vec3(0.16, 0.085, 0.03), brown)
+
+
+@wp.func
+def blade_light(
+    tables: FloatTables,
+    materials: Materials,
+    light: Light,
+    maps: ShadowMaps,
+    lens: Pinhole,
+    back: wp.mat33,
+    points: Points,
+    slot: int,
+) -> wp.vec3:
+    """Light of one point of a leaf or a blade of grass; see ``leaf_surface`` and ``shade_surface``."""
+    i = points.primitive[slot]
+    ray = point_ray(lens, back, points.u[slot], points.v[slot])
+    z = points.z[slot]
+    scale = wp.length(ray)
+    d = ray / scale
+    p = lens.eye + ray * z
+    pixel = z * 2.0 / lens.fx
+    size = tables.a[i, 3]
+    rib = row3(tables.b, i)
+    up = row3(tables.c, i)
+    side = wp.cross(rib, up)
+    q = (p - row3(tables.a, i)) / size
+    u = wp.dot(q, side)
+    v = wp.dot(q, rib)
+    bend = tables.d[i, 2]
+    slope_u = -2.0 * tables.d[i, 0] * u - wp.where(u > 0.0, bend, -bend)
+    slope_v = -2.0 * tables.d[i, 1] * v
+    plain = unit(side * slope_u + rib * slope_v + up)
+    grass = wp.where(materials.material[i] == GRASS, 1.0, 0.0)
+    # the texture: vein, relief, tone
+    x = wp.clamp((u + 1.0) * 64.0 - 0.5, 0.0, 126.0)
+    y = wp.clamp((v + 0.75) * 64.0 - 0.5, 0.0, 126.0)
+    column = int(x)
+    row = int(y)
+    fx = x - float(column)
+    fy = y - float(row)
+    t = Texels()
+    t.a = (int(tables.b[i, 3]) * 128 + row) * 128 + column
+    t.b = t.a + 1
+    t.c = t.a + 128
+    t.d = t.a + 129
+    t.wa = (1.0 - fx) * (1.0 - fy)
+    t.wb = fx * (1.0 - fy)
+    t.wc = (1.0 - fx) * fy
+    t.wd = fx * fy
+    near = wp.where(size > pixel * 10.0, 1.0 - grass, 0.0)
+    clear = near * wp.clamp(wp.abs(wp.dot(up, d)) * 2.2, 0.0, 1.0) / (1.0 + 6.0 * pixel / size)
+    vein = sampled(tables.leaf_texture, t, 0) * clear
+    relief = 0.6 * clear
+    slope_u -= sampled(tables.leaf_texture, t, 1) * relief
+    slope_v -= sampled(tables.leaf_texture, t, 2) * relief
+    bumpy = side * slope_u + rib * slope_v + up
+    n = unit(mix(bumpy, plain * 0.5 + wp.vec3(0.0, 0.0, 0.8), grass))
+    tone = 1.0 + near * (sampled(tables.leaf_texture, t, 3) * 0.5 - 0.28)
+    tone = wp.where(grass > 0.5, 0.35 + 0.75 * (0.5 + 0.5 * v), tone)
+    albedo = row3(tables.tint, i) * tone
+    albedo = autumn_colour(tables, albedo, i, u, v, 1.0 - grass)
+    passing = mix(wp.vec3(2.3, 2.0, 0.75) * (1.0 - 0.7 * vein), wp.vec3(0.7, 0.7, 0.7), grass)
+    transmission = wp.cw_mul(albedo, passing)
+    # from below: paler, felted, veins stand out
+    under = wp.where(wp.dot(plain, d) > 0.0, 1.0, 0.0)
+    below = under * (1.0 - grass)
+    above = (1.0 - under) * (1.0 - grass)
+    felt = mix(albedo * 1.05, wp.vec3(0.22, 0.27, 0.16), 0.42)
+    albedo = mix(mix(albedo, felt, below), wp.vec3(0.34, 0.38, 0.20), below * vein * 0.7)
+    albedo = mix(albedo, wp.vec3(0.20, 0.28, 0.08), above * vein * 0.40)
+    specular = 0.012 + 0.038 * above
+    shininess = 12.0 - 6.0 * below + 10.0 * above
+    occlusion = wp.where(grass > 0.5, 0.35 + 0.65 * smoothstep(-0.75, 0.0, v), 1.0)
+    sky = materials.sky[i]
+    # light
+    turn = 1.0 - 2.0 * under
+    n = n * turn
+    ndl = wp.dot(n, light.sun)
+    towards = wp.where(wp.dot(plain, light.sun) < 0.0, -1.0, 1.0)
+    lit = sun_share(maps, p, plain * towards, sky)
+    direct = light.sun_colour * (wp.max(ndl, 0.0) * lit * (0.35 + 0.65 * occlusion))
+    colour = wp.cw_mul(albedo, direct + ambient_light(light, n, sky) * occlusion)
+    through = light.sun_colour * (wp.max(-ndl, 0.0) * lit * 0.55)
+    colour += wp.cw_mul(transmission, through + ambient_light(light, -n, sky) * (0.30 * occlusion))
+    cosine = wp.max(-wp.dot(n, d), 0.0)
+    grazing = 1.0 - cosine
+    g2 = grazing * grazing
+    fresnel = specular + (1.0 - specular) * g2 * g2 * grazing * wp.min(specular * 14.0, 1.0) * 0.8
+    peak = 1.0 - wp.max(wp.dot(n, unit(light.sun - d)), 0.0)
+    bright = falling_exp(shininess * peak) * (shininess * 0.14 + 0.4) * wp.max(ndl + 0.05, 0.0)
+    colour += light.sun_colour * (fresnel * lit * bright)
+    mirrored = d[2] - n[2] * 2.0 * wp.dot(n, d)
+    surroundings = mix(
+        light.ground_colour, mix(light.canopy_colour * 0.45, light.sky_colour, sky * sky), 0.5 + 0.5 * mirrored
+    )
+    colour += surroundings * (wp.min(fresnel, 0.16) * 0.55 * above * occlusion)
+    return haze(light, colour, z * scale)
+
+
+@wp.kernel
+def light_ground(
+    # model
+    tables: FloatTables,
+    materials: Materials,
+    ground_sky: wp.array(dtype=wp.float32),
+    # in
+    light: Light,
+    maps: ShadowMaps,
+    lens: Pinhole,
+    points: Points,
+    first_list: int,
+    # out
+    radiance_out: wp.array(dtype=wp.vec3),
+):
+    """One thread lights the points of one list that lie on the ground.
+
+    ground_sky: the table of the materials, flat; first_list: of the first thread; radiance: [pixel] linear RGB.
+    """
+    number = first_list + wp.tid()
+    start = (number * CLASS_COUNT + GROUND) * points.capacity
+    end = start + points.count[number, GROUND]
+    back = wp.transpose(lens.rotation)
+    red = FloatBatch()
+    green = FloatBatch()
+    blue = FloatBatch()
+    for first in range(start, end, BATCH):
+        count = wp.min(end - first, BATCH)
+        whole = (count + 7) // 8 * 8
+        m = wp.int32(0)
+        while m < whole:
+            slot = first + wp.min(m, count - 1)
+            ray = point_ray(lens, back, points.u[slot], points.v[slot])
+            colour = ground_light(tables, materials, ground_sky, light, maps, lens, ray)
+            red[m] = colour[0]
+            green[m] = colour[1]
+            blue[m] = colour[2]
+            m += 1
+        for k in range(count):
+            write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
+
+
+@wp.func
+def ground_light(
+    tables: FloatTables,
+    materials: Materials,
+    ground_sky: wp.array(dtype=wp.float32),
+    light: Light,
+    maps: ShadowMaps,
+    lens: Pinhole,
+    ray: wp.vec3,
+) -> wp.vec3:
+    """Light of the ground where ``ray`` meets it; see ``ground_surface`` and ``shade_surface``."""
+    z = -lens.eye[2] / ray[2]
+    scale = wp.length(ray)
+    p = lens.eye + ray * z
+    pixel = z * 2.0 / lens.fx
+    slant = pixel * z * scale / lens.eye[2]
+    blur = 1.0 / (1.0 + slant * slant * 1.5)
+    t = texels_around(p[0] * 0.21, p[1] * 0.21)
+    coarse = 0.5 + (sampled(tables.noise, t, 0) - 0.5) * blur
+    shade = 0.5 + (sampled(tables.noise, t, 1) - 0.5) * blur
+    spots = 0.5 + (sampled(tables.noise, t, 2) - 0.5) * blur
+    detail = 1.0 / (1.0 + pixel * pixel * 20000.0)
+    detail = wp.where(detail > 0.08, detail, 0.0)
+    t = texels_around(p[0] * 0.8, p[1] * 0.8)
+    tone = 0.5 + (sampled(tables.soil, t, 0) - 0.5) * detail
+    sod = 0.5 + (sampled(tables.soil, t, 1) - 0.5) * detail
+    n = unit(wp.vec3(sampled(tables.soil, t, 2) * detail, sampled(tables.soil, t, 3) * detail, 1.0))
+    # the sky that is seen, and how far inside the vineyard
+    x = (p[0] - materials.ground_x) / materials.ground_cell
+    y = (p[1] - materials.ground_y) / materials.ground_cell
+    columns = materials.ground_sky.shape[1]
+    wide = float(columns - 1)
+    high = float(materials.ground_sky.shape[0] - 1)
+    within = x > 0.0 and y > 0.0 and x < wide and y < high
+    i = int(wp.clamp(x, 0.0, wide - 1.0))
+    j = int(wp.clamp(y, 0.0, high - 1.0))
+    fx = x - float(i)
+    fy = y - float(j)
+    at = j * columns + i
+    low = ground_sky[at] * (1.0 - fx) + ground_sky[at + 1] * fx
+    above = ground_sky[at + columns] * (1.0 - fx) + ground_sky[at + columns + 1] * fx
+    sky = wp.where(within, low * (1.0 - fy) + above * fy, 0.75)
+    edge = wp.min(wp.min(x, wide - x), wp.min(y, high - y)) * materials.ground_cell
+    inside = wp.where(within, smoothstep(0.0, 3.0, edge), 0.0)
+    green = 0.85 * smoothstep(
+        0.38,
+        0.60,
+        0.55 * coarse + 0.2 * spots + 0.25 * sod + row_greenness(materials.rows, p[1]) * inside * blur,
+    )
+    t = texels_around(p[0] * 0.011, p[1] * 0.011 + 0.37)
+    outside = 1.0 - inside
+    fields = 0.22 + 0.45 * smoothstep(0.35, 0.65, sampled(tables.noise, t, 1))
+    green = wp.where(outside > 0.0, wp.min(green + fields * outside, 0.92), green)
+    earth = mix(wp.vec3(0.11, 0.072, 0.042), wp.vec3(0.28, 0.195, 0.12), tone)
+    turf = mix(wp.vec3(0.035, 0.055, 0.014), wp.vec3(0.13, 0.15, 0.042), sod)
+    turf = mix(turf, wp.vec3(0.055, 0.085, 0.022), outside * smoothstep(0.35, 0.6, sampled(tables.noise, t, 2)))
+    albedo = mix(earth, turf, green) * (0.8 + 0.4 * shade)
+    occlusion = 0.6 + 0.8 * wp.min(tone, 0.5)
+    ndl = wp.dot(n, light.sun)
+    lit = sun_share(maps, p, n * wp.where(ndl < 0.0, -1.0, 1.0), sky)
+    direct = light.sun_colour * (wp.max(ndl, 0.0) * lit * (0.35 + 0.65 * occlusion))
+    colour = wp.cw_mul(albedo, direct + ambient_light(light, n, sky) * occlusion)
+    return haze(light, colour, z * scale)
+
+
+@wp.kernel
+def light_berries(
+    # model
+    tables: FloatTables,
+    materials: Materials,
+    # in
+    light: Light,
+    maps: ShadowMaps,
+    lens: Pinhole,
+    points: Points,
+    first_list: int,
+    # out
+    radiance_out: wp.array(dtype=wp.vec3),
+):
+    """One thread lights the points of one list that lie on berries.
+
+    first_list: of the first thread; radiance: [pixel] linear RGB.
+    """
+    number = first_list + wp.tid()
+    start = (number * CLASS_COUNT + BERRIES) * points.capacity
+    end = start + points.count[number, BERRIES]
+    back = wp.transpose(lens.rotation)
+    red = FloatBatch()
+    green = FloatBatch()
+    blue = FloatBatch()
+    for first in range(start, end, BATCH):
+        count = wp.min(end - first, BATCH)
+        whole = (count + 7) // 8 * 8
+        m = wp.int32(0)
+        while m < whole:
+            slot = first + wp.min(m, count - 1)
+            colour = berry_light(tables, materials, light, maps, lens, back, points, slot)
+            red[m] = colour[0]
+            green[m] = colour[1]
+            blue[m] = colour[2]
+            m += 1
+        for k in range(count):
+            write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
+
+
+@wp.func
+def berry_light(
+    tables: FloatTables,
+    materials: Materials,
+    light: Light,
+    maps: ShadowMaps,
+    lens: Pinhole,
+    back: wp.mat33,
+    points: Points,
+    slot: int,
+) -> wp.vec3:
+    """Light of one point of a berry; see ``berry_surface`` and ``shade_surface``."""
+    number = points.primitive[slot]
+    ray = point_ray(lens, back, points.u[slot], points.v[slot])
+    z = points.z[slot]
+    scale = wp.length(ray)
+    d = ray / scale
+    p = lens.eye + ray * z
+    radius = tables.a[number, 3]
+    axis = row3(tables.b, number)
+    stretch = 1.0 / tables.b[number, 3] - 1.0
+    e = scale_along(p - row3(tables.a, number), axis, stretch)
+    n = unit(scale_along(e, axis, stretch))
+    tint = row3(tables.tint, number)
+    sky = materials.sky[number]
+    seed = tables.c[number, 0]
+    neighbours = tables.d[number, 3] + wp.dot(row3(tables.d, number), n)
+    occlusion = wp.clamp(1.0 - neighbours, 0.12, 1.0) * (0.4 + 0.6 * tables.c[number, 1])
+    pale = wp.clamp(tint[1] * 2.2, 0.0, 1.0)
+    red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
+    wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
+    transmission = wp.vec3(0.95, 0.76, 0.12) * pale + wp.vec3(0.26, 0.03, 0.012) * red + wp.vec3(0.03, 0.003, 0.004)
+    bloom = 0.46 - 0.32 * pale - 0.10 * red
+    near = wp.where(z * 2.0 / lens.fx < radius * 0.35, 1.0, 0.0)
+    w = unit(e)
+    t = texels_around(w[0] * 0.20 + seed * 7.1, w[1] * 0.20 + w[2] * 0.31 + seed * 3.3)
+    wide0 = sampled(tables.noise, t, 0)
+    wide1 = sampled(tables.noise, t, 1)
+    t = texels_around(w[0] * 1.1 + w[2] * 0.6 + seed, w[1] * 1.1 - w[2] * 0.4)
+    fine = sampled(tables.noise, t, 1)
+    albedo = tint * (0.86 + 0.28 * wide1)
+    albedo = mix(albedo, wp.vec3(0.46, 0.30, 0.06), pale * 0.35 * smoothstep(0.5, 0.8, wide0 + 0.15 * n[2]))
+    speck = wp.where(sampled(tables.noise, t, 3) > 0.82, 0.22, 0.0)
+    albedo = albedo * (1.0 + pale * (0.14 * sampled(tables.noise, t, 2) - 0.07) + red * speck)
+    along = wp.dot(w, axis)
+    dusty = bloom * smoothstep(0.30, 0.62, wide0 * 0.55 + wide1 * 0.45 + 0.12 * n[2]) * (0.75 + 0.5 * fine)
+    albedo = mix(albedo, wp.vec3(0.07, 0.045, 0.025), smoothstep(0.986, 0.994, along))
+    albedo = mix(albedo, wp.vec3(0.16, 0.18, 0.06), 0.7 * smoothstep(-0.95, -0.985, along))
+    albedo = mix(tint, albedo, near)
+    dusty = wp.where(near > 0.5, dusty, bloom * 0.6)
+    albedo = mix(albedo, wp.vec3(0.40, 0.43, 0.60), wp.clamp(dusty, 0.0, 0.8))
+    shininess = 260.0 - 300.0 * wp.min(dusty, 0.75)
+    reflectivity = 1.0 - wp.min(dusty * 1.6, 0.85)
+    # light
+    ndl = wp.dot(n, light.sun)
+    lit = sun_share(maps, p, n * wp.where(ndl < 0.0, -1.0, 1.0), sky)
+    direct = wp.vec3(
+        wp.max((ndl + wrap[0]) / (1.0 + wrap[0]), 0.0),
+        wp.max((ndl + wrap[1]) / (1.0 + wrap[1]), 0.0),
+        wp.max((ndl + wrap[2]) / (1.0 + wrap[2]), 0.0),
+    )
+    direct = wp.cw_mul(direct, light.sun_colour) * (lit * (0.35 + 0.65 * occlusion))
+    colour = wp.cw_mul(albedo, direct + ambient_light(light, n, sky) * occlusion)
+    rim = wp.clamp(0.55 - 0.75 * ndl, 0.0, 1.0)
+    sunny = rim * rim * 0.30 * (0.15 + 0.85 * lit) * occlusion * (0.25 + 0.75 * sky)
+    colour += wp.cw_mul(transmission, light.sun_colour * sunny + ambient_light(light, -n, sky) * (0.35 * occlusion))
+    grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
+    g2 = grazing * grazing
+    fresnel = 0.045 + 0.955 * g2 * g2 * grazing * 0.504
+    peak = 1.0 - wp.max(wp.dot(n, unit(light.sun - d)), 0.0)
+    bright = falling_exp(shininess * peak) * (shininess * 0.14 + 0.4) * wp.max(ndl + 0.05, 0.0)
+    colour += light.sun_colour * (fresnel * lit * bright)
+    r = d - n * (2.0 * wp.dot(n, d))
+    t = texels_around(r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
+    hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, sampled(tables.noise, t, 1))
+    mirrored = mix(light.canopy_colour * 0.4, light.sky_colour * 1.3, hole)
+    mirrored = mix(light.ground_colour * 0.8, mirrored, smoothstep(-0.25, 0.25, r[2]))
+    colour += mirrored * (fresnel * reflectivity * occlusion)
+    return haze(light, colour, z * scale)

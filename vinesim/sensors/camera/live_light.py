@@ -1,0 +1,110 @@
+"""Light of live pictures on a CPU: points sorted by what they lie on, each kind lit by a kernel of its own."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.raster.pinhole import Pinhole
+from vinesim.kernels.shading import light_plants, light_points
+from vinesim.kernels.shading.deferred import Light
+from vinesim.kernels.shading.shadow_maps import ShadowMap
+from vinesim.sensors.raster.camera_rasterizer import BANDS_PER_THREAD, CameraRasterizer
+from vinesim.sensors.scene.primitives import Primitives
+
+_ROWS = 4
+"""Rows of blocks of 2 x 2 pixels whose points make one list: long enough to fill batches, short enough for caches."""
+
+
+class LiveLight:
+    """Lights the points that one rasteriser sees; its buffers."""
+
+    def __init__(self, seen: CameraRasterizer) -> None:
+        self._seen = seen
+        self.list_count = -(-seen.height // (2 * _ROWS))
+        points = self._points = light_points.Points()
+        points.capacity = 4 * _ROWS * -(-seen.width // 2)
+        places = self.list_count * light_points.CLASS_COUNT * points.capacity
+        for name in ("u", "v", "z"):
+            setattr(points, name, wp.empty(places, dtype=float, device="cpu"))
+        for name in ("primitive", "pixels"):
+            setattr(points, name, wp.empty(places, dtype=wp.int32, device="cpu"))
+        points.count = wp.empty((self.list_count, light_points.CLASS_COUNT), dtype=wp.int32, device="cpu")
+        self._tables = light_points.FloatTables()
+        self._ground_sky: wp.array = wp.empty(0, dtype=float, device="cpu")
+        self._sources: list[wp.array] = []
+        """Arrays that the tables are views of."""
+
+    def shade(
+        self,
+        primitives: Primitives,
+        light: Light,
+        maps: light_points.ShadowMaps,
+        lens: Pinhole,
+        radiance: wp.array,
+    ) -> None:
+        """Write the light of all pixels to ``radiance`` [pixel] linear RGB."""
+        self._update_tables(primitives, light)
+        workers = self._seen.workers
+        parts = min(BANDS_PER_THREAD * workers.size if workers.size > 1 else 1, self.list_count)
+        ends = [self.list_count * i // parts for i in range(parts + 1)]
+        task = functools.partial(self._shade_lists, primitives, light, maps, lens, radiance)
+        workers.share([functools.partial(task, *pair) for pair in itertools.pairwise(ends)])
+
+    def _shade_lists(
+        self,
+        primitives: Primitives,
+        light: Light,
+        maps: light_points.ShadowMaps,
+        lens: Pinhole,
+        radiance: wp.array,
+        first: int,
+        end: int,
+    ) -> None:
+        """Sort and light the points of some lists."""
+        points, tables, materials = self._points, self._tables, primitives.materials
+        arrays = [points.u, points.v, points.z, points.primitive, points.pixels, points.count]
+
+        def launch(kernel: wp.Kernel, inputs: list[Any], outputs: list[wp.array]) -> None:
+            wp.launch(kernel, end - first, inputs=inputs, outputs=outputs, device="cpu")
+
+        seen = [self._seen.primitive, self._seen.keys, _ROWS, first, points]
+        launch(light_points.sort_points, [primitives.shapes, materials, lens, *seen], arrays)
+        launch(light_points.light_sky, [tables, light, lens, points, first], [radiance])
+        where = [light, maps, lens, points, first]
+        launch(light_plants.light_ground, [tables, materials, self._ground_sky, *where], [radiance])
+        launch(light_plants.light_blades, [tables, materials, *where], [radiance])
+        launch(light_plants.light_berries, [tables, materials, *where], [radiance])
+        solid = [light, maps.near, maps.far, lens, points, first]
+        launch(light_points.light_others, [primitives.shapes, materials, *solid], [radiance])
+
+    def _update_tables(self, primitives: Primitives, light: Light) -> None:
+        """Views of the primitives' arrays as they are now: they are made anew with the list of bodies."""
+        shapes, materials = primitives.shapes, primitives.materials
+        sources = [shapes.a, shapes.b, shapes.c, shapes.d, materials.tint]
+        sources += [materials.leaf_texture, materials.noise_texture, materials.soil_texture, light.sky_table]
+        if len(sources) == len(self._sources) and all(a is b for a, b in zip(sources, self._sources, strict=True)):
+            return
+        names = ("a", "b", "c", "d", "tint", "leaf_texture", "noise", "soil", "sky_table")
+        for name, source in zip(names, sources, strict=True):
+            setattr(self._tables, name, _numbers(source))
+        self._tables.outline = shapes.outline.flatten()
+        self._ground_sky = materials.ground_sky.flatten()
+        self._sources = sources
+
+
+def shadow_maps(near: ShadowMap, far: ShadowMap, depth: wp.array) -> light_points.ShadowMaps:
+    """Both maps and the array that holds the depths of the near one, then those of the far one."""
+    maps = light_points.ShadowMaps()
+    maps.near, maps.far, maps.depth = near, far, depth
+    return maps
+
+
+def _numbers(vectors: wp.array) -> wp.array:
+    """The same memory as plain numbers [vector, component]."""
+    shape = int(np.prod(vectors.shape)), int(vectors.dtype._length_)
+    return wp.array(ptr=vectors.ptr, dtype=float, shape=shape, device="cpu", copy=False)
