@@ -9,6 +9,7 @@ import sys
 import threading
 
 import pytest
+import warp as wp
 
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_writer import RecordingWriter
@@ -79,14 +80,28 @@ def test_bad_urdf(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("demo",),
+        ("demo", "--job", "pick"),
+        ("render", "demo", "--at", "0.4,1.2,1.3", "--look", "3,1,1.7"),
+        ("dataset", "--images", "1"),
+    ],
+)
+def test_no_gpu_is_one_line_before_anything_is_written(command, tmp_path):
+    out = tmp_path / "out"
+    wanted = "cuda:0" if wp.get_cuda_device_count() == 0 else f"cuda:{wp.get_cuda_device_count()}"
+    refused(vinesim(*command, "--device", wanted, "--out", str(out)), 3, f"'{wanted}'")
+    assert not out.exists()
+
+
 def test_no_such_device():
     refused(vinesim("client", "--device", "abacus"), 3, "abacus", "cpu, cuda")
     refused(vinesim("client", "--device", "cuda:0", "--threads", "2"), *threads_or_no_gpu())
 
 
 def threads_or_no_gpu():
-    import warp as wp
-
     return (2, "--threads 2") if wp.get_cuda_device_count() else (3, "'cuda:0'", "no NVIDIA GPU", "use cpu")
 
 

@@ -61,12 +61,17 @@ def run(
     crates: Sequence[str] = (),
     hour: float | None = None,
     renderer: str = "warp",
+    device: str = "cpu",
 ) -> int:
     """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON.
 
     The viewpoint is ``at`` and ``look``; those of a ``path`` file go to the folders ``0000``, ``0001``, ... of ``out``.
     """
     viewpoints = _viewpoints(at, look, path)
+    if device != "cpu":  # these imports cost half a second
+        from vinesim.physics.plants.device_buffers import find_device
+
+        find_device(device)
     from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
@@ -76,16 +81,17 @@ def run(
     from vinesim.sensors.scene.primitives import Primitives
     from vinesim.sensors.scene.ray_caster import RayCaster
 
-    renderer_selection.check_renderer(renderer)
+    renderer_selection.check_renderer(renderer, device)
     spec = CameraSpec.load(camera)
     info = resized_intrinsics(spec, None if size is None else parse_size(size))
     plan, staged = with_seed(load_scene(scene), seed), parse_composition(robots, people, crates)
     if hour is not None:
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
-    compile_kernels(SENSOR_PACKAGES)
+    if device == "cpu":
+        compile_kernels(SENSOR_PACKAGES)
     model = generate(plan)
     view = staged.compose(model)
-    primitives = Primitives(model, renderer=renderer)
+    primitives = Primitives(model, renderer=renderer, device=device)
     primitives.update(view)
     for viewpoint in viewpoints:
         _check_not_enclosed(primitives, viewpoint)
@@ -150,7 +156,9 @@ class _Stage:
         seen = ground_truth.render_buffers(self.primitives, self.info, pose)
         truths = ground_truth.bunch_truths(self.primitives, self.view, seen, self.caster)
         # a camera for each picture: none depends on those before it
-        camera = Camera(self.spec, self.info, "camera", self.plan.sun.direction(), quality="still")
+        camera = Camera(
+            self.spec, self.info, "camera", self.plan.sun.direction(), quality="still", device=self.primitives.device
+        )
         frame = camera.render(self.primitives, pose)
         assert frame.exact_depth is not None, "a camera that renders by itself gives exact depth"
         images = {

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Camera, ImageSize, Renderer, Scene, Seed
+from vinesim.cli.commands.options import Camera, Device, ImageSize, Renderer, Scene, Seed
 
 
 def scene_show(
@@ -51,6 +51,7 @@ def render(
         list[str] | None, typer.Option(help="X,Y[,YAW[,FILL]]: a crate, filled with bunches from 0 to 1.")
     ] = None,
     renderer: Renderer = "warp",
+    device: Device = "cpu",
 ) -> None:
     """Render pictures with their ground truth: ids, masks, boxes, berries, cut points.
 
@@ -69,7 +70,7 @@ def render(
 
     code = run(
         scene, camera=camera, at=at, look=look, path=path, size=size, hour=hour, seed=seed, out=out, renderer=renderer,
-        robots=robot or (), people=person or (), crates=crate or (),
+        device=device, robots=robot or (), people=person or (), crates=crate or (),
     )  # fmt: skip
     raise typer.Exit(code)
 
@@ -82,9 +83,11 @@ def dataset(
     camera: Camera = "d435",
     size: ImageSize = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=256, help="Processes; half as many as cores unless given.")
+        int | None,
+        typer.Option(min=1, max=256, help="Processes; half as many as cores unless given, as many with a GPU."),
     ] = None,
     renderer: Renderer = "warp",
+    device: Device = "cpu",
     actors: Annotated[
         float, typer.Option(help="Share of the images with people, robots, crates and wind; 0 leaves the vines alone.")
     ] = 0.4,

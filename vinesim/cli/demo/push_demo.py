@@ -16,6 +16,7 @@ from vinesim.cli.demo.summary import Window, push_summary, push_table, write_sum
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, process_group
 from vinesim.client.processes.ros_listener import RosListener
 from vinesim.kernels.compilation import compile_kernels
+from vinesim.physics.plants.device_buffers import find_device
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
@@ -44,12 +45,16 @@ class ListenedTopics:
         return self.owners.get(topic, topic)
 
 
-def run_push(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
+def run_push(
+    *, seconds: float, seed: int | None, scene: str, robot: str, device: str, headless: bool, out: pathlib.Path
+) -> int:
     """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``; the exit code."""
     console = Console(stderr=True)
     begin = time.time()
+    find_device(device)
     plan = with_seed(load_scene(scene), seed)
-    compile_kernels()
+    if device == "cpu":
+        compile_kernels()
     description = load_description(robot)  # refused once, and before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +70,9 @@ def run_push(*, seconds: float, seed: int | None, scene: str, robot: str, headle
         console.print(
             f"server on {endpoint}; {PICKER} will push bunch {bunch} for {seconds:.0f} s (a first run compiles kernels)"
         )
-        clients = _start_clients(group, endpoint, scene, seed, robot, bunch, poses, out)
+        common = ["--connect", endpoint, "--scene", scene, "--robot", robot, "--device", device]
+        common += [] if seed is None else ["--seed", str(seed)]
+        clients = _start_clients(group, common, bunch, poses, out)
         newest = Statuses()
         ready = wait_until_ready(clients, [server], listener, newest, topics.describe, console, START_TIMEOUT)
         took = time.time() - begin
@@ -113,12 +120,10 @@ class _RunTimer:
 
 
 def _start_clients(
-    group: ProcessGroup, endpoint: str, scene: str, seed: int | None, robot: str, bunch: int,
-    poses: tuple[list[str], list[str]], out: pathlib.Path,
-) -> dict[str, Process]:  # fmt: skip
-    """The clients by name: one pushes the ``bunch``, the other drives up to it."""
-    common = ["-m", "vinesim.cli", "client", "--role", "robot", "--scene", scene, "--robot", robot, "--status", "json"]
-    common += ["--connect", endpoint, "--watch", str(bunch)] + ([] if seed is None else ["--seed", str(seed)])
+    group: ProcessGroup, common: list[str], bunch: int, poses: tuple[list[str], list[str]], out: pathlib.Path
+) -> dict[str, Process]:
+    """The clients by name, with ``common`` options: one pushes the ``bunch``, the other drives up to it."""
+    common = ["-m", "vinesim.cli", "client", "--role", "robot", *common, "--status", "json", "--watch", str(bunch)]
     own = {
         PICKER: [*poses[0], "--push", str(bunch)],
         VISITOR: [
