@@ -57,8 +57,11 @@ class EffectiveMass:
         touched = np.zeros(m.ntree, bool)
         touched[m.dof_treeid[J.any(axis=0)]] = True
         if d.nefc and d.nisland:
-            islands = np.unique(d.tree_island[touched])
-            touched |= np.isin(d.tree_island, islands[islands >= 0])
+            island = d.tree_island
+            is_coupled = np.zeros(d.nisland + 1, bool)  # the last one stands for -1, trees without an island
+            is_coupled[island[touched]] = True
+            is_coupled[-1] = False
+            touched |= is_coupled[island]
         return np.flatnonzero(touched[m.dof_treeid])
 
 

@@ -33,6 +33,8 @@ class LevelOfDetail:
         self._points, self._radius = np.zeros((0, 3)), 0.0
         self._attached = -1
         self._worth = np.zeros(trees, bool)
+        self._rated_trees = self._clusters = self._first_cluster = np.zeros(0, np.int64)
+        """Trees of the last :meth:`_rate`, all their clusters, and where those of each tree begin."""
 
     def set_focus(self, points: np.ndarray, radius: float) -> None:
         """Look closely at what hangs within ``radius`` [m] of ``points`` [n, 3], until told otherwise; none: stop."""
@@ -79,10 +81,12 @@ class LevelOfDetail:
 
     def _rate(self, trees: np.ndarray) -> np.ndarray:
         """The fastest cluster of each tree [k] rad/s, against what it hangs on."""
-        model = self.plants.model
-        core = model.tree_core[trees]
-        count = model.tree_size[trees] - core
-        start = np.cumsum(count) - count
-        clusters = np.repeat(model.tree_first[trees] + core - start, count) + np.arange(count.sum())
-        rate = self.plants.state.joint_qd[clusters]
-        return np.sqrt(np.maximum.reduceat((rate * rate).sum(1), start))
+        if not np.array_equal(trees, self._rated_trees):
+            model, self._rated_trees = self.plants.model, trees
+            core = model.tree_core[trees]
+            count = model.tree_size[trees] - core
+            self._first_cluster = np.cumsum(count) - count
+            first = np.repeat(model.tree_first[trees] + core - self._first_cluster, count)
+            self._clusters = first + np.arange(count.sum())
+        rate = self.plants.state.joint_qd[self._clusters]
+        return np.sqrt(np.maximum.reduceat((rate * rate).sum(1), self._first_cluster))

@@ -153,10 +153,11 @@ class JointServos:
         if self._finger_groups:
             middle = position.copy()
             for fingers in self._finger_groups.values():
-                middle[fingers] = position[fingers].mean()
+                middle[fingers] = position[fingers].sum() / len(fingers)
         start = clip(self.setpoint, middle - self._max_tracking_error, middle + self._max_tracking_error)
         wanted = (self._command - start) / dt
-        wanted[self._velocity_joints] = self._command[self._velocity_joints]
+        if len(self._velocity_joints):
+            wanted[self._velocity_joints] = self._command[self._velocity_joints]
         # Nor may the set-point accelerate faster than the drive can: a saturated servo would exceed the velocity.
         gain = self._max_impulse / np.maximum(self._rigid.joint_inertia(self._name), MIN_DIVISOR)
         slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.max_velocity)
