@@ -15,6 +15,7 @@ from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, process_group
 from vinesim.client.processes.ros_listener import RosListener
+from vinesim.kernels.compilation import compile_kernels
 from vinesim.physics.plants.device_buffers import find_device
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
@@ -54,6 +55,8 @@ def run_push(
     begin = time.time()
     find_device(device)
     plan = with_seed(load_scene(scene), seed)
+    if device == "cpu":
+        compile_kernels()
     description = load_description(robot)  # refused once, and before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
