@@ -15,6 +15,7 @@ from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, process_group
 from vinesim.client.processes.ros_listener import RosListener
+from vinesim.kernels.compilation import compile_kernels
 from vinesim.physics.plants.device_buffers import find_device
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
@@ -36,6 +37,8 @@ class ListenedTopics:
     always: tuple[str, ...]
     once: tuple[str, ...]
     """Only until their first message."""
+    events: tuple[str, ...]
+    """Nobody waits for these: they may stay silent."""
     owners: Mapping[str, str]
     """Topic: the sensor that it comes from, in words."""
 
@@ -52,6 +55,8 @@ def run_push(
     begin = time.time()
     find_device(device)
     plan = with_seed(load_scene(scene), seed)
+    if device == "cpu":
+        compile_kernels()
     description = load_description(robot)  # refused once, and before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
@@ -61,7 +66,7 @@ def run_push(
         console.print(f"ROS 2 is not usable here, the demo runs without it: {no_ros}")
     with process_group() as group:
         topics = listened_topics(description)
-        listener = None if no_ros else RosListener(group, topics.always, topics.once)
+        listener = None if no_ros else RosListener(group, topics.always, topics.once, topics.events)
         server, endpoint = group.start_server()
         bunch, poses = choose_poses(plan, generate(plan))
         console.print(
@@ -138,7 +143,7 @@ def listened_topics(robot: RobotDescription) -> ListenedTopics:
     """All topics of the picker; of the visitor its joints, its first picture and its first scan."""
     always = [
         "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment",
-        "/tf_environment_static", "/vine/contacts", "/mobile_base_controller/odom", "/diagnostics",
+        "/tf_environment_static", "/mobile_base_controller/odom", "/diagnostics",
         f"/{VISITOR}/joint_states",
     ]  # fmt: skip
     once, owners = [], {f"/{VISITOR}/joint_states": VISITOR}
@@ -156,4 +161,4 @@ def listened_topics(robot: RobotDescription) -> ListenedTopics:
     ):
         once.append(f"/{VISITOR}/{sensor.name}/{topic}")
         owners[once[-1]] = f"{sensor.name} of {VISITOR}"
-    return ListenedTopics(tuple(always), tuple(once), owners)
+    return ListenedTopics(tuple(always), tuple(once), ("/vine/contacts",), owners)
