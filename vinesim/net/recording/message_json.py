@@ -96,8 +96,8 @@ def _describe_records(payload: bytes, _: str) -> dict[str, Any]:
         "facts": [
             {
                 **_named(record.object), "ownership": record.ownership, "authority": record.authority,
-                "author": record.author, "moving": record.moving, "pose": _pose(np.array(record.pose)), "parent": record.parent,
-                "cut": list(record.cut),
+                "author": record.author, "moving": record.moving, "pose": _pose(np.array(record.pose)),
+                "parent": record.parent, "cut": list(record.cut),
             }
             for record in messages.decode_records(payload)
         ]
