@@ -1,4 +1,4 @@
-"""The sensor process of a robot, as a real process: its pictures go on whatever joins, fails or dies."""
+"""The sensor process of a robot: its pictures continue when actors join and when processes fail."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.support.contact_scenes import cane
 from tests.support.waiting import wait
@@ -33,11 +34,11 @@ CAMERA = "head_front_camera"
 class Robot:
     """A client with one vinebot far from a single cane, and its sensor process."""
 
-    def __init__(self) -> None:
+    def __init__(self, device: str = "cpu") -> None:
         scene, vinebot = load_scene("demo"), load_description("vinebot")
         model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
         self.hub = MemoryHub()
-        self.sensors = SensorProcess("robot", scene, model, vinebot, ros=False, keep_pictures=True)
+        self.sensors = SensorProcess("robot", scene, model, vinebot, ros=False, keep_pictures=True, device=device)
         self.client = Client(scene, model, vinebot, self.hub.bus("robot"), name="robot", pose=spawn_pose(scene, 0))
 
     def frames(self) -> int:
@@ -67,6 +68,16 @@ def robot() -> Iterator[Robot]:
     with one.sensors:
         one.sensors.attach(one.client)
         yield one
+
+
+@pytest.mark.skipif(wp.get_cuda_device_count() > 0, reason="needs a GPU that is gone")
+def test_sensors_whose_gpu_is_gone_compute_on_the_cpu_and_the_report_says_so():
+    """What the restarted process of a robot meets whose GPU was lost in mid-run."""
+    lost = Robot(device="cuda:0")
+    with lost.sensors:
+        lost.sensors.attach(lost.client)
+        lost.run_for_pictures(1)
+        assert lost.sensors.report()["sensor_device"] == "cpu"
 
 
 def test_a_body_that_joins_while_a_list_is_on_its_way_does_not_end_the_pictures(robot):

@@ -327,7 +327,7 @@ FAULTS = {
         robot(links="<link name='s'><collision><geometry><cone radius='1'/></geometry></collision></link>"),
         "cone",
     ),
-    "everybody's world": (robot().replace('"base"', '"world"'), "is called 'world'"),
+    "name of the world": (robot().replace('"base"', '"world"'), "is called 'world'"),
     "no limits": (robot(arm_joint="<dynamics damping='1'/>"), "moves without limits"),
     "half a limit": (robot(arm_joint="<limit effort='1' velocity='1'/>"), "lower, upper"),
     "upside-down limits": (robot(arm_joint="<limit lower='1' upper='0' effort='1' velocity='1'/>"), "limits 1 to 0"),
@@ -340,7 +340,7 @@ FAULTS = {
         robot(links="<link name='s'><visual><geometry><mesh filename='gone.stl'/></geometry></visual></link>"),
         "'gone.stl' is missing",
     ),
-    "mimics nobody": (
+    "unknown mimic source": (
         robot(
             links="<link name='a'><inertial><mass value='1'/></inertial></link>",
             joints="<joint name='j' type='revolute'><parent link='arm'/><child link='a'/><mimic joint='k'/></joint>",

@@ -138,12 +138,12 @@ def test_without_a_time_tolerance_it_waits_until_the_goal_is_reached() -> None:
 
 def test_tolerances_of_the_trajectory_override_those_of_the_controller() -> None:
     arm = ControlledArm(path_tolerance=Tolerance.uniform(7, position=1e-9))
-    loose = swing(arm)
+    trajectory = swing(arm)
     for tolerance, outcome in (
         (None, Outcome.PATH_TOLERANCE_VIOLATED),
         (Tolerance.uniform(2, 0.05), Outcome.SUCCESSFUL),
     ):
-        plan = Trajectory(TWO, loose.times, loose.positions, loose.velocities, path_tolerance=tolerance)
+        plan = Trajectory(TWO, trajectory.times, trajectory.positions, trajectory.velocities, path_tolerance=tolerance)
         run = arm.controller.start(plan, arm.time)
         arm.run(4.0, until=run)
         assert run.outcome is outcome

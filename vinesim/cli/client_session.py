@@ -55,7 +55,7 @@ class ClientSession:
         """Index of the start pose in the scene."""
         if options.pose is not None:
             self.scene, self.spawn = with_start_pose(self.scene, *options.pose), 0
-        compile_kernels()
+        compile_kernels(device=options.device)
         self.model = generate(self.scene)
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()

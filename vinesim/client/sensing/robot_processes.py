@@ -30,7 +30,7 @@ class RobotProcesses:
     def __init__(
         self, name: str, scene: Scene, model: Model, description: RobotDescription, *, namespace: str = "",
         ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
-        renderer: str = "warp",
+        renderer: str = "warp", device: str = "cpu",
     ) -> None:  # fmt: skip
         """``clock``: publish /clock; a ROS domain has one. For the others see :class:`SensorProcess`."""
         if ros and (reason := middleware.unavailable_reason()) is not None:
@@ -40,7 +40,7 @@ class RobotProcesses:
             self.sensors = stack.enter_context(
                 SensorProcess(
                     name, scene, model, description, namespace=namespace, ros=ros, keep_pictures=keep_pictures,
-                    sensor_hz=sensor_hz, renderer=renderer,
+                    sensor_hz=sensor_hz, renderer=renderer, device=device,
                 )
             )  # fmt: skip
             self.ros = (

@@ -52,6 +52,7 @@ class SensorProcess:
         keep_pictures: bool = False,
         sensor_hz: float | None = None,
         renderer: str = "warp",
+        device: str = "cpu",
     ) -> None:
         """Starts the process; :meth:`attach` connects it with a client.
 
@@ -62,6 +63,7 @@ class SensorProcess:
         self.missed_snapshots = 0
         """Snapshots that were written one step later, as the process was just reading."""
         self._awaited: tuple[str, ...] = ("process",)
+        self._device = device
         self._counts: Counts = {}
         self._counts_before: dict[str, collections.Counter[str]] = {}
         """Counts of the runs of the process before this one."""
@@ -71,7 +73,8 @@ class SensorProcess:
         self._is_overdue = False
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
-            name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer
+            name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer,
+            device,
         )  # fmt: skip
         self._frames = tuple(config.sensor_frames.values())
         self.worker = WorkerProcess(
@@ -153,6 +156,8 @@ class SensorProcess:
                 for what, counts in self._counts.items():  # a new run
                     self._counts_before.setdefault(what, collections.Counter()).update(counts)
             self._counts = value
+        elif kind == "device":
+            self._device = value
         elif kind == "saved":
             self._saved.set()
 
@@ -175,13 +180,14 @@ class SensorProcess:
         return self._total("ros_dropped")
 
     def report(self) -> dict[str, Any]:
-        """Frames delivered and dropped by sensor, snapshots that could not be shown or were late, restarts."""
+        """Frames delivered and dropped by sensor, snapshots that could not be shown or were late, restarts, device."""
         return {
             "frames": self._total("frames"),
             "frames_dropped": self._total("frames_dropped"),
             "frames_skipped": self._total("frames_skipped").get("snapshots", 0),
             "snapshots_missed": self.missed_snapshots,
             "sensor_restarts": self.worker.restarts,
+            "sensor_device": self._device,
         }
 
     def save_picture(self, folder: pathlib.Path) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from vinesim.client.sensing.rigid_visual_list import VisualListMessage, VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
+from vinesim.physics.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
 from vinesim.scene.model import Model
@@ -63,6 +64,8 @@ class SensorConfig:
     sensor_hz: float | None
     """Rate of all sensors [Hz]; None: each sensor's own."""
     renderer: str = "warp"
+    device: str = "cpu"
+    """Where they compute; the CPU from the next start on if a GPU fails."""
 
     @property
     def sensor_frames(self) -> dict[str, str]:
@@ -164,20 +167,34 @@ class SensorWorker:
         from vinesim.sensors.scene.primitives import Primitives
         from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
 
-        load_kernels()
+        device = self._working_device()
+        if device == "cpu":
+            load_kernels()
         config, sensors = self.config, []
         seed = zlib.crc32(config.name.encode())  # no two robots have the same noise
         for i, mount in enumerate(config.description.cameras):
             spec = CameraSpec.load(mount.type)
-            camera = Camera(spec, spec.info(mount.frame), mount.name, config.sun, quality="fast", seed=seed)
+            camera = Camera(
+                spec, spec.info(mount.frame), mount.name, config.sun, quality="fast", seed=seed, device=device
+            )
             always = config.keep_pictures and i == 0
             wanted = self._camera_demand(mount.name, always)
             sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, config.sensor_hz))
         for mount in config.description.lidars:
-            lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed)
+            lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed, device=device)
             wanted = self._lidar_demand(mount.name)
             sensors.append(ScheduledSensor(lidar, self._deliver_lidar, wanted, config.sensor_hz))
-        return SensorScheduler(config.model, sensors, primitives=Primitives(config.model, renderer=config.renderer))
+        primitives = Primitives(config.model, renderer=config.renderer, device=device)
+        return SensorScheduler(config.model, sensors, primitives=primitives)
+
+    def _working_device(self) -> str:
+        """The device of the configuration, or the CPU if it cannot be used any more, which is logged and reported."""
+        device = self.config.device
+        if device != "cpu" and (fault := device_fault(device)) is not None:
+            log.error("cameras and lidars of %s compute on the CPU: %s", self.config.name, fault)
+            device = "cpu"
+        self.pipe.send(("device", device))
+        return device
 
     def _camera_demand(self, name: str, always: bool) -> Callable[[], CameraOutput]:
         """The outputs of a camera that its subscribers need now; all but the exact depth if ``always``."""
