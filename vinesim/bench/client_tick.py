@@ -1,8 +1,10 @@
 """``vinesim bench tick``: the whole tick of a robot client with the push job, split into its five parts.
 
 The real client steps back to back on a clock that advances by one step a tick, so that it sends as many messages a tick
-as in real time. Its bus is in memory. Sensors and ROS run in other processes and are not part of these times. Budgets
-stand beside processor time, which other programs on the machine change little; the wall time of whole ticks is given too.
+as in real time. Its bus is in memory. Sensors and ROS run in other processes and are not part of these times.
+
+Budgets stand beside processor time, which other programs on the machine change little; the wall time of whole ticks is
+given too.
 """
 
 from __future__ import annotations
