@@ -153,7 +153,12 @@ class Camera:
         if samples > 1:
             self._supersampled = CameraRasterizer(width * samples, height * samples, self.device, workers)
         self._sunlight = Sunlight(
-            self.sun, taps=quality.taps, period=period, fine=quality.shadow_texel_divisor, device=self.device
+            self.sun,
+            taps=quality.taps,
+            period=period,
+            fine=quality.shadow_texel_divisor,
+            device=self.device,
+            workers=workers,
         )
         self._exposure = Exposure(width, height, samples, self.exposure, self.device, workers)
         self._live_light = LiveLight(self.rasterizer) if quality.is_live and self.device == "cpu" else None
