@@ -20,7 +20,7 @@ from vinesim.kernels.launch import ThreadPool, usable_cores
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.sensing import stereo_rows
-from vinesim.kernels.shading import deferred, light_plants, light_points, shadow_maps
+from vinesim.kernels.shading import deferred, light_plants, light_points, shadow_maps, tone_rows
 from vinesim.kernels.shading.shadow_maps import ShadowMap
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput
@@ -111,7 +111,16 @@ QUALITIES = {
 @functools.cache
 def load_camera_kernels() -> None:
     """Compile the CPU kernels of cameras, or read them from the cache: threads must not do so at the same time."""
-    for module in (camera_raster, camera_raster_plants, deferred, shadow_maps, light_points, light_plants, stereo_rows):
+    for module in (
+        camera_raster,
+        camera_raster_plants,
+        deferred,
+        shadow_maps,
+        light_points,
+        light_plants,
+        tone_rows,
+        stereo_rows,
+    ):
         wp.load_module(module, device="cpu")
 
 
