@@ -1,4 +1,4 @@
-"""Every test runs with a ROS domain of its own and discovery on this host only; in CI a skipped test has failed."""
+"""Every test process has its own ROS domain with discovery on this host only; in CI a skipped test fails."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SLOW = (
     "tests/sensors/test_cuda_rasterizer.py", "tests/sensors/test_dataset.py",
     "tests/sensors/test_taichi_rasterizer.py", "tests/test_examples.py",
 )  # fmt: skip
-"""Files and folders that ``make check`` leaves out: each takes more than some ten seconds."""
+"""Files and folders that ``make check`` leaves out: each takes more than about ten seconds."""
 
 
 @pytest.hookimpl(tryfirst=True)

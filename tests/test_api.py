@@ -1,4 +1,4 @@
-"""The public interface: it loads lazily, and its energies, momenta, tips and damping are those of independent
+"""The public interface: lazy loading, and energies, momenta, tips and damping against independent
 formulas."""
 
 import ast
@@ -39,17 +39,17 @@ def test_every_public_name_loads_and_is_documented():
         assert inspect.getdoc(getattr(vinesim, name)), name
 
 
-def test_type_checkers_see_the_same_names():
+def test_type_checkers_find_the_same_names():
     tree = ast.parse(pathlib.Path(vinesim.__file__).read_text())
     block = next(node for node in tree.body if isinstance(node, ast.If))
-    seen = {}
+    samples = {}
     for line in block.body:
         assert isinstance(line, ast.ImportFrom)
         for alias in line.names:
             assert alias.asname == alias.name  # a re-export
             module = f"{line.module}.frames" if alias.name == "frames" else line.module
-            seen[alias.name] = module.removeprefix("vinesim.")
-    assert seen == vinesim._MODULES
+            samples[alias.name] = module.removeprefix("vinesim.")
+    assert samples == vinesim._MODULES
 
 
 def test_an_unknown_name_lists_the_known_ones():
@@ -60,7 +60,7 @@ def test_an_unknown_name_lists_the_known_ones():
 # ---------------------------------------------------------------- canes
 
 
-def test_a_fresh_cane_does_not_hover():
+def test_a_new_straight_cane_sags():
     """A straight cane is not in equilibrium: it starts awake, sags and falls asleep in another shape."""
     simulation = vinesim.Simulation(vinesim.CaneBuilder(tip_mass=0.05, damping_ratio=0.5))
     assert simulation.awake.tolist() == [0]
@@ -71,7 +71,7 @@ def test_a_fresh_cane_does_not_hover():
     assert start[2] - simulation.tip()[2] > 0.1
 
 
-def test_what_is_in_equilibrium_stays_asleep():
+def test_a_cane_in_equilibrium_stays_asleep():
     drawn = vinesim.CaneBuilder(tip_mass=0.05, shape="equilibrium")
     moving = vinesim.CaneBuilder(tip_mass=0.05)
     assert vinesim.Simulation([drawn, moving]).awake.tolist() == [1]
@@ -134,14 +134,14 @@ def test_the_first_mode_is_that_of_the_beam():
         ({"pose": (0.0, 0.0, 1.0)}, r"pose has the shape \(3,\); give position and quaternion"),
     ],
 )
-def test_a_bad_cane_is_refused_in_one_line(field, message):
+def test_an_invalid_cane_is_refused_in_one_line(field, message):
     with pytest.raises(ValueError, match=message) as error:
         vinesim.cane(**field)
     assert "\n" not in str(error.value)
 
 
-def test_a_drawn_bend_is_the_slack_shape():
-    """A quarter circle of 1 m, drawn with equal bends; without weight it stays where it was drawn."""
+def test_a_drawn_bend_is_the_unloaded_shape():
+    """A quarter circle of 1 m, drawn with equal bends; without weight it keeps its shape."""
     bends = np.zeros((32, 3))
     bends[1:, 2] = 0.5 * np.pi / 32
     simulation = vinesim.Simulation(vinesim.CaneBuilder(segments=32, bends=bends, shape="equilibrium"))
@@ -160,37 +160,37 @@ def test_energy_of_a_pendulum():
     begin = simulation.energy()
     assert begin.kinetic == 0.0
     assert begin.gravitational == pytest.approx(mass * G * 2.0, rel=1e-5)
-    tips, seen = [simulation.tip()], [begin]
+    tips, samples = [simulation.tip()], [begin]
     for _ in range(300):
         simulation.step()
         tips.append(simulation.tip())
-        seen.append(simulation.energy())
+        samples.append(simulation.energy())
     tips = np.array(tips)
-    assert tips[:, 2].min() < 0.51  # it has swung through
+    assert tips[:, 2].min() < 0.51  # it passed the lowest point
     speed = np.linalg.norm(tips[2:] - tips[:-2], axis=1) / (2.0 * simulation.dt)
     kinetic = mass * speed**2 / 6.0  # the tip moves at L omega
     # a chord is shorter than the arc by (omega dt)^2 / 6, less than a tenth of a percent here
-    np.testing.assert_allclose([e.kinetic for e in seen[1:-1]], kinetic, rtol=0.01, atol=1e-4)
+    np.testing.assert_allclose([e.kinetic for e in samples[1:-1]], kinetic, rtol=0.01, atol=1e-4)
     height = 2.0 + 0.5 * (tips[:, 2] - 2.0)
-    np.testing.assert_allclose([e.gravitational for e in seen], mass * G * height, rtol=1e-4)
-    assert [e.elastic for e in seen] == [0.0] * len(seen)
+    np.testing.assert_allclose([e.gravitational for e in samples], mass * G * height, rtol=1e-4)
+    assert [e.elastic for e in samples] == [0.0] * len(samples)
     swing = mass * G * 0.75
-    assert np.ptp([e.total for e in seen]) < 0.01 * swing
+    assert np.ptp([e.total for e in samples]) < 0.01 * swing
 
 
-def test_energy_of_an_undamped_cane_is_kept():
+def test_energy_of_an_undamped_cane_is_conserved():
     """Released straight, phi 1/2, 10 s: kinetic, elastic and gravitational energy pass into each other, total to 2
     %."""
     cane = vinesim.CaneBuilder(length=0.6, tip_mass=0.02)
     simulation = vinesim.Simulation(cane, parameters=vinesim.PhysicsParameters(phi=0.5), sleep=False)
-    seen = [simulation.energy()]
+    samples = [simulation.energy()]
     for _ in range(1000):
         simulation.step()
-        seen.append(simulation.energy())
-    exchanged = np.ptp([e.gravitational for e in seen])
-    assert max(e.kinetic for e in seen) > 0.2 * exchanged
-    assert max(e.elastic for e in seen) > 0.8 * exchanged
-    assert np.ptp([e.total for e in seen]) < 0.02 * exchanged
+        samples.append(simulation.energy())
+    exchanged = np.ptp([e.gravitational for e in samples])
+    assert max(e.kinetic for e in samples) > 0.2 * exchanged
+    assert max(e.elastic for e in samples) > 0.8 * exchanged
+    assert np.ptp([e.total for e in samples]) < 0.02 * exchanged
 
 
 def test_elastic_energy_is_the_work_of_the_load():
@@ -203,7 +203,7 @@ def test_elastic_energy_is_the_work_of_the_load():
 
 
 def test_momentum_of_a_floating_tree():
-    """Cut off and thrown: momentum grows by F t + m g t, angular momentum by r x F t + r_com x m g t."""
+    """Cut and moving: momentum grows by F t + m g t, angular momentum by r x F t + r_com x m g t."""
     cane = vinesim.CaneBuilder(length=0.6, tip_mass=0.05, pose=(0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 1.0))
     simulation = vinesim.Simulation(cane, sleep=False)
     simulation.cut(0)
@@ -255,7 +255,7 @@ def test_a_wrench_wakes_its_tree_and_ends_with_the_step():
     assert not simulation.physics.plants.body_load.any()
 
 
-def test_a_written_pose_is_seen_at_once_and_moves():
+def test_a_written_pose_is_applied_at_once():
     simulation = vinesim.Simulation(vinesim.CaneBuilder(shape="equilibrium"))
     simulation.snapshot()
     simulation.state.joint_q[0] = frames.exp(np.array([0.0, 0.0, 0.3]))
@@ -268,7 +268,7 @@ def test_a_written_pose_is_seen_at_once_and_moves():
     assert simulation.time == pytest.approx(0.05)
 
 
-def test_a_robot_bends_a_cane_that_stands_in_its_way():
+def test_a_robot_bends_a_cane_on_its_path():
     upwards = frames.pose(np.array([1.0, 0.0, 0.0]), frames.from_x_axis(np.array([0.0, 0.0, 1.0])))
     simulation = vinesim.Simulation(vinesim.CaneBuilder(length=1.2, pose=upwards, damping_ratio=0.1), dt=0.01)
     robot = simulation.add_robot("vinebot", name="picker")
@@ -279,13 +279,13 @@ def test_a_robot_bends_a_cane_that_stands_in_its_way():
         simulation.step()
         contacts += simulation.contacts
     assert {contact.actor for contact in contacts} == {"picker"}
-    assert sum(contact.force[0] for contact in contacts) < -10.0  # on the robot, against its way
+    assert sum(contact.force[0] for contact in contacts) < -10.0  # on the robot, against its motion
     assert simulation.tip()[0] > 1.05
     with pytest.raises(UsageError, match="robot 'picker' exists already; give another name"):
         simulation.add_robot("vinebot", name="picker")
 
 
-def test_what_was_picked_is_a_detachment():
+def test_a_picked_bunch_is_a_detachment():
     simulation = vinesim.Simulation(vinesim.load_scene("demo", seed=3))
     simulation.pick(2)
     simulation.step(2)
@@ -307,7 +307,7 @@ def test_what_was_picked_is_a_detachment():
         (lambda s: vinesim.Simulation([1.0]), "cannot simulate a list; give a scene, a model or cane builders"),
     ],
 )
-def test_bad_use_is_refused_in_one_line(call, message):
+def test_invalid_calls_are_refused_in_one_line(call, message):
     simulation = vinesim.Simulation(vinesim.CaneBuilder())
     with pytest.raises(UsageError, match=message) as error:
         call(simulation)
@@ -317,7 +317,7 @@ def test_bad_use_is_refused_in_one_line(call, message):
 # ---------------------------------------------------------------- sensors, recordings, clients
 
 
-def test_cameras_and_lidars_see_the_simulation_as_it_moves():
+def test_cameras_and_lidars_render_the_current_state():
     simulation = vinesim.Simulation(vinesim.CaneBuilder(radius=0.02, shape="equilibrium"))
     camera, pose = vinesim.Camera("pinhole", size=(64, 48)), vinesim.look_at((0.5, -0.6, 1.0), (0.5, 0.0, 1.0))
     frame = camera.render(simulation, pose)
@@ -346,7 +346,7 @@ def test_a_recording_is_read_message_by_message(tmp_path):
     assert (second.key, second.data["kind"]) == ("hello/ada", "spectator")
 
 
-def test_a_client_alone_drives_its_robot():
+def test_a_client_without_peers_drives_its_robot():
     with vinesim.Client("demo", name="ada", pose=(-2.0, 0.0, 0.0)) as client:
         for _ in range(100):
             client.robot.command_base(0.3, 0.0, client.time)

@@ -44,13 +44,13 @@ def test_defaults_are_not_shared():
         ("radius", np.array([0, np.nan, 0, 0], np.float32), r"Wires\.radius\[1\] is not finite"),
     ],
 )
-def test_a_wrong_array_is_named(field, value, text):
+def test_an_invalid_array_is_named(field, value, text):
     wires = Wires.allocate(wire=4, pole=1)
     setattr(wires, field, value)
     with pytest.raises(ValueError, match=text):
         wires.check()
 
 
-def test_a_forgotten_count_is_named():
+def test_a_missing_count_is_named():
     with pytest.raises(ValueError, match=r"Wires\.pole needs a count for 'pole'"):
         Wires.allocate(wire=4)

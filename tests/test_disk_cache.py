@@ -1,4 +1,4 @@
-"""The cache on disk: what it returns is what was computed, whatever happens to its files or to other processes."""
+"""The cache on disk returns what was computed, also with damaged files and other processes."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def entry(cache: pathlib.Path) -> pathlib.Path:
     return path
 
 
-def test_an_entry_is_made_once_and_read_bit_for_bit(cache: pathlib.Path) -> None:
+def test_an_entry_is_made_once_and_read_bitwise(cache: pathlib.Path) -> None:
     make = Maker()
     for _ in range(3):
         assert_same(load_or_make("table", "0", make))
@@ -176,7 +176,7 @@ def test_entries_used_last_stay_when_the_cache_is_too_large(
 
 
 def _make_slowly(place: str, pipe: Connection) -> None:
-    """In a process of its own: load or make an entry; says when it makes, then waits for a word to go on."""
+    """In another process: load or make an entry; report when it makes one, then wait for a message to continue."""
     os.environ["VINESIM_CACHE"] = place
 
     def make() -> dict[str, np.ndarray]:
@@ -197,7 +197,7 @@ def start(cache: pathlib.Path) -> tuple[multiprocessing.process.BaseProcess, Con
     return process, pipe
 
 
-def test_of_two_processes_one_makes_and_the_other_waits(cache: pathlib.Path) -> None:
+def test_of_two_processes_one_makes_an_entry_and_the_other_waits(cache: pathlib.Path) -> None:
     first, first_pipe = start(cache)
     assert first_pipe.recv() == "making"
     second, second_pipe = start(cache)
@@ -205,7 +205,7 @@ def test_of_two_processes_one_makes_and_the_other_waits(cache: pathlib.Path) -> 
     make = Maker()
     here = threading.Thread(target=lambda: found.append(load_or_make("table", "0", make)))
     here.start()
-    assert not second_pipe.poll(1.0)  # a second after its start at the latest it would say that it makes
+    assert not second_pipe.poll(1.0)  # it would report within a second of its start
     assert not found
     first_pipe.send("go on")
     assert (first_pipe.recv(), second_pipe.recv()) == ("done", "done")
@@ -217,7 +217,7 @@ def test_of_two_processes_one_makes_and_the_other_waits(cache: pathlib.Path) -> 
         assert process.exitcode == 0
 
 
-def test_a_process_killed_while_making_delays_nobody(cache: pathlib.Path) -> None:
+def test_a_process_killed_while_making_delays_no_other(cache: pathlib.Path) -> None:
     process, pipe = start(cache)
     assert pipe.recv() == "making"
     assert process.pid is not None
@@ -240,7 +240,7 @@ def test_a_lock_that_is_held_for_too_long_is_ignored(cache: pathlib.Path, monkey
     assert process.exitcode == 0
 
 
-def test_exclusive_says_whether_it_has_waited(cache: pathlib.Path) -> None:
+def test_exclusive_returns_whether_it_waited(cache: pathlib.Path) -> None:
     entered, leave, waited = threading.Event(), threading.Event(), []
 
     def hold() -> None:

@@ -1,4 +1,4 @@
-"""Every example runs as it stands, uses only ``import vinesim``, fits forty lines and prints what it promises."""
+"""Every example runs unchanged, uses only ``import vinesim``, has at most forty lines and prints its result."""
 
 import ast
 import os
@@ -15,7 +15,7 @@ MAX_LINES = 40
 
 
 def run(name: str, folder: pathlib.Path, *arguments: str) -> str:
-    """What an example prints, run in a folder of its own."""
+    """Output of an example, run in its own folder."""
     path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
     done = subprocess.run(
         [sys.executable, str(ROOT / "examples" / name), *arguments],

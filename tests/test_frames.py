@@ -23,7 +23,7 @@ def test_products_rotations_inverses():
     assert np.allclose(frames.rotate(a, V), A.apply(V), atol=1e-12)
 
 
-def test_rotation_vectors_there_and_back():
+def test_rotation_vectors_and_back():
     assert same(frames.exp(V), Rotation.from_rotvec(V))
     assert np.allclose(frames.log(A.as_quat()), A.as_rotvec(), atol=1e-10)
     assert np.allclose(frames.log(-A.as_quat()), A.as_rotvec(), atol=1e-10)
@@ -31,7 +31,7 @@ def test_rotation_vectors_there_and_back():
     assert np.allclose(frames.log(frames.exp(small)), small, rtol=1e-6, atol=1e-20)
 
 
-def test_matrices_there_and_back():
+def test_matrices_and_back():
     assert np.allclose(frames.to_matrix(A.as_quat()), A.as_matrix(), atol=1e-12)
     assert same(frames.from_matrix(A.as_matrix()), A)
     for half_turn in np.vstack([np.eye(3), [[0.6, 0.8, 0.0]]]):
@@ -39,7 +39,7 @@ def test_matrices_there_and_back():
         assert same(frames.from_matrix(r.as_matrix())[None], Rotation.concatenate([r]))
 
 
-def test_aligned_points_x_and_leans_z():
+def test_from_x_axis_aligns_x_and_keeps_z_upwards():
     q = frames.from_x_axis(V)
     assert np.allclose(frames.rotate(q, np.array([1.0, 0.0, 0.0])), frames.normalize(V), atol=1e-12)
     z = frames.rotate(q, np.array([0.0, 0.0, 1.0]))
@@ -58,23 +58,23 @@ def test_poses_compose_and_invert():
     assert same(back[:, 3:], B)
 
 
-def test_the_one_crossing_to_mujoco():
+def test_quaternion_order_of_mujoco():
     q = np.array([0.1, 0.2, 0.3, 0.9])
     assert frames.to_wxyz(q).tolist() == [0.9, 0.1, 0.2, 0.3]
     assert frames.from_wxyz(frames.to_wxyz(q)).tolist() == q.tolist()
 
 
-def test_an_optical_frame_looks_along_the_links_x():
+def test_the_z_axis_of_an_optical_frame_is_the_links_x():
     """REP-103: optical z is the link's x, optical x its right (-y), optical y its down (-z)."""
     axes = frames.to_matrix(frames.OPTICAL).T
     assert np.allclose(axes, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
 
 
-def test_yaw_turns_x_to_y():
+def test_yaw_rotates_x_to_y():
     assert frames.rotate(frames.from_yaw(np.pi / 2), np.array([1.0, 0.0, 0.0])) == pytest.approx(
         [0.0, 1.0, 0.0], abs=1e-12
     )
 
 
-def test_zero_stays_zero():
+def test_a_zero_quaternion_stays_zero():
     assert frames.normalize(np.zeros(3)).tolist() == [0.0, 0.0, 0.0]

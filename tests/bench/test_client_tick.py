@@ -12,7 +12,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
 
-def test_a_tick_is_the_sum_of_its_parts_and_stands_beside_its_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tick_is_the_sum_of_its_parts_and_has_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client_tick, "CASES", client_tick.CASES[:1])
     monkeypatch.setattr(client_tick, "WARM_UP_TICKS", 2)
     monkeypatch.setattr(client_tick, "MEASURED_TICKS", 1)
@@ -23,7 +23,7 @@ def test_a_tick_is_the_sum_of_its_parts_and_stands_beside_its_budget(monkeypatch
     assert whole.ratio == pytest.approx(1.2 / whole.value)
 
 
-def test_the_measured_client_pushes_and_its_visitor_is_told() -> None:
+def test_the_measured_client_pushes_and_sends_updates() -> None:
     scene = load_scene("demo")
     with contextlib.ExitStack() as stack:
         pushing = client_tick.PushingClient(

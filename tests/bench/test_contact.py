@@ -1,4 +1,4 @@
-"""What ``vinesim bench tick`` reports: the tick of one robot and of ten, and whose share it is."""
+"""``vinesim bench tick``: the tick of one robot and of ten, divided into MuJoCo, vinesim and the rest."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vinesim.bench import contact as bench
 from vinesim.cli.bench import BENCHES
 
 
-def test_every_tick_is_shared_out_to_mujoco_us_and_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_tick_is_divided_into_mujoco_vinesim_and_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "SCENE", "demo")
     monkeypatch.setattr(bench, "MEASURED_STEPS", 20)
     monkeypatch.setattr(bench, "WARM_UP_STEPS", 2)
@@ -19,11 +19,11 @@ def test_every_tick_is_shared_out_to_mujoco_us_and_the_rest(monkeypatch: pytest.
     found = list(BENCHES["tick"]())
     assert {m.unit for m in found} == {"ms/tick"}
     for robots in ("1 robot,", "10 robots,"):
-        of = {m.case.split(": ")[1]: m.value for m in found if m.case.startswith(robots)}
-        assert len(of) == 8
+        values = {m.case.split(": ")[1]: m.value for m in found if m.case.startswith(robots)}
+        assert len(values) == 8
         for name in ("tick", "MuJoCo's share", "ours", "the rest"):
-            assert 0.0 < of[f"{name}, p50"] <= of[f"{name}, p99"]
-        parts = [of[f"{name}, p50"] for name in ("MuJoCo's share", "ours", "the rest")]
-        assert max(parts) < of["tick, p99"]
-        assert np.sum(parts) < 1.5 * of["tick, p99"]
+            assert 0.0 < values[f"{name}, p50"] <= values[f"{name}, p99"]
+        parts = [values[f"{name}, p50"] for name in ("MuJoCo's share", "ours", "the rest")]
+        assert max(parts) < values["tick, p99"]
+        assert np.sum(parts) < 1.5 * values["tick, p99"]
     assert all("20 trees awake" in m.case for m in found)

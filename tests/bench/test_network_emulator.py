@@ -1,4 +1,4 @@
-"""Emulated links: what they delay, lose and count, and that nothing of them stays behind."""
+"""Emulated links: delay, loss, counters, and clean-up of namespaces."""
 
 from __future__ import annotations
 
@@ -77,41 +77,41 @@ def test_links_delay_each_way_and_count_every_byte():
         assert net.counts("near") == (Count(20, 2000, 0), Count(20, 2000, 0))
 
 
-def test_links_lose_their_share_and_can_be_cut_and_mended():
+def test_links_lose_packets_and_can_be_cut_and_restored():
     with NetworkEmulator({"bad": Link(LinkProfile(loss=0.2), LinkProfile())}, seed=3) as net:
         echo(net)
         _, answered = probe(net, "bad", 200, "flood")
-        there, back = net.counts("bad")
-        assert 20 <= there.lost <= 65
-        assert answered == there.packets - there.lost == back.packets
+        forth, back = net.counts("bad")
+        assert 20 <= forth.lost <= 65
+        assert answered == forth.packets - forth.lost == back.packets
         net.disconnect("bad")
         assert probe(net, "bad", 10, "flood")[1] == 0
         net.shape("bad", Link())
         assert probe(net, "bad", 10, "flood")[1] == 10
 
 
-def test_nothing_stays_behind_even_of_one_that_is_killed():
+def test_namespaces_are_removed_also_after_a_kill():
     code = (
         "import sys, time\nfrom vinesim.bench.support.network_emulator import Link, NetworkEmulator\n"
         "net = NetworkEmulator({'a': Link()})\nprint('ready', flush=True)\ntime.sleep(60)"
     )
-    victim = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert victim.stdout is not None
-    assert victim.stdout.readline() == "ready\n"
-    mine = [space for space in network_emulator._list_namespaces() if f"-{victim.pid}-" in space]
-    assert len(mine) == 2
-    victim.send_signal(signal.SIGKILL)
-    victim.wait()
-    victim.stdout.close()
+    owner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert owner.stdout is not None
+    assert owner.stdout.readline() == "ready\n"
+    namespaces = [space for space in network_emulator._list_namespaces() if f"-{owner.pid}-" in space]
+    assert len(namespaces) == 2
+    owner.send_signal(signal.SIGKILL)
+    owner.wait()
+    owner.stdout.close()
     wait(
-        lambda: not [s for s in network_emulator._list_namespaces() if f"-{victim.pid}-" in s],
-        "the carrier to take them away",
+        lambda: not [s for s in network_emulator._list_namespaces() if f"-{owner.pid}-" in s],
+        "the helper process to remove them",
     )
 
-    # and what a carrier that was killed as well left is swept by the next
-    gone = subprocess.Popen([sys.executable, "-c", "pass"])
-    gone.wait()
-    left = f"{network_emulator._PREFIX}-{gone.pid}-1-hub"
+    # the next emulator removes what a killed helper process left
+    ended = subprocess.Popen([sys.executable, "-c", "pass"])
+    ended.wait()
+    left = f"{network_emulator._PREFIX}-{ended.pid}-1-hub"
     subprocess.run(["ip", "netns", "add", left], check=True)
     start = time.monotonic()
     with NetworkEmulator({"a": Link()}):
@@ -120,7 +120,7 @@ def test_nothing_stays_behind_even_of_one_that_is_killed():
     assert time.monotonic() - start < 20.0
 
 
-def test_what_cannot_be_is_refused_in_words():
+def test_invalid_links_are_refused_with_the_reason():
     with pytest.raises(ValueError, match="loss from 0 to 1"):
         LinkProfile(loss=2.0)
     with pytest.raises(ValueError, match="end 'hub'"):

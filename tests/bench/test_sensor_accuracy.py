@@ -1,4 +1,4 @@
-"""What ``vinesim bench sensors`` measures, on a few of its cases."""
+"""``vinesim bench sensors`` on a few of its cases."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from vinesim.sensors.camera.camera import CameraSpec
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
-def test_a_plane_is_measured_as_the_formula_says(monkeypatch) -> None:
+def test_noise_on_a_plane_is_that_of_the_formula(monkeypatch) -> None:
     monkeypatch.setattr(sensor_accuracy, "RANGES", (0.5, 2.0))
     spec = CameraSpec.load("d435")
     found = measure_plane(spec)
     assert list(found.fill.values()) == [1.0, 1.0]
-    for away, error in found.error.items():
-        assert error == pytest.approx(float(depth_noise_formula(spec, np.array(away))), rel=0.2)
+    for distance, error in found.error.items():
+        assert error == pytest.approx(float(depth_noise_formula(spec, np.array(distance))), rel=0.2)
 
 
-def test_depths_need_enough_pixels() -> None:
+def test_depth_statistics_need_enough_pixels() -> None:
     depths, exact = DepthStatistics(), np.full(1000, 2.0)
     measured = exact + 0.01 * np.random.default_rng(1).standard_normal(1000)
     measured[:100] = np.nan
@@ -32,23 +32,23 @@ def test_depths_need_enough_pixels() -> None:
     assert depths.error[2.0] == pytest.approx(0.01, rel=0.1)
 
 
-def test_a_real_lidar_loses_some_returns_and_mixes_some() -> None:
+def test_a_lidar_with_errors_loses_some_returns_and_mixes_some() -> None:
     scan = measure_ranges("vlp16", Primitives(generate(load_scene("demo"))))
     assert 0.7 < scan.returned < 1.2
     assert 0.02 < scan.mixed < 0.5
     assert len(scan.real) == pytest.approx(scan.returned * len(scan.exact))
 
 
-def test_renderers_see_what_rays_meet(tmp_path) -> None:
+def test_renderers_agree_with_ray_casting(tmp_path) -> None:
     model = generate(load_scene("demo"))
     pictures = sensor_accuracy.compare_renderers(CameraSpec.load("d435"), model, rest_snapshot(model))
     assert {"warp", "rays"} <= pictures.keys()
     cast = pictures["rays"]
-    for name, look in pictures.items():
-        same = look.primitive == cast.primitive
+    for name, picture in pictures.items():
+        same = picture.primitive == cast.primitive
         assert same.mean() > 0.999, name
         both = same & np.isfinite(cast.depth)
-        assert np.median(np.abs(look.depth[both] - cast.depth[both])) < 1e-5, name
+        assert np.median(np.abs(picture.depth[both] - cast.depth[both])) < 1e-5, name
     sensor_accuracy._compare(tmp_path, pictures)
     assert (tmp_path / "sensors-backends.png").stat().st_size > 10_000
 

@@ -9,7 +9,7 @@ import pytest
 from vinesim.cli.bench import NoSuchBench, run
 
 
-def test_a_bench_that_needs_a_checkout_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bench_that_needs_a_checkout_is_refused_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
     loaded = [name for name in sys.modules if name.startswith("vinesim.bench.support")]
     for module in ("vinesim.bench.support", *loaded):
         monkeypatch.setitem(sys.modules, module, None)

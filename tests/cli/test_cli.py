@@ -1,4 +1,4 @@
-"""Wrong use: one clear line on standard error, the right exit code, no traceback, nothing half-written."""
+"""The command line: errors are one clear line and the right exit code, without traceback or partial files."""
 
 import contextlib
 import json
@@ -9,6 +9,7 @@ import sys
 import threading
 
 import pytest
+import warp as wp
 
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_writer import RecordingWriter
@@ -17,7 +18,7 @@ from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 TIMEOUT = 300.0
-"""Longest run of a command [s]; reached only by a failure."""
+"""Limit for a command [s]; reached only by a failure."""
 
 
 def vinesim(*arguments, cwd=None):
@@ -26,12 +27,12 @@ def vinesim(*arguments, cwd=None):
     )
 
 
-def refused(done, code, *words):
+def assert_refused(done, code, *reasons):
     assert done.returncode == code, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     assert len(lines) == 1, done.stderr
     assert lines[0].startswith("vinesim: ")
-    for word in words:
+    for word in reasons:
         assert word in lines[0]
 
 
@@ -62,68 +63,86 @@ def test_help_shows_every_command_with_examples():
         assert "Examples:" in vinesim(*command, "--help").stdout, command
 
 
-def test_no_such_scene():
-    refused(vinesim("scene", "show", "nowhere"), 2, "nowhere", "demo", "tendone", "vsp")
+def test_an_unknown_scene_is_refused():
+    assert_refused(vinesim("scene", "show", "nowhere"), 2, "nowhere", "demo", "tendone", "vsp")
 
 
-def test_bad_scene_names_file_field_and_remedy(tmp_path):
+def test_an_invalid_scene_is_refused_with_file_field_and_remedy(tmp_path):
     (tmp_path / "bad.toml").write_text('name = "bad"\nseed = 1\ntraining = "tendone"\nrow_spacing = 2\n')
     done = vinesim("scene", "show", "bad.toml", cwd=tmp_path)
-    refused(done, 2, "bad.toml", "row_spacing")
+    assert_refused(done, 2, "bad.toml", "row_spacing")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.toml"]
 
 
-def test_bad_urdf(tmp_path):
+def test_an_invalid_urdf_is_refused(tmp_path):
     (tmp_path / "bad.urdf").write_text("<robot name='x'><link name='a'/></robot")
-    refused(vinesim("client", "--robot", str(tmp_path / "bad.urdf"), "--out", str(tmp_path / "out")), 2, "bad.urdf")
+    assert_refused(
+        vinesim("client", "--robot", str(tmp_path / "bad.urdf"), "--out", str(tmp_path / "out")), 2, "bad.urdf"
+    )
     assert not (tmp_path / "out").exists()
 
 
-def test_no_such_device():
-    refused(vinesim("client", "--device", "abacus"), 3, "abacus", "cpu, cuda")
-    refused(vinesim("client", "--device", "cuda:0", "--threads", "2"), *threads_or_no_gpu())
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("demo",),
+        ("demo", "--job", "pick"),
+        ("render", "demo", "--at", "0.4,1.2,1.3", "--look", "3,1,1.7"),
+        ("dataset", "--images", "1"),
+    ],
+)
+def test_no_gpu_is_one_line_before_anything_is_written(command, tmp_path):
+    out = tmp_path / "out"
+    device = "cuda:0" if wp.get_cuda_device_count() == 0 else f"cuda:{wp.get_cuda_device_count()}"
+    assert_refused(vinesim(*command, "--device", device, "--out", str(out)), 3, f"'{device}'")
+    assert not out.exists()
+
+
+def test_an_unavailable_device_is_refused():
+    assert_refused(vinesim("client", "--device", "abacus"), 3, "abacus", "cpu, cuda")
+    assert_refused(vinesim("client", "--device", "cuda:0", "--threads", "2"), *threads_or_no_gpu())
 
 
 def threads_or_no_gpu():
-    import warp as wp
-
     return (2, "--threads 2") if wp.get_cuda_device_count() else (3, "'cuda:0'", "no NVIDIA GPU", "use cpu")
 
 
-def test_server_gone():
+def test_an_unreachable_server_is_reported():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    refused(vinesim("client", "--connect", endpoint, "--seconds", "1", "--no-ros"), 4, endpoint, "vinesim server")
+    assert_refused(
+        vinesim("client", "--connect", endpoint, "--seconds", "1", "--no-ros"), 4, endpoint, "vinesim server"
+    )
 
 
-def test_port_taken():
-    with socket.socket() as holder:
-        holder.bind(("127.0.0.1", 0))
-        holder.listen()
-        endpoint = f"tcp/127.0.0.1:{holder.getsockname()[1]}"
-        refused(vinesim("server", "--listen", endpoint), 4, endpoint)
+def test_a_port_in_use_is_reported():
+    with socket.socket() as occupied:
+        occupied.bind(("127.0.0.1", 0))
+        occupied.listen()
+        endpoint = f"tcp/127.0.0.1:{occupied.getsockname()[1]}"
+        assert_refused(vinesim("server", "--listen", endpoint), 4, endpoint)
 
 
-def test_files_that_cannot_be_replayed(tmp_path):
+def test_files_that_cannot_be_replayed_are_refused(tmp_path):
     (tmp_path / "scene.toml").write_text('name = "demo"\n')
-    refused(vinesim("replay", "scene.toml", "--out", "pictures", cwd=tmp_path), 2, "scene.toml", "no MCAP file")
+    assert_refused(vinesim("replay", "scene.toml", "--out", "pictures", cwd=tmp_path), 2, "scene.toml", "no MCAP file")
     with RecordingWriter(tmp_path / "old.mcap", {"protocol": "0", "release": "0.0.9"}):
         pass
-    refused(vinesim("replay", "old.mcap", "--out", "pictures", cwd=tmp_path), 2, "version 0", "0.0.9")
+    assert_refused(vinesim("replay", "old.mcap", "--out", "pictures", cwd=tmp_path), 2, "version 0", "0.0.9")
     with RecordingWriter(tmp_path / "empty.mcap"):
         pass
-    refused(vinesim("replay", "empty.mcap", "--out", "pictures", cwd=tmp_path), 2, "empty.mcap", "no message")
+    assert_refused(vinesim("replay", "empty.mcap", "--out", "pictures", cwd=tmp_path), 2, "empty.mcap", "no message")
     assert not (tmp_path / "pictures").exists()
 
 
-def test_no_server_to_record_and_nowhere_to_write(tmp_path):
+def test_recording_needs_a_server_and_a_writable_file(tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    refused(vinesim("record", "run.mcap", "--connect", endpoint, cwd=tmp_path), 4, endpoint, "vinesim server")
+    assert_refused(vinesim("record", "run.mcap", "--connect", endpoint, cwd=tmp_path), 4, endpoint, "vinesim server")
     assert list(tmp_path.iterdir()) == []
     with Server("tcp/127.0.0.1:0") as server:
-        refused(vinesim("record", "no/run.mcap", "--connect", server.endpoint, cwd=tmp_path), 4, "no/run.mcap")
+        assert_refused(vinesim("record", "no/run.mcap", "--connect", server.endpoint, cwd=tmp_path), 4, "no/run.mcap")
 
 
-def test_two_actors_with_one_name():
+def test_a_second_actor_of_one_name_is_refused():
     with Server("tcp/127.0.0.1:0") as server:
         arguments = ["client", "--connect", server.endpoint, "--name", "twin", "--no-ros", "--status", "json"]
         first = subprocess.Popen(
@@ -131,7 +150,7 @@ def test_two_actors_with_one_name():
         )
         try:
             assert first.stdout.readline()  # its first status: it is in
-            refused(vinesim(*arguments, "--seconds", "1"), 4, "twin")
+            assert_refused(vinesim(*arguments, "--seconds", "1"), 4, "twin")
         finally:
             first.terminate()
             first.communicate(timeout=TIMEOUT)
@@ -139,7 +158,7 @@ def test_two_actors_with_one_name():
 
 
 @contextlib.contextmanager
-def serving(*arguments):
+def running_server(*arguments):
     """A server process and its first line."""
     process = subprocess.Popen(
         [sys.executable, "-m", "vinesim.cli", "server", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -152,8 +171,8 @@ def serving(*arguments):
         process.communicate()
 
 
-def test_the_server_says_who_is_there_and_ends_cleanly(tmp_path):
-    with serving("--listen", "tcp/127.0.0.1:0", "--status", "json", "--state-dir", str(tmp_path / "kept")) as (
+def test_the_server_reports_actors_and_ends_cleanly(tmp_path):
+    with running_server("--listen", "tcp/127.0.0.1:0", "--status", "json", "--state-dir", str(tmp_path / "kept")) as (
         process,
         line,
     ):
@@ -167,7 +186,10 @@ def test_the_server_says_who_is_there_and_ends_cleanly(tmp_path):
         process.send_signal(signal.SIGTERM)
         assert process.wait(timeout=TIMEOUT) == 0
         assert process.stderr.read() == ""
-    with serving("--listen", "tcp/127.0.0.1:0", "--listen", "udp/127.0.0.1:0", "--status", "text") as (process, line):
+    with running_server("--listen", "tcp/127.0.0.1:0", "--listen", "udp/127.0.0.1:0", "--status", "text") as (
+        process,
+        line,
+    ):
         assert line.startswith("listening on tcp/127.0.0.1:")
         assert "udp/127.0.0.1:" in line
         assert process.stdout.readline().startswith("nobody: 0 links")
@@ -175,9 +197,9 @@ def test_the_server_says_who_is_there_and_ends_cleanly(tmp_path):
         assert process.wait(timeout=TIMEOUT) == 0
 
 
-def test_a_journal_that_is_none_is_left_alone(tmp_path):
+def test_a_file_that_is_not_a_journal_is_left_unchanged(tmp_path):
     (tmp_path / "vineyard.facts").write_text("notes on grapes")
-    refused(
+    assert_refused(
         vinesim("server", "--listen", "tcp/127.0.0.1:0", "--state-dir", str(tmp_path)),
         4,
         "vineyard.facts",
@@ -186,10 +208,10 @@ def test_a_journal_that_is_none_is_left_alone(tmp_path):
     assert (tmp_path / "vineyard.facts").read_text() == "notes on grapes"
 
 
-def test_a_client_of_another_scene_is_refused_by_both_digests():
+def test_a_client_of_another_scene_is_refused_with_both_digests():
     with Server("tcp/127.0.0.1:0", scene=SceneId("vsp", "0123456789abcdef")) as server:
         arguments = ["client", "--connect", server.endpoint, "--name", "ada", "--no-ros", "--seconds", "1"]
-        refused(vinesim(*arguments), 4, "'ada'", "'demo'", "'vsp'", "0123456789abcdef", "scene and seed")
+        assert_refused(vinesim(*arguments), 4, "'ada'", "'demo'", "'vsp'", "0123456789abcdef", "scene and seed")
 
 
 def test_secured_from_certificate_to_client(tmp_path):
@@ -197,9 +219,9 @@ def test_secured_from_certificate_to_client(tmp_path):
     done = vinesim("certs", "new", "ada", "--dir", str(certs))
     assert done.returncode == 0, done.stderr
     assert done.stdout.split()[-2:] == [str(certs / "ada.key"), str(certs / "ada.pem")]
-    refused(vinesim("certs", "new", "ada", "--dir", str(certs)), 4, "ada.pem", "there already")
+    assert_refused(vinesim("certs", "new", "ada", "--dir", str(certs)), 4, "ada.pem", "there already")
     arguments = ["--listen", "tls/127.0.0.1:0", "--tls", str(certs), "--status", "text", "--scene", "demo"]
-    with serving(*arguments) as (_, line):
+    with running_server(*arguments) as (_, line):
         endpoint = line.split()[-1]
         common = [
             "client",
@@ -218,7 +240,7 @@ def test_secured_from_certificate_to_client(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "reasons"),
     [
         (["client", "--role", "spectator", "--status", "xml"], ["xml", "json"]),
         (["client", "--role", "tractor"], ["tractor", "robot"]),
@@ -246,19 +268,19 @@ def test_secured_from_certificate_to_client(tmp_path):
         (["replay", "nowhere.mcap", "--out", "pictures"], ["nowhere.mcap", "No such file"]),
         (["replay", "run.mcap"], ["--connect", "--listen", "--out"]),
         (["demo", "--scene", "nowhere"], ["nowhere"]),
-        (["demo", "--robot", "nobody"], ["nobody"]),
+        (["demo", "--robot", "unknown"], ["unknown"]),
         (["demo", "--job", "dance"], ["dance", "push", "pick", "exchange"]),
         (["client", "--job", "dance", "--no-ros"], ["dance", "pick", "exchange"]),
     ],
 )
-def test_wrong_use(arguments, words, tmp_path):
-    refused(vinesim(*arguments, cwd=tmp_path), 2, *words)
+def test_invalid_options_are_refused(arguments, reasons, tmp_path):
+    assert_refused(vinesim(*arguments, cwd=tmp_path), 2, *reasons)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_person_joins_and_goes(tmp_path):
-    ended = vinesim("client", "--role", "human", "--reach", "3", "--seconds", "1", "--out", str(tmp_path), cwd=tmp_path)
-    assert ended.returncode == 0, ended.stderr
+def test_a_human_client_runs_and_writes_its_report(tmp_path):
+    done = vinesim("client", "--role", "human", "--reach", "3", "--seconds", "1", "--out", str(tmp_path), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["name"].startswith("human-")
     assert report["time"] == pytest.approx(1.0)
@@ -278,22 +300,22 @@ def status_when(process, condition):
 
 
 def test_three_roles_join_one_server_each_in_its_own_process():
-    """F06, F50: robot and human see each other, the spectator sees both, and has no body itself."""
+    """F06, F50: robot and human are known to each other and to the spectator, which has no body."""
     with Server("tcp/127.0.0.1:0") as server, contextlib.ExitStack() as stack:
         common = ["client", "--connect", server.endpoint, "--status", "json"]
         clients = {}
-        for name, role, more in (
+        for name, role, options in (
             ("picker", "robot", ["--no-ros"]),
             ("eva", "human", ["--spawn", "1"]),
             ("guest", "spectator", []),
         ):
-            command = [sys.executable, "-m", "vinesim.cli", *common, "--role", role, "--name", name, *more]
+            command = [sys.executable, "-m", "vinesim.cli", *common, "--role", role, "--name", name, *options]
             clients[name] = stack.enter_context(
                 subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             )
             stack.callback(clients[name].kill)
-        seen = {"picker": ["eva"], "eva": ["picker"], "guest": ["eva", "picker"]}
-        for name, others in seen.items():
+        expected = {"picker": ["eva"], "eva": ["picker"], "guest": ["eva", "picker"]}
+        for name, others in expected.items():
             status_when(clients[name], lambda status, others=others: status["others"] == others)
         assert sorted(server.figures()["actors"]) == ["vineyard/eva", "vineyard/guest", "vineyard/picker"]
         for client in clients.values():

@@ -194,9 +194,9 @@ def test_lidar_and_camera_render_humans_and_robots_of_other_clients(vinebot):
     snapshot = anna.physics.snapshot()
     primitives = Primitives(world.model, grass=0.0)
     primitives.update(snapshot)
-    eye = np.array([0.0, 0.0, 1.3])
-    scan = Lidar(LidarSpec.load("vlp16")).scan(primitives, frames.pose(eye))
-    camera_pose = look_at(eye, np.array([3.0, -0.4, 1.0]))
+    sensor_position = np.array([0.0, 0.0, 1.3])
+    scan = Lidar(LidarSpec.load("vlp16")).scan(primitives, frames.pose(sensor_position))
+    camera_pose = look_at(sensor_position, np.array([3.0, -0.4, 1.0]))
     frame = Camera(sensor_scenes.IDEAL, sensor_scenes.SMALL, sun=(0.4, 0.5, 0.77)).render(primitives, camera_pose)
     d435 = CameraSpec.load("d435")
     clear = look_at(np.array([1.0, 0.0, 1.3]), np.array([3.0, -0.4, 1.0]))  # both imagers clear of the own robot
@@ -207,7 +207,7 @@ def test_lidar_and_camera_render_humans_and_robots_of_other_clients(vinebot):
         (Organ.ROBOT, "bert", bert.physics.rigid.actor_position("bert")),
     ):
         actor_label = label(organ, label_index(name))
-        points = eye + scan.xyz[scan.labels == actor_label].astype(float)
+        points = sensor_position + scan.xyz[scan.labels == actor_label].astype(float)
         assert len(points) > 30, name
         assert np.linalg.norm(points[:, :2] - at[:2], axis=1).max() < 0.8
         here = remote_parts == actor_label

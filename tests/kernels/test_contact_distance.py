@@ -1,4 +1,4 @@
-"""Distances of segments and primitives: against MuJoCo, against many points, against the definition."""
+"""Distances of segments and primitives against MuJoCo, dense sampling, and the definition."""
 
 from __future__ import annotations
 
@@ -76,8 +76,8 @@ def test_distance_of_segments_is_mujocos(kind, length):
     np.testing.assert_allclose(np.linalg.norm(mine[:, :3], axis=1), 1.0, atol=1e-12)
 
 
-def test_distance_of_segments_and_a_box_is_that_of_the_closest_of_many_points():
-    """Not MuJoCo here: its distance from a box to a capsule that pierces it comes out positive."""
+def test_distance_of_segments_and_a_box_equals_dense_sampling():
+    """Against sampling, as MuJoCo's distance of a box to a capsule that pierces it is positive."""
     rng = np.random.default_rng(5)
     size = np.array(KINDS["box"][1])
     middle, turn = rng.normal(size=(200, 3)) * 0.15, frames.normalize(rng.normal(size=(200, 4)))
@@ -130,7 +130,7 @@ def true_distance(kind: str, p: np.ndarray) -> np.ndarray:
 
 @settings(max_examples=150, deadline=None)
 @given(kind=st.sampled_from(["sphere", "capsule", "cylinder", "box"]), start=points, end=points)
-def test_distance_of_a_segment_is_the_least_of_its_points(kind, start, end):
+def test_distance_of_a_segment_is_the_minimum_over_its_points(kind, start, end):
     a, b = np.array(start, float), np.array(end, float)
     along = np.linspace(0.0, 1.0, 2001)[:, None]
     truth = true_distance(kind, a + along * (b - a)).min()
@@ -153,7 +153,7 @@ def ellipsoid_distance(p: np.ndarray) -> np.ndarray:
 
 
 def test_distance_of_an_ellipsoid_is_of_first_order_near_its_surface():
-    """The error is quadratic: below 2 % at 5 mm, and a contact, within a millimetre, sees less than 5 um of it."""
+    """The error is quadratic: below 2 % at 5 mm, and below 5 um for contacts within a millimetre."""
     rng = np.random.default_rng(3)
     size = np.array(KINDS["ellipsoid"][1])
     surface = size * frames.normalize(rng.normal(size=(2000, 3)))
@@ -170,7 +170,7 @@ def test_distance_of_an_ellipsoid_is_of_first_order_near_its_surface():
 
 @settings(max_examples=100, deadline=None)
 @given(start=points, end=points)
-def test_distance_of_a_segment_and_an_ellipsoid_has_its_sign_and_is_close_near_it(start, end):
+def test_distance_of_a_segment_and_an_ellipsoid_has_the_right_sign_and_is_accurate_nearby(start, end):
     size = np.array(KINDS["ellipsoid"][1])
     a, b = np.array(start, float), np.array(end, float)
     p = a + np.linspace(0.0, 1.0, 2001)[:, None] * (b - a)
@@ -201,7 +201,7 @@ def _crossing(
 
 @settings(max_examples=150, deadline=None)
 @given(a=points, b=points, c=points, d=points)
-def test_distance_of_two_segments_is_the_least_of_their_points(a, b, c, d):
+def test_distance_of_two_segments_is_the_minimum_over_their_points(a, b, c, d):
     ends = [np.array([x], float) for x in (a, b, c, d)]
     found = wp.zeros(1, dtype=distance.vec6d, device="cpu")
     wp.launch(
@@ -216,7 +216,7 @@ def test_distance_of_two_segments_is_the_least_of_their_points(a, b, c, d):
     assert np.linalg.norm(mine[:3]) == pytest.approx(1.0, abs=1e-9)
 
 
-def test_segment_along_a_face_touches_in_its_middle():
+def test_a_segment_along_a_face_has_its_contact_in_the_middle():
     start, end = np.array([[0.06, 0.0, -0.04]]), np.array([[0.06, 0.0, 0.04]])
 
     assert closest("box", start, end)[0] == pytest.approx([1.0, 0.0, 0.0, 0.01])

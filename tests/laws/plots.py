@@ -126,20 +126,20 @@ def convergence() -> Table:
 
 
 def damping() -> Table:
-    """Damping ratio asked against seen, at 100 Hz and the shipping phi."""
+    """Requested and measured damping ratio, at 100 Hz and the default phi."""
     measured, frequency, floor = beam_theory.damping_sweep()
-    asked = np.array(beam_theory.ZETAS)
+    requested = np.array(beam_theory.ZETAS)
     figure, axes = plt.subplots(figsize=(5.4, 4.4), layout="constrained")
     axes.plot([0, 0.21], [0, 0.21], color=GREY, lw=1, ls="--")
     axes.fill_between([0, 0.21], [-0.005, 0.205], [0.005, 0.215], color=GREY, alpha=0.18, lw=0, label="gate: 0.005")
     axes.axhline(floor[0], color=WOOD, lw=1, label=f"floor {floor[0]:.4f} (2.8 Hz, phi 0.55)")
-    axes.plot(asked, measured, "o", color=GRAPE, ms=6, label="seen")
+    axes.plot(requested, measured, "o", color=GRAPE, ms=6, label="seen")
     axes.set(xlabel="damping ratio asked", ylabel="damping ratio seen", xlim=(0, 0.21), ylim=(0, 0.21), aspect="equal")
     axes.set_title("first mode of a cane, 100 Hz")
     axes.legend(loc="upper left")
     save(figure, "damping")
     lines = table(
-        ("damping ratio asked", *(f"{z:g}" for z in asked)),
+        ("damping ratio asked", *(f"{z:g}" for z in requested)),
         [("seen", *(f"{z:.4f}" for z in measured)), ("frequency", *(f"{100 * (f - 1):+.2f} %" for f in frequency))],
     )
     f_seen, f_truth = beam_theory.measured_frequencies()
@@ -148,7 +148,7 @@ def damping() -> Table:
 
 
 def grasped() -> Table:
-    """A bunch grasped, lifted, moved, pulled, let go: ours and the same scene wholly in MuJoCo."""
+    """A bunch grasped, lifted, moved, pulled, released: vinesim, and the same scene entirely in MuJoCo."""
     model, body, middle = bunch_scene()
     ours, reference = Physics(model), MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))

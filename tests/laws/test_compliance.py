@@ -148,7 +148,7 @@ def expected(stiffness: float, damping: float, inertia: float) -> tuple[float, f
 @pytest.mark.parametrize("zeta", [0.02, 0.05, 0.1, 0.2, 0.3])
 @pytest.mark.parametrize("stiffness", [15.0, 60.0, 240.0])
 def test_log_decrement_is_that_of_the_commanded_damping(gate: RobotDescription, stiffness: float, zeta: float) -> None:
-    """2 %, from 0.5 to 2 Hz: the implicit servo alone would add dt K, at 2 Hz twice what zeta 0.05 asks for."""
+    """2 %, from 0.5 to 2 Hz: the implicit servo alone would add dt K, at 2 Hz twice the damping of zeta 0.05."""
     inertia = GATE_INERTIA + ROTOR
     damping = 2.0 * zeta * np.sqrt(stiffness * inertia)
     stand = Stand(gate)
@@ -220,7 +220,7 @@ def test_a_whole_arm_deflects_by_f_over_k(vinebot: RobotDescription) -> None:
 def test_a_joint_of_an_arm_oscillates_as_commanded(
     vinebot: RobotDescription, joint: int, stiffness: float, zeta: float
 ) -> None:
-    """The robot's own hinge friction (URDF) adds to the damping asked for; inertia from the URDF and the rotor."""
+    """The robot's own hinge friction (URDF) adds to the commanded damping; inertia from the URDF and the rotor."""
     stand, name = Stand(vinebot), ARM[joint]
     inertia = inertia_about(vinebot, name) + next(d.armature for d in vinebot.drives if d.joint == name)
     friction = next(

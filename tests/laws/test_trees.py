@@ -514,7 +514,7 @@ def test_a_tied_cane_gains_no_energy(stiffness: float, mass: float, beta: float)
 
 
 @pytest.mark.parametrize("zeta", [0.03, 0.1, 0.2])
-def test_a_tie_damps_as_asked(zeta: float) -> None:
+def test_a_tie_has_the_given_damping_ratio(zeta: float) -> None:
     """A balanced wheel of 0.02 kg m^2 on a spring of 50 N/m at a lever of 0.2 m: 10 rad/s."""
     inertia, lever, stiffness = 0.02, 0.2, 50.0
     tree = TreeBuilder(frames.pose(np.zeros(3)))

@@ -23,7 +23,7 @@ def received(bus) -> list[tuple[str, int]]:
 
 def run(hub: MemoryHub, sync: RetainedSync, ticks: int = 3) -> None:
     for _ in range(ticks):
-        sync.update_window([HERE], hub.time)
+        sync.update_window([HERE], 0, hub.time)
         sync.flush()
         hub.advance(0.01)
 
@@ -93,8 +93,8 @@ def test_each_cell_is_queried_once_and_again_when_it_is_entered_again():
     run(hub, ada, 500)
     assert len(queries) == 1
     for _ in range(2000):
-        ada.update_window([THERE], hub.time)
+        ada.update_window([THERE], 1, hub.time)
         hub.advance(0.01)
-    ada.update_window([HERE], hub.time)
+    ada.update_window([HERE], 2, hub.time)
     hub.advance(0.01)
     assert len(queries) == 2

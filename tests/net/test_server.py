@@ -341,7 +341,7 @@ def test_records_are_published_again_to_a_server_that_lost_them(tmp_path):
 
         def while_syncing(condition):
             def check():
-                sync.update_window([(0, 0)], time.monotonic())
+                sync.update_window([(0, 0)], 0, time.monotonic())
                 sync.flush()
                 time.sleep(0.005)
                 return condition()

@@ -101,7 +101,7 @@ def test_a_resting_box_wakes_no_tree_and_a_pushed_one_does():
     assert touched == {(0, "box/0")}
 
 
-def test_beyond_the_capacity_the_deepest_contacts_stay_and_a_message_tells():
+def test_beyond_the_capacity_the_deepest_contacts_stay_and_the_rest_is_reported():
     model, _, middle = bunch_scene()
     physics = Physics(model, parameters=PhysicsParameters(contact_capacity=2))
     physics.add_robot(gripper(middle))

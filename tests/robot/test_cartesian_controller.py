@@ -1,4 +1,4 @@
-"""A hand that is led: straight lines, the turn that was asked for, and tasks in their order."""
+"""Cartesian control of a hand: straight lines, commanded orientation, and task priorities."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from vinesim.scene.builder import assemble
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def led(
+def moved(
     hand: CartesianController, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, seconds: float = 6.0
 ) -> np.ndarray:
-    """Lead a hand for a while; the places [tick, 3] m that its point went through."""
+    """Move a hand for ``seconds``; positions [tick, 3] m of its tip."""
     robot, points = hand.robot, []
     for tick in range(round(seconds / 0.01)):
         hand.move_towards(goal, ahead, up, speed=0.3, working_height=float(goal[2]))
@@ -36,27 +36,27 @@ def led(
     [((0.8, 0.25, 1.6), (1.0, 0.0, 0.0), UP), ((0.15, 0.58, 0.75), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0))],
     ids=["level, to a bunch", "down, to a box"],
 )
-def test_a_hand_comes_to_its_goal_and_turns_as_it_should(side: str, goal: tuple, ahead: tuple, up: np.ndarray):
+def test_a_hand_reaches_its_goal_and_orientation(side: str, goal: tuple, ahead: tuple, up: np.ndarray):
     robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     hand = CartesianController(robot, side)
-    there = np.array(goal) * [1.0, 1.0 if side == "left" else -1.0, 1.0]
-    led(hand, there, np.array(ahead), np.array(up))
-    assert hand.distance_to(there) < 0.002
+    target = np.array(goal) * [1.0, 1.0 if side == "left" else -1.0, 1.0]
+    moved(hand, target, np.array(ahead), np.array(up))
+    assert hand.distance_to(target) < 0.002
     axes = axes_of_pose(robot.frame_pose(hand.tool))
     assert axes[0] @ np.array(ahead) > 0.999
     assert axes[2] @ np.array(up) > 0.999
 
 
-def test_a_hand_goes_straight_and_not_too_fast():
+def test_a_hand_moves_on_a_line_within_its_speed():
     robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     hand = CartesianController(robot, "left", tip_offset=0.03)
-    led(hand, np.array([0.6, 0.25, 1.3]), np.array([1.0, 0.0, 0.0]), UP)
+    moved(hand, np.array([0.6, 0.25, 1.3]), np.array([1.0, 0.0, 0.0]), UP)
     hand.reset()
     start, goal = hand.tip_position, np.array([0.8, 0.15, 1.6])
-    points = led(hand, goal, np.array([1.0, 0.0, 0.0]), UP)
+    points = moved(hand, goal, np.array([1.0, 0.0, 0.0]), UP)
     along = frames.normalize(goal - start)
-    beside = (points - start) - ((points - start) @ along)[:, None] * along
-    assert np.linalg.norm(beside, axis=1).max() < 0.01
+    deviation = (points - start) - ((points - start) @ along)[:, None] * along
+    assert np.linalg.norm(deviation, axis=1).max() < 0.01
     assert np.linalg.norm(np.diff(points, axis=0), axis=1).max() / 0.01 < 1.2 * 0.3
 
 
@@ -75,7 +75,7 @@ def solve(
     return ik.solve().copy()
 
 
-def test_inverse_kinematics_is_that_of_singular_value_decompositions() -> None:
+def test_inverse_kinematics_equals_the_svd_reference() -> None:
     """Random tasks, with joints at their bounds, nearly singular rows and rows that contradict each other."""
     rng = np.random.default_rng(1)
     at_bounds = 0
@@ -91,13 +91,13 @@ def test_inverse_kinematics_is_that_of_singular_value_decompositions() -> None:
         tasks = [(jacobian[:3], velocity[:3]), (jacobian[3:], velocity[3:])]
         weights, bound = rng.uniform(0.1, 1.0, joints), rng.uniform(0.1, 3.0, joints)
         given = (tasks, rng.normal(size=joints), -bound, bound, weights)
-        wanted = reference(*given)
-        np.testing.assert_allclose(solve(*given), wanted, atol=1e-8)
-        at_bounds += np.count_nonzero(np.abs(np.abs(wanted) - bound) < 1e-9)
+        expected = reference(*given)
+        np.testing.assert_allclose(solve(*given), expected, atol=1e-8)
+        at_bounds += np.count_nonzero(np.abs(np.abs(expected) - bound) < 1e-9)
     assert at_bounds > 300
 
 
-def test_priorities_hold() -> None:
+def test_task_priorities_hold() -> None:
     """First task exact, second as far as it is free, bounds kept: against least squares on the null space."""
     rng = np.random.default_rng(5)
     first, second = rng.normal(size=(3, 7)), rng.normal(size=(5, 7))
@@ -109,9 +109,9 @@ def test_priorities_hold() -> None:
     null = np.eye(7) - np.linalg.pinv(first) @ first
     best = particular + null @ (np.linalg.pinv(second @ null, rcond=1e-9) @ (two - second @ particular))
     np.testing.assert_allclose(rates, best, atol=1e-9)
-    alone = solve([(first, one)], posture, -far, far, np.ones(7))
-    np.testing.assert_allclose(alone, particular + null @ posture, atol=1e-9)
-    bound = np.full(7, 0.9 * np.abs(alone).max())
-    kept = solve([(first, one)], posture, -bound, bound, np.ones(7))
-    assert (np.abs(kept) <= bound + 1e-9).all()
-    np.testing.assert_allclose(first @ kept, one, atol=1e-9)
+    first_only = solve([(first, one)], posture, -far, far, np.ones(7))
+    np.testing.assert_allclose(first_only, particular + null @ posture, atol=1e-9)
+    bound = np.full(7, 0.9 * np.abs(first_only).max())
+    bounded = solve([(first, one)], posture, -bound, bound, np.ones(7))
+    assert (np.abs(bounded) <= bound + 1e-9).all()
+    np.testing.assert_allclose(first @ bounded, one, atol=1e-9)

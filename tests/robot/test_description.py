@@ -1,4 +1,4 @@
-"""Robot descriptions: our own robot's numbers, foreign URDFs, and every way in which one can be unfit."""
+"""Robot descriptions: vinebot's numbers, other URDFs, and every kind of invalid description."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def parse(urdf: str) -> yourdfpy.Robot:
     return yourdfpy.URDF.load(io.BytesIO(urdf.encode()), build_scene_graph=False, load_meshes=False).robot
 
 
-# ---------------------------------------------------------------------- our own robot
+# ---------------------------------------------------------------------- vinebot
 
 
 @pytest.mark.parametrize("name", ["vinebot", "logistic"])
-def test_urdf_is_what_its_writer_writes(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_urdf_is_the_output_of_its_generator(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Structure, names and text are equal, numbers to the last digits, which differ between processors."""
     root = data_files.data_dir().parent
     monkeypatch.syspath_prepend(root / "tools")
@@ -52,10 +52,10 @@ def test_urdf_is_what_its_writer_writes(name: str, monkeypatch: pytest.MonkeyPat
         assert len(ours) == len(theirs)
         assert list(ours.attrib) == list(theirs.attrib)
         for key, text in ours.attrib.items():
-            assert_same_words(text, theirs.attrib[key], f"<{ours.tag} {key}=...>")
+            assert_same_text(text, theirs.attrib[key], f"<{ours.tag} {key}=...>")
 
 
-def assert_same_words(left: str, right: str, where: str) -> None:
+def assert_same_text(left: str, right: str, where: str) -> None:
     """Two texts of words and numbers are equal, numbers within 1e-6 of their size and 1e-12."""
     assert len(left.split()) == len(right.split()), where
     for one, other in zip(left.split(), right.split(), strict=True):
@@ -80,7 +80,7 @@ def test_vinebot_is_a_dual_arm_carrier(vinebot: RobotDescription) -> None:
         assert drive.lower <= home <= drive.upper, drive.joint
 
 
-def test_arms_weigh_as_arms_do(vinebot: RobotDescription, parsed: yourdfpy.Robot) -> None:
+def test_arms_have_plausible_masses(vinebot: RobotDescription, parsed: yourdfpy.Robot) -> None:
     for side in ("left", "right"):
         parts = [
             link for link in parsed.links if link.name.startswith((f"arm_{side}", f"gripper_{side}", f"wrist_{side}"))
@@ -88,7 +88,7 @@ def test_arms_weigh_as_arms_do(vinebot: RobotDescription, parsed: yourdfpy.Robot
         assert 15.0 < sum(link.inertial.mass for link in parts if link.inertial) < 20.0
 
 
-def test_inertias_are_those_of_the_shapes(parsed: yourdfpy.Robot) -> None:
+def test_inertias_are_those_of_the_collision_shapes(parsed: yourdfpy.Robot) -> None:
     """Oracle: trimesh integrates mass, centre and inertia over the surface of each link's collision shapes."""
     checked = 0
     for link in parsed.links:
@@ -117,7 +117,7 @@ def test_inertias_are_those_of_the_shapes(parsed: yourdfpy.Robot) -> None:
 
 
 def test_each_gripper_has_a_cutter_over_its_fingers(vinebot: RobotDescription) -> None:
-    """Wood that stands across the finger tips passes through the mouth."""
+    """Wood across the fingertips passes between the blades."""
     assert [cutter.group for cutter in vinebot.cutters] == ["gripper_left", "gripper_right"]
     poses = vinebot.link_poses(vinebot.home)
     for cutter in vinebot.cutters:
@@ -164,13 +164,13 @@ def test_moving_joints_agree_with_yourdfpy(vinebot: RobotDescription, parsed: yo
         np.testing.assert_allclose(frames.to_matrix(poses[link][3:]), expected[:3, :3], atol=1e-9)
 
 
-def test_camera_looks_ahead(vinebot: RobotDescription) -> None:
+def test_the_camera_points_ahead(vinebot: RobotDescription) -> None:
     pose = vinebot.link_poses(vinebot.home)["head_front_camera_rgb_optical_frame"]
     np.testing.assert_allclose(frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0])), [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(frames.rotate(pose[3:], np.array([0.0, 1.0, 0.0])), [0, 0, -1], atol=1e-9)
 
 
-# ---------------------------------------------------------------------- foreign robots
+# ---------------------------------------------------------------------- other robots
 
 
 def tiago_pro() -> RobotDescription:
@@ -211,7 +211,7 @@ def test_mimic_joints_follow_their_source() -> None:
 
 
 def robot(links: str = "", joints: str = "", arm_mass: str = "1", arm_joint: str = "") -> str:
-    """A URDF of a base and one arm, with room for faults."""
+    """A URDF of a base and one arm, into which faults can be inserted."""
     limits = '<limit lower="-1" upper="2" effort="10" velocity="1"/>'
     moments = 'ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"'
     return f"""<robot name="simple"><link name="base"><inertial><mass value="9"/><inertia {moments}/></inertial></link>
@@ -245,7 +245,9 @@ def test_defaults_without_a_sidecar(tmp_path: pathlib.Path) -> None:
 
 
 @pytest.mark.parametrize(("lower", "upper", "home"), [(0.5, 1.5, 1.0), (-1.0, 1.1, 0.0), (-2.4, 1.1, -0.65)])
-def test_home_is_zero_or_the_middle(lower: float, upper: float, home: float, tmp_path: pathlib.Path) -> None:
+def test_home_is_zero_or_the_middle_of_the_range(
+    lower: float, upper: float, home: float, tmp_path: pathlib.Path
+) -> None:
     limit = f'<limit lower="{lower}" upper="{upper}" effort="1" velocity="1"/>'
     assert load_description(write(tmp_path, robot(arm_joint=limit))).home == pytest.approx([home])
 
@@ -272,7 +274,7 @@ def test_meshes_are_found_and_unreadable_ones_replaced(tmp_path: pathlib.Path) -
     assert sum(".ply" in note for note in simple.notes) == 1
 
 
-# ---------------------------------------------------------------------- what cannot be simulated
+# ---------------------------------------------------------------------- invalid descriptions
 
 FAULTS = {
     "not XML": ("<robot name='x'>", "not well-formed XML"),
@@ -325,7 +327,7 @@ FAULTS = {
         robot(links="<link name='s'><collision><geometry><cone radius='1'/></geometry></collision></link>"),
         "cone",
     ),
-    "everybody's world": (robot().replace('"base"', '"world"'), "is called 'world'"),
+    "name of the world": (robot().replace('"base"', '"world"'), "is called 'world'"),
     "no limits": (robot(arm_joint="<dynamics damping='1'/>"), "moves without limits"),
     "half a limit": (robot(arm_joint="<limit effort='1' velocity='1'/>"), "lower, upper"),
     "upside-down limits": (robot(arm_joint="<limit lower='1' upper='0' effort='1' velocity='1'/>"), "limits 1 to 0"),
@@ -338,7 +340,7 @@ FAULTS = {
         robot(links="<link name='s'><visual><geometry><mesh filename='gone.stl'/></geometry></visual></link>"),
         "'gone.stl' is missing",
     ),
-    "mimics nobody": (
+    "unknown mimic source": (
         robot(
             links="<link name='a'><inertial><mass value='1'/></inertial></link>",
             joints="<joint name='j' type='revolute'><parent link='arm'/><child link='a'/><mimic joint='k'/></joint>",
@@ -349,7 +351,7 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_faults_are_named_in_one_line(fault: str, tmp_path: pathlib.Path) -> None:
+def test_faults_are_reported_in_one_line(fault: str, tmp_path: pathlib.Path) -> None:
     text, words = FAULTS[fault]
     with pytest.raises(DescriptionError) as caught:
         load_description(write(tmp_path, text))
@@ -360,7 +362,7 @@ def test_faults_are_named_in_one_line(fault: str, tmp_path: pathlib.Path) -> Non
     assert "\n" not in message
 
 
-def test_missing_file_lists_what_there_is() -> None:
+def test_a_missing_file_is_refused_with_the_known_ones() -> None:
     with pytest.raises(DescriptionError, match=r"no file 'vinbot'.*vinebot"):
         load_description("vinbot")
 
@@ -399,7 +401,7 @@ def test_springs_and_slip_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:
         ("[base", "Expected"),
     ],
 )
-def test_sidecar_faults_name_the_toml(toml: str, words: str, tmp_path: pathlib.Path) -> None:
+def test_faults_of_the_sidecar_name_the_toml_file(toml: str, words: str, tmp_path: pathlib.Path) -> None:
     file = write(tmp_path, robot())
     file.with_suffix(".toml").write_text(toml)
     with pytest.raises(DescriptionError, match=r"simple\.toml") as caught:
@@ -408,7 +410,7 @@ def test_sidecar_faults_name_the_toml(toml: str, words: str, tmp_path: pathlib.P
     assert "\n" not in str(caught.value)
 
 
-def test_an_extra_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_optional_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vinesim.robot.description.loader.find_installed", lambda path: None)
     with pytest.raises(DescriptionError, match=r"tiago_pro: .*pip install vinesim\[tiago\]"):
         load_description("tiago_pro")

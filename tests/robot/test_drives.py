@@ -57,10 +57,10 @@ def test_smooth_commands_are_tracked(yard: Yard) -> None:
     start = yard.robot.setpoint[joints].copy()
     worst = 0.0
     for _ in range(300):
-        wanted = start + 0.3 * (1.0 - np.cos(2.0 * np.pi * 0.4 * yard.time)) * np.array([1, -1, 1, -1])
-        yard.robot.command_position(wanted, joints)
+        desired = start + 0.3 * (1.0 - np.cos(2.0 * np.pi * 0.4 * yard.time)) * np.array([1, -1, 1, -1])
+        yard.robot.command_position(desired, joints)
         position = yard.run(yard.rigid.dt)[-1, 0, joints]
-        worst = max(worst, np.abs(position - wanted).max())
+        worst = max(worst, np.abs(position - desired).max())
     assert worst < 5e-3
 
 
@@ -83,7 +83,7 @@ def test_velocity_command_moves_and_ends_at_the_limit(yard: Yard) -> None:
 
 
 def test_effort_command_is_the_effort_at_rest(yard: Yard) -> None:
-    """The head pans about the vertical: no weight. Driven against its end stop it transmits what is asked."""
+    """The head pans about the vertical: no weight. Against its end stop it transmits the commanded effort."""
     joint = yard.robot.joint_indices(["head_1_joint"])[0]
     yard.robot.command_effort([2.0], ["head_1_joint"])
     rows = yard.run(3.0)
@@ -93,7 +93,7 @@ def test_effort_command_is_the_effort_at_rest(yard: Yard) -> None:
     assert yard.run(1.0)[-1, 2, joint] == pytest.approx(yard.robot.max_effort[joint], rel=0.01)
 
 
-def test_effort_command_accelerates_as_newton_says(yard: Yard) -> None:
+def test_effort_command_gives_newtons_acceleration(yard: Yard) -> None:
     """Lift: 10 N beyond the weight on what it carries, its screw, and the URDF's friction of 50 N s/m."""
     joint = yard.robot.joint_indices(["torso_lift_joint"])[0]
     urdf = ElementTree.fromstring(yard.robot.description.urdf)
@@ -105,10 +105,10 @@ def test_effort_command_accelerates_as_newton_says(yard: Yard) -> None:
     acceleration = np.diff(velocity) / yard.rigid.dt
     expected = (10.0 - 50.0 * velocity[1:]) / (carried + yard.robot.description.drives[joint].armature)
     assert 0.04 < velocity[-1] < 0.15
-    np.testing.assert_allclose(acceleration[5:], expected[5:], rtol=0.02)  # until then the arms sag in their joints
+    np.testing.assert_allclose(acceleration[5:], expected[5:], rtol=0.02)  # before that the arms settle in their joints
 
 
-def test_zero_effort_lets_the_joint_be_moved_and_position_does_not(yard: Yard) -> None:
+def test_a_joint_moves_under_force_with_zero_effort_and_not_with_position_control(yard: Yard) -> None:
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
     start = yard.run(0.2)[-1, 0, joint]
     yard.rigid.apply_wrench("anna", "arm_left_7_link", np.array([0.0, 0.0, 20.0]))
@@ -117,7 +117,7 @@ def test_zero_effort_lets_the_joint_be_moved_and_position_does_not(yard: Yard) -
     assert abs(yard.run(1.0)[-1, 0, joint] - start) > 0.2
 
 
-def test_impedance_gives_way_as_its_stiffness_says(yard: Yard) -> None:
+def test_impedance_deflects_by_force_over_stiffness(yard: Yard) -> None:
     """Oracle: k times deflection is J^T f of a known push (D6.4 section 3.1: compliance by stiffness gains)."""
     joint = yard.robot.joint_indices(["arm_left_4_joint"])[0]
     start = yard.run(0.1)[-1, 0, joint]
@@ -133,7 +133,7 @@ def test_impedance_gives_way_as_its_stiffness_says(yard: Yard) -> None:
         yard.robot.command_impedance([-1.0], [1.0], ["arm_left_4_joint"])
 
 
-def test_gains_outlive_the_coming_of_another_robot(yard: Yard, vinebot: RobotDescription) -> None:
+def test_gains_persist_when_another_robot_joins(yard: Yard, vinebot: RobotDescription) -> None:
     yard.robot.command_effort([0.0], ["arm_left_1_joint"])
     yard.run(0.02)
     Robot(yard.rigid, vinebot, "bert", 1, frames.pose([4.0, 0.0, 0.0]))
@@ -143,7 +143,7 @@ def test_gains_outlive_the_coming_of_another_robot(yard: Yard, vinebot: RobotDes
     assert abs(yard.run(1.0)[-1, 0, joint] - start) > 0.2
 
 
-def test_overpowered_joints_yield_at_their_effort_and_come_back_gently(yard: Yard) -> None:
+def test_overpowered_joints_yield_at_their_effort_limit_and_return_without_overshoot(yard: Yard) -> None:
     before = yard.run(0.2)[-1, 0]
     yard.rigid.apply_wrench("anna", "arm_left_4_link", np.array([900.0, 0.0, 0.0]))
     rows = yard.run(0.6)
@@ -152,10 +152,10 @@ def test_overpowered_joints_yield_at_their_effort_and_come_back_gently(yard: Yar
     yielded = rows[-1, 0, joint] - before[joint]
     assert abs(yielded) > 0.1
     yard.rigid.apply_wrench("anna", "arm_left_4_link", np.zeros(3))
-    back = yard.run(2.5)
-    assert back[-1, 0, joint] == pytest.approx(before[joint], abs=1e-3)
-    beyond = (before[joint] - back[:, 0, joint]) * np.sign(yielded)
-    assert beyond.max() < 0.05, "the servo had wound up"
+    returned = yard.run(2.5)
+    assert returned[-1, 0, joint] == pytest.approx(before[joint], abs=1e-3)
+    beyond = (before[joint] - returned[:, 0, joint]) * np.sign(yielded)
+    assert beyond.max() < 0.05, "overshoot"
 
 
 def test_gripper_opens_by_the_given_width(yard: Yard) -> None:
@@ -176,7 +176,7 @@ def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard)
         turns.append(velocity[5])
     speeds = np.array(speeds)
     commanded = 0.5 / limits.linear_acceleration
-    assert speeds[5] < 0.15, "it jumped"
+    assert speeds[5] < 0.15, "faster than its acceleration limit"
     assert speeds[48] == pytest.approx(0.5, abs=0.05)
     assert turns[48] == pytest.approx(0.4, abs=0.02)
     stopped = round((limits.timeout + commanded + 0.4) / yard.rigid.dt)
@@ -188,7 +188,7 @@ def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard)
 
 
 def test_samples_agree_with_the_rigid_world(vinebot: RobotDescription) -> None:
-    """Oracle: MuJoCo's kinematics of every moving link; odometry: the way since the start."""
+    """Oracle: MuJoCo's kinematics of every moving link; odometry: the pose relative to the start."""
     start = frames.pose([3.0, -2.0, 0.0], frames.from_yaw(2.0))
     yard = Yard(vinebot, start)
     first = yard.robot.sample(0.0)
@@ -202,23 +202,23 @@ def test_samples_agree_with_the_rigid_world(vinebot: RobotDescription) -> None:
     assert sample.joints.names == vinebot.joints
     for (parent, child), pose in zip(sample.transforms, sample.transform_q, strict=True):
         expected = yard.robot.frame_pose(child)
-        found = frames.compose(yard.robot.frame_pose(parent), pose)
-        np.testing.assert_allclose(found[:3], expected[:3], atol=1e-9)
-        assert abs(found[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-9)
+        composed = frames.compose(yard.robot.frame_pose(parent), pose)
+        np.testing.assert_allclose(composed[:3], expected[:3], atol=1e-9)
+        assert abs(composed[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-9)
     for (parent, child), pose in zip(vinebot.fixed_frames, vinebot.fixed_poses, strict=True):
-        found = frames.compose(yard.robot.frame_pose(parent), pose)
-        np.testing.assert_allclose(found[:3], yard.robot.frame_pose(child)[:3], atol=1e-9)
+        composed = frames.compose(yard.robot.frame_pose(parent), pose)
+        np.testing.assert_allclose(composed[:3], yard.robot.frame_pose(child)[:3], atol=1e-9)
     np.testing.assert_allclose(frames.compose(start, sample.odom_q), sample.base_q, atol=1e-9)
     np.testing.assert_allclose(yard.robot.frame_pose("base_footprint"), sample.base_q, atol=1e-9)
     assert np.linalg.norm(sample.odom_q[:3]) > 0.05
 
 
 def test_samples_keep_their_own_contacts(yard: Yard) -> None:
-    mine, other = (Contact(name, "link", 0, np.zeros(3), np.zeros(3), 0.0) for name in ("anna", "bert"))
-    assert yard.robot.sample(0.0, (other, mine)).contacts == (mine,)
+    own, other = (Contact(name, "link", 0, np.zeros(3), np.zeros(3), 0.0) for name in ("anna", "bert"))
+    assert yard.robot.sample(0.0, (other, own)).contacts == (own,)
 
 
-def test_two_runs_are_the_same_to_the_bit(vinebot: RobotDescription) -> None:
+def test_two_runs_are_bitwise_equal(vinebot: RobotDescription) -> None:
     ends = []
     for _ in range(2):
         yard = Yard(vinebot)
@@ -229,7 +229,7 @@ def test_two_runs_are_the_same_to_the_bit(vinebot: RobotDescription) -> None:
     assert ends[0] == ends[1]
 
 
-def test_stop_holds_everything_where_it_is(yard: Yard) -> None:
+def test_stop_holds_the_current_pose(yard: Yard) -> None:
     yard.robot.command_velocity(0.3 * yard.robot.max_velocity)
     yard.robot.command_base(0.5, 0.0, yard.time)
     yard.run(0.3)
@@ -240,7 +240,7 @@ def test_stop_holds_everything_where_it_is(yard: Yard) -> None:
     assert np.abs(yard.rigid.base_state("anna")[1]).max() < 0.02
 
 
-def test_wrong_commands_are_named(yard: Yard) -> None:
+def test_invalid_commands_are_refused(yard: Yard) -> None:
     with pytest.raises(CommandError, match=r"anna has no drive for 'arm_left_9_joint'.*arm_left_1_joint"):
         yard.robot.command_position([0.0], ["arm_left_9_joint"])
     with pytest.raises(CommandError, match="2 values for 1 joints"):
@@ -251,23 +251,25 @@ def test_wrong_commands_are_named(yard: Yard) -> None:
         yard.robot.command_base(np.inf, 0.0, 0.0)
 
 
-def test_remote_copy_follows_its_original(vinebot: RobotDescription) -> None:
-    here = Yard(vinebot)
-    far = RigidWorld(assemble([]))
-    copy = RemoteRobot(far, vinebot, "anna", pose=frames.pose([50.0, 0.0, -10.0]))
+def test_a_remote_copy_follows_its_robot(vinebot: RobotDescription) -> None:
+    local = Yard(vinebot)
+    remote_world = RigidWorld(assemble([]))
+    copy = RemoteRobot(remote_world, vinebot, "anna", pose=frames.pose([50.0, 0.0, -10.0]))
     home = vinebot.home.copy()
-    reach = here.robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint", "torso_lift_joint"])
+    reach = local.robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint", "torso_lift_joint"])
     joints, bases = [], []
     for tick in range(300):
-        here.robot.command_position(home[reach] + 0.15 * np.sin(1.5 * here.time) * np.array([1, -1, 0.5]), reach)
-        here.robot.command_base(0.3, 0.2, here.time)
-        here.run(here.rigid.dt)
-        copy.follow(here.robot.update(here.time))
-        far.predict()
-        far.integrate()
+        local.robot.command_position(home[reach] + 0.15 * np.sin(1.5 * local.time) * np.array([1, -1, 0.5]), reach)
+        local.robot.command_base(0.3, 0.2, local.time)
+        local.run(local.rigid.dt)
+        copy.follow(local.robot.update(local.time))
+        remote_world.predict()
+        remote_world.integrate()
         if tick > 50:
-            joints.append(np.abs(far.joint_measurements("anna")[0] - here.rigid.joint_measurements("anna")[0]).max())
-            bases.append(np.linalg.norm(far.base_state("anna")[0][:3] - here.rigid.base_state("anna")[0][:3]))
+            joints.append(
+                np.abs(remote_world.joint_measurements("anna")[0] - local.rigid.joint_measurements("anna")[0]).max()
+            )
+            bases.append(np.linalg.norm(remote_world.base_state("anna")[0][:3] - local.rigid.base_state("anna")[0][:3]))
     assert max(joints) < 0.01
     assert max(bases) < 0.03
     assert copy.sample(0.0).base_q[2] == 0.0
@@ -283,7 +285,7 @@ def test_robots_leave(yard: Yard, vinebot: RobotDescription) -> None:
     np.testing.assert_allclose(yard.run(0.05)[-1, 0], vinebot.home, atol=1e-9)
 
 
-def test_foreign_robot_moves(tmp_path) -> None:
+def test_a_robot_with_continuous_and_mimic_joints_moves(tmp_path) -> None:
     """Continuous joints have no limits; a mimicking finger follows through MuJoCo's equality."""
     inertial = '<inertial><mass value="1"/><inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial>'
     joints = """<joint name="spin_joint" type="continuous"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
@@ -310,29 +312,29 @@ def test_foreign_robot_moves(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("interface", ["position", "velocity", "effort"])
-def test_each_interface_tracks_a_swing(vinebot: RobotDescription, interface: str) -> None:
+def test_each_interface_tracks_a_sine(vinebot: RobotDescription, interface: str) -> None:
     """0.3 rad at 0.4 Hz in shoulder and elbow; by effort a controller outside closes the loop at 100 Hz."""
     yard, names = Yard(vinebot), ["arm_left_1_joint", "arm_left_4_joint"]
     joints = yard.robot.joint_indices(names)
     start, w, worst = yard.robot.setpoint[joints].copy(), 2.0 * np.pi * 0.4, 0.0
     for _ in range(400):
         t = yard.time + yard.rigid.dt
-        wanted = start + 0.15 * (1.0 - np.cos(w * t)) * np.array([1, -1])
+        desired = start + 0.15 * (1.0 - np.cos(w * t)) * np.array([1, -1])
         rate = 0.15 * w * np.sin(w * t) * np.array([1, -1])
         position, velocity, _, _ = yard.rigid.joint_measurements("anna")
         if interface == "position":
-            yard.robot.command_position(wanted, names)
+            yard.robot.command_position(desired, names)
         elif interface == "velocity":
             yard.robot.command_velocity(rate, names)
         else:
-            effort = 1500.0 * (wanted - position[joints]) + 80.0 * (rate - velocity[joints])
+            effort = 1500.0 * (desired - position[joints]) + 80.0 * (rate - velocity[joints])
             yard.robot.command_effort(effort, names)
         now = yard.run(yard.rigid.dt)[-1, 0, joints]
-        worst = max(worst, np.abs(now - wanted).max())
+        worst = max(worst, np.abs(now - desired).max())
     assert worst < {"position": 2e-3, "velocity": 2e-3, "effort": 1e-2}[interface]
 
 
-def test_a_switch_to_what_is_so_already_moves_nothing(yard: Yard) -> None:
+def test_switching_the_interface_at_the_current_state_causes_no_motion(yard: Yard) -> None:
     yard.robot.command_position(yard.robot.description.home * 0.8)
     yard.run(3.0)
     joints = yard.robot.joint_indices(None)
@@ -349,8 +351,8 @@ def test_a_switch_to_what_is_so_already_moves_nothing(yard: Yard) -> None:
         assert np.abs(rows[:, 0] - before).max() < 2e-4
 
 
-def test_effort_drives_no_joint_beyond_its_speed(yard: Yard) -> None:
-    """All of the effort is there at rest, as good as none at the largest speed."""
+def test_effort_control_keeps_the_speed_limit(yard: Yard) -> None:
+    """The full effort is available at rest, nearly none at the largest speed."""
     joint = yard.robot.joint_indices(["arm_left_1_joint"])[0]
     yard.robot.command_effort([yard.robot.max_effort[joint]], ["arm_left_1_joint"])
     rows = yard.run(1.5)[:, :, joint]
@@ -360,8 +362,8 @@ def test_effort_drives_no_joint_beyond_its_speed(yard: Yard) -> None:
     assert np.abs(rows[10:40, 2] - yard.rigid.gravity_effort("anna")[joint]).max() < 0.2 * yard.robot.max_effort[joint]
 
 
-def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
-    """All joints soft, a set-point behind the bunch: at rest K times what is missing is what the plants press."""
+def test_a_compliant_arm_presses_on_a_vine_by_stiffness_times_error() -> None:
+    """All joints soft, a set-point behind the bunch: at rest K times the position error is the contact effort."""
     description = load_description("vinebot")
     model, _, middle = bunch_scene()
     physics = Physics(model)
@@ -373,10 +375,10 @@ def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
     robot.command_impedance(stiffness, 0.2 * stiffness, joints)
     robot.control(physics.time)
     physics.step()
-    here = robot.frame_pose("gripper_left_grasping_link")[:3]
-    J = physics.rigid.jacobian("anna", "gripper_left_grasping_link", here)[:3, joints]
-    wanted = robot.setpoint[joints] + np.linalg.pinv(J) @ np.array([-0.25, 0.0, 0.0])
-    robot.command_position(wanted, joints)
+    local = robot.frame_pose("gripper_left_grasping_link")[:3]
+    J = physics.rigid.jacobian("anna", "gripper_left_grasping_link", local)[:3, joints]
+    desired = robot.setpoint[joints] + np.linalg.pinv(J) @ np.array([-0.25, 0.0, 0.0])
+    robot.command_position(desired, joints)
     for _ in range(1500):
         robot.control(physics.time)
         physics.step()
@@ -384,4 +386,4 @@ def test_a_compliant_arm_leans_on_a_vine_as_its_springs_say() -> None:
     assert any(c.link.startswith("gripper_left") for c in physics.contacts)
     assert np.abs(contact[joints]).max() > 0.3
     assert np.abs(velocity[joints]).max() < 2e-3
-    np.testing.assert_allclose(stiffness * (wanted - position[joints]), -contact[joints], atol=0.03)
+    np.testing.assert_allclose(stiffness * (desired - position[joints]), -contact[joints], atol=0.03)

@@ -26,7 +26,7 @@ def yard(vinebot: RobotDescription) -> Yard:
 
 @pytest.mark.parametrize(("ahead", "turning"), [(0.0, 0.0), (0.08, 0.0), (0.05, 0.2)])
 def test_odometry_measures_the_travel_of_the_tracks(vinebot: RobotDescription, ahead: float, turning: float) -> None:
-    """Straight on, then a turn on the spot: travel = way / (1 - slip)."""
+    """Straight, then a rotation in place: travel of the tracks = motion / (1 - slip)."""
     limits = msgspec.structs.replace(vinebot.base_limits, slip=(ahead, turning))
     start = frames.pose([3.0, -2.0, 0.0], frames.from_yaw(2.0))
     yard = Yard(dataclasses.replace(vinebot, base_limits=limits), start)

@@ -38,8 +38,8 @@ def vineyard(seed: int) -> tuple[Model, PickPlan]:
     return model, next(pick_planning.plan_picks(model, start_poses.spawn_pose(plan, 0)[:2]))
 
 
-def awake(physics: Physics) -> None:
-    """Let MuJoCo compute the forces of what lies still, too."""
+def disable_sleep(physics: Physics) -> None:
+    """Disable sleep, so that MuJoCo computes the forces of resting bodies, too."""
     physics.rigid.mj_model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 
@@ -57,11 +57,11 @@ def run(pick: PickBunch) -> PickBunch:
     return pick
 
 
-def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(vinebot: RobotDescription):
+def test_a_picked_bunch_ends_in_the_box_with_its_weight(vinebot: RobotDescription):
     model, task = vineyard(7)
     physics = Physics(model)
     robot = picker(physics, vinebot, task.base_pose)
-    awake(physics)
+    disable_sleep(physics)
     body = model.bunch_body[task.bunch]
     physics.plants.wake(int(model.body_tree[body]))
     for _ in range(30):
@@ -74,7 +74,7 @@ def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(
     pick = run(PickBunch(physics, robot, task))
     assert pick.picked, pick.reason
     assert not physics.state.bunch_attached[task.bunch]
-    assert physics.state.bunch_attached.sum() == len(model.bunch_body) - 1, "no other bunch may be torn off"
+    assert physics.state.bunch_attached.sum() == len(model.bunch_body) - 1, "another bunch was detached"
     for _ in range(150):
         robot.control(physics.time)
         physics.step()
@@ -82,7 +82,7 @@ def test_the_bunch_ends_in_the_box_and_weighs_there_what_it_weighed_on_the_vine(
     in_box = np.mean([_next(physics, robot, task.box) for _ in range(50)]) - empty
     assert on_vine > 3.0
     assert in_box == pytest.approx(on_vine, rel=0.01)
-    # it was cut, not torn: the blade did it, and the hand that held it is empty now
+    # cut by the blade, not pulled off; the hand is empty now
     assert np.abs(physics.rigid.bunch_pose(task.bunch)[:3] - pick.arm.tip_position).max() > 0.2
 
 
@@ -92,18 +92,18 @@ def _next(physics: Physics, robot: Robot, box: int) -> float:
     return pressed_on_ground(physics, box)
 
 
-def test_a_bunch_out_of_reach_is_told_in_words(vinebot: RobotDescription):
+def test_a_bunch_out_of_reach_is_refused_with_the_reason(vinebot: RobotDescription):
     model, task = vineyard(7)
-    far = frames.compose(task.base_pose, frames.pose([-0.8, 0.0, 0.0]))
+    distant = frames.compose(task.base_pose, frames.pose([-0.8, 0.0, 0.0]))
     physics = Physics(model)
-    pick = run(PickBunch(physics, picker(physics, vinebot, far), task))
+    pick = run(PickBunch(physics, picker(physics, vinebot, distant), task))
     assert not pick.picked
     assert pick.reason.startswith("reach: the hand is 0.")
     assert "out of reach" in pick.reason
     assert physics.state.bunch_attached.all()
 
 
-def test_a_blade_that_does_not_cut_is_told_in_words(vinebot: RobotDescription, monkeypatch: pytest.MonkeyPatch):
+def test_a_failed_cut_is_reported_with_the_reason(vinebot: RobotDescription, monkeypatch: pytest.MonkeyPatch):
     model, task = vineyard(7)
     physics = Physics(model)
     robot = picker(physics, vinebot, task.base_pose)
@@ -114,8 +114,8 @@ def test_a_blade_that_does_not_cut_is_told_in_words(vinebot: RobotDescription, m
     assert physics.state.bunch_attached.all()
 
 
-def test_a_bunch_that_is_gone_is_told_in_words(vinebot: RobotDescription):
-    """The fingers close where nothing is: what hung there fell before."""
+def test_a_missing_bunch_is_reported_with_the_reason(vinebot: RobotDescription):
+    """The fingers close in empty space, as the bunch has fallen before."""
     model, task = vineyard(7)
     physics = Physics(model)
     pick = PickBunch(physics, picker(physics, vinebot, task.base_pose), task)
@@ -135,7 +135,7 @@ def test_a_robot_without_a_cutter_is_refused(vinebot: RobotDescription):
         PickBunch(physics, robot, task)
 
 
-def test_the_same_pick_twice_is_the_same_to_the_bit(vinebot: RobotDescription):
+def test_two_picks_are_bitwise_equal(vinebot: RobotDescription):
     ends = []
     for _ in range(2):
         model, task = vineyard(7)

@@ -1,4 +1,4 @@
-"""Body sensors: wrist wrenches and IMUs against weights, pushes, accelerations and contacts."""
+"""Wrist force-torque sensors and IMUs against weights, pushes, accelerations and contacts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def yard(vinebot: RobotDescription) -> Yard:
     return Yard(vinebot)
 
 
-def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: RobotDescription) -> None:
+def test_the_wrist_measures_the_weight_of_the_hand_and_a_push(yard: Yard, vinebot: RobotDescription) -> None:
     yard.run(0.5)
     force, torque = wrench_of(yard)
     mass, centre = hand_of(vinebot)
@@ -44,8 +44,8 @@ def test_wrist_carries_the_hand_and_feels_a_push(yard: Yard, vinebot: RobotDescr
     assert np.linalg.norm(other.force) == pytest.approx(9.81 * mass, rel=0.01)
 
 
-def test_a_hand_that_falls_freely_weighs_nothing(yard: Yard, vinebot: RobotDescription) -> None:
-    """Inertia counts: as the lift drops and the hand with it, the wrist carries m (g + a)."""
+def test_the_wrist_measures_the_inertia_of_a_falling_hand(yard: Yard, vinebot: RobotDescription) -> None:
+    """With inertia: as the lift drops with the hand, the wrist carries m (g + a)."""
     hand, _ = hand_of(vinebot)
     yard.run(0.2)
     yard.robot.command_effort([-400.0], ["torso_lift_joint"])
@@ -59,7 +59,7 @@ def test_a_hand_that_falls_freely_weighs_nothing(yard: Yard, vinebot: RobotDescr
     np.testing.assert_allclose(forces[2:], -hand * (9.81 + acceleration), atol=0.1)
 
 
-def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
+def test_the_imu_measures_gravity_acceleration_and_rotation(yard: Yard) -> None:
     yard.run(0.3)
     imu = yard.robot.sample(yard.time).imus[0]
     assert (imu.name, imu.frame) == ("base_imu", "base_imu_link")
@@ -79,19 +79,19 @@ def test_imu_feels_gravity_speeding_up_and_turning(yard: Yard) -> None:
     np.testing.assert_allclose(imu.linear_acceleration, expected, atol=0.02)
 
 
-def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
-    """Oracle: MuJoCo knows nothing of them, so weight and contact forces must make up the reading at rest."""
+def test_the_wrist_measures_contact_forces_of_plants() -> None:
+    """Oracle: the reading at rest is the weight of the hand and the contact forces of plants."""
     description = load_description("vinebot")
     model, _, middle = bunch_scene()
     physics = Physics(model)
     tip = description.link_poses(description.home)["gripper_left_grasping_link"][:3]
-    ahead = np.array([0.15, 0.0, 0.0])  # it comes from beyond the cane's tip
+    ahead = np.array([0.15, 0.0, 0.0])  # it approaches from beyond the cane's tip
     place = middle + ahead - frames.rotate(frames.from_yaw(np.pi), tip)
     robot = Robot(physics.rigid, description, "anna", pose=frames.pose(place, frames.from_yaw(np.pi)))
-    met = 0
+    contact_ticks = 0
     for _ in range(900):
-        met += any(c.link.startswith("gripper_left") for c in physics.contacts)
-        if met < 20:
+        contact_ticks += any(c.link.startswith("gripper_left") for c in physics.contacts)
+        if contact_ticks < 20:
             robot.command_base(0.2, 0.0, physics.time)
         robot.control(physics.time)
         physics.step()
@@ -102,5 +102,5 @@ def test_wrist_feels_the_plants_that_the_hand_touches() -> None:
     wrench = next(w for w in sample.wrenches if w.name == "wrist_left_ft")
     turn = robot.frame_pose(wrench.frame)[3:]
     mass, _ = hand_of(description)
-    felt = frames.rotate(turn, wrench.force) + np.array([0.0, 0.0, 9.81 * mass])
-    np.testing.assert_allclose(felt, force, atol=0.05)
+    measured = frames.rotate(turn, wrench.force) + np.array([0.0, 0.0, 9.81 * mass])
+    np.testing.assert_allclose(measured, force, atol=0.05)

@@ -1,4 +1,4 @@
-"""The scripted reach: fingertips arrive wherever bunches hang, gently, and go on when they cannot."""
+"""The push task: fingertips reach bunches in the whole workspace, slowly, and skip those out of reach."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Run:
             self.setpoints.append(robot.setpoint.copy())
 
 
-# 0.45 to 0.9 m ahead, 1.3 to 1.8 m high, across the half of the alley that an arm works in
+# 0.45 to 0.9 m ahead, 1.3 to 1.8 m high, across the half of the alley that an arm covers
 GRID = list(itertools.product((0.45, 0.65, 0.9), (0.1, 0.35), (1.3, 1.55, 1.8)))
 
 
@@ -66,7 +66,7 @@ def test_fingertips_arrive_within_a_centimetre(robot: Robot, target: tuple[float
         assert run.errors[phase] < 0.01, phase
     touched = np.flatnonzero([phase is Phase.PUSH for phase in run.phases])[0]
     assert np.linalg.norm(run.tips[touched - 1] - np.array(target)) < 0.01
-    # within the limits of the URDF: what is asked strictly, what happens but for the servos' ringing
+    # within the limits of the URDF: set-points strictly, velocities up to the servos' overshoot
     steps = np.abs(np.diff(run.setpoints, axis=0)) / robot.rigid.dt
     assert (steps <= robot.max_velocity * (1.0 + 1e-6)).all()
     assert (np.abs(run.speeds) <= 1.5 * robot.max_velocity).all()
@@ -82,7 +82,7 @@ def test_the_right_arm_mirrors_the_left(robot: Robot, target: tuple[float, float
     np.testing.assert_allclose(right.tips, np.array(left.tips) * [1, -1, 1], atol=1e-6)
 
 
-def test_targets_are_in_the_world(robot: Robot) -> None:
+def test_targets_are_in_world_coordinates(robot: Robot) -> None:
     base = frames.pose([4.0, -3.0, 0.0], frames.from_yaw(2.5))
     target = frames.compose(base, frames.pose([0.65, 0.2, 1.5]))[:3]
     run = Run(robot, "left", target, base, radius=0.05)
@@ -91,7 +91,7 @@ def test_targets_are_in_the_world(robot: Robot) -> None:
     assert np.linalg.norm(run.tips[touched] - target) == pytest.approx(0.05, abs=0.01)
 
 
-def test_the_fingers_come_from_below_and_touch_slowly(robot: Robot) -> None:
+def test_the_fingers_approach_from_below_and_touch_slowly(robot: Robot) -> None:
     target = np.array([0.65, 0.2, 1.55])
     run = Run(robot, "left", target, radius=0.05, clearance=0.10, depth=0.04)
     tips, phases = np.array(run.tips), np.array([phase.value for phase in run.phases])
@@ -108,7 +108,7 @@ def test_the_fingers_come_from_below_and_touch_slowly(robot: Robot) -> None:
     assert forward[0] > 0.7
 
 
-def test_the_hand_is_smooth(robot: Robot) -> None:
+def test_the_hand_moves_smoothly(robot: Robot) -> None:
     run = Run(robot, "left", np.array([0.7, 0.25, 1.5]))
     arm = robot.description.joint_indices("arm_left")
     acceleration = np.diff(np.array(run.speeds)[:, arm], axis=0) / robot.rigid.dt
@@ -134,7 +134,7 @@ def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: RobotDescr
     assert max(errors) < 0.01
 
 
-def test_what_is_out_of_reach_is_given_up_calmly(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_target_out_of_reach_is_skipped(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
     run = Run(robot, "left", np.array([1.6, 0.2, 1.5]))
     assert run.reach.missed_count == 1
     assert Phase.TOUCH not in run.phases
@@ -145,7 +145,7 @@ def test_what_is_out_of_reach_is_given_up_calmly(robot: Robot, caplog: pytest.Lo
     assert (position <= robot.upper_limit + 0.02).all()
 
 
-def test_two_arms_share_the_robot(vinebot: RobotDescription) -> None:
+def test_two_arms_of_one_robot_push_independently(vinebot: RobotDescription) -> None:
     robot = Robot(RigidWorld(assemble([])), vinebot, "anna")
     arms = [
         PushBunch(robot, "left", lambda: np.array([0.7, 0.25, 1.45]), repeat=False),
@@ -167,7 +167,7 @@ def test_two_arms_share_the_robot(vinebot: RobotDescription) -> None:
     assert max(touched.values()) < 0.01
 
 
-def test_the_same_push_twice_is_the_same_to_the_bit(vinebot: RobotDescription) -> None:
+def test_two_pushes_are_bitwise_equal(vinebot: RobotDescription) -> None:
     ends = []
     for _ in range(2):
         robot = Robot(RigidWorld(assemble([])), vinebot, "anna")
@@ -180,7 +180,7 @@ def test_an_arm_without_a_tool_is_refused(robot: Robot) -> None:
         PushBunch(robot, "middle", lambda: np.zeros(3))
 
 
-def test_a_foreign_robot_reaches_by_its_names_alone() -> None:
+def test_tiago_pro_pushes_by_its_joint_names_alone() -> None:
     try:
         tiago = load_description("tiago_pro")
     except DescriptionError as error:

@@ -1,4 +1,4 @@
-"""The logistic job: a full box leaves on the carrier with all that lies in it, an empty one stands in its place."""
+"""The exchange task: a full box is carried away with its bunches, and an empty one takes its place."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def yard() -> tuple[Model, SwapPlan]:
     return model, swap_planning.plan_swap(model, start_poses.spawn_pose(plan, 1))
 
 
-def begun(count: int = 6) -> SwapBoxes:
+def start_task(count: int = 6) -> SwapBoxes:
     model, swap = yard()
     physics = Physics(model, detachment=False)
     robot = Robot(physics.rigid, load_description("logistic"), "carrier", pose=swap.start)
@@ -33,51 +33,51 @@ def begun(count: int = 6) -> SwapBoxes:
     return SwapBoxes(physics, robot, swap)
 
 
-def tick(exchange: SwapBoxes) -> None:
-    exchange.control(exchange.physics.time)
-    exchange.robot.control(exchange.physics.time)
-    exchange.physics.step()
+def tick(task: SwapBoxes) -> None:
+    task.control(task.physics.time)
+    task.robot.control(task.physics.time)
+    task.physics.step()
 
 
-def test_a_full_box_goes_and_an_empty_one_comes():
-    exchange = begun()
+def test_a_full_box_is_exchanged_for_an_empty_one():
+    task = start_task()
     model, swap = yard()
-    place = exchange.box_pose(swap.full_box).copy()
-    load_kg = sum(float(model.body_mass[model.bunch_body[bunch]]) for bunch in exchange.physics.rigid.free_bunches)
-    lift = exchange.robot.description.joint_indices("lift_front")[0]
+    place = task.box_pose(swap.full_box).copy()
+    load_kg = sum(float(model.body_mass[model.bunch_body[bunch]]) for bunch in task.physics.rigid.free_bunches)
+    lift = task.robot.description.joint_indices("lift_front")[0]
     carried = []
-    while not exchange.is_done:
-        tick(exchange)
-        if exchange.phase == "turn":
-            carried.append(exchange.robot.rigid.joint_measurements("carrier")[2][lift])
-    assert exchange.succeeded, exchange.reason
-    report = exchange.report()
+    while not task.is_done:
+        tick(task)
+        if task.phase == "turn":
+            carried.append(task.robot.rigid.joint_measurements("carrier")[2][lift])
+    assert task.succeeded, task.reason
+    report = task.report()
     assert report["exchanged"]
     assert report["bunches"] == 6
-    assert np.linalg.norm(exchange.box_pose(swap.empty_box)[:2] - place[:2]) < 0.05
-    assert exchange.box_pose(swap.empty_box)[2] == pytest.approx(0.0, abs=2e-3), "on the ground"
-    assert exchange.box_pose(swap.full_box)[2] == pytest.approx(LIFT_HEIGHT, abs=0.01), "on the carrier"
-    # the lift bears what its own parts weigh, the box, and every bunch in it
+    assert np.linalg.norm(task.box_pose(swap.empty_box)[:2] - place[:2]) < 0.05
+    assert task.box_pose(swap.empty_box)[2] == pytest.approx(0.0, abs=2e-3), "on the ground"
+    assert task.box_pose(swap.full_box)[2] == pytest.approx(LIFT_HEIGHT, abs=0.01), "on the carrier"
+    # the lift carries its own parts, the box, and every bunch in it
     parts = 6.0 + 2 * 1.5
     expected = 9.81 * (parts + float(model.box_mass[swap.full_box]) + load_kg)
     assert np.median(carried) == pytest.approx(expected, rel=0.01)
 
 
-def test_a_box_that_is_not_there_is_told_in_words():
-    exchange = begun(count=0)
-    joint = exchange.physics.rigid.mj_data.joint("box/1")
-    while exchange.phase != "take the empty box":
-        tick(exchange)
-    joint.qpos[2] = 5.0  # somebody takes it away
+def test_a_missing_box_is_reported_with_the_reason():
+    task = start_task(count=0)
+    joint = task.physics.rigid.mj_data.joint("box/1")
+    while task.phase != "take the empty box":
+        tick(task)
+    joint.qpos[2] = 5.0  # the box is removed
     joint.qvel[:] = 0.0
     for _ in range(20):
         joint.qpos[2], joint.qvel[2] = 5.0, 0.0
-        tick(exchange)
-    while not exchange.is_done:
+        tick(task)
+    while not task.is_done:
         joint.qpos[2], joint.qvel[2] = 5.0, 0.0
-        tick(exchange)
-    assert not exchange.succeeded
-    assert exchange.reason.startswith("take the empty box: the rear paddles feel 0 N")
+        tick(task)
+    assert not task.succeeded
+    assert task.reason.startswith("take the empty box: the rear paddles feel 0 N")
 
 
 def test_a_robot_without_clamps_is_refused():
@@ -88,7 +88,7 @@ def test_a_robot_without_clamps_is_refused():
         SwapBoxes(physics, robot, swap)
 
 
-def test_a_box_that_the_scene_has_not_is_refused():
+def test_an_unknown_box_is_refused():
     model, swap = yard()
     with pytest.raises(start_poses.PlacementError, match="no box 7: this scene has 2"):
         swap_planning.plan_swap(model, swap.start, full=7)

@@ -1,4 +1,4 @@
-"""Jobs told as generators: phases, durations, the end, and the reason if it fails."""
+"""Tasks written as generators: phases, durations, timeout, and the reason of a failure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.scene.builder import assemble
 
 
-class Story(Task):
+class TwoPhases(Task):
     fails = False
 
     def focus(self) -> np.ndarray:
@@ -32,35 +32,35 @@ def robot() -> Robot:
     return Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
 
 
-def tell(story: Story) -> Story:
+def run_to_the_end(task: TwoPhases) -> TwoPhases:
     tick = 0
-    while not story.is_done:
-        story.control(3.0 + 0.01 * tick)
+    while not task.is_done:
+        task.control(3.0 + 0.01 * tick)
         tick += 1
         assert tick < 1000
-    return story
+    return task
 
 
-def test_phases_follow_and_their_times_are_told(robot: Robot):
-    story = tell(Story(robot, timeout=5.0))
-    assert story.succeeded
-    report = story.report()
+def test_phases_follow_and_their_durations_are_reported(robot: Robot):
+    task = run_to_the_end(TwoPhases(robot, timeout=5.0))
+    assert task.succeeded
+    report = task.report()
     assert list(report["phases_s"]) == ["one", "two"]
     assert report["phases_s"]["one"] == pytest.approx(0.5, abs=0.011)
     assert report["phases_s"]["two"] == pytest.approx(0.25, abs=0.011)
     assert report["reason"] == ""
 
 
-def test_a_failure_says_where_and_why(robot: Robot, caplog: pytest.LogCaptureFixture):
-    story = Story(robot, timeout=5.0)
-    story.fails = True
-    assert not tell(story).succeeded
-    assert story.reason == "two: the end is missing"
+def test_a_failure_is_reported_with_phase_and_reason(robot: Robot, caplog: pytest.LogCaptureFixture):
+    task = TwoPhases(robot, timeout=5.0)
+    task.fails = True
+    assert not run_to_the_end(task).succeeded
+    assert task.reason == "two: the end is missing"
     assert "anna: two: the end is missing" in caplog.text
-    story.control(100.0)  # and that is its end
-    assert story.phase == "two"
+    task.control(100.0)  # a finished task does nothing
+    assert task.phase == "two"
 
 
-def test_patience_ends(robot: Robot):
-    story = tell(Story(robot, timeout=0.3))
-    assert story.reason == "one: not done after 0.3 s"
+def test_a_task_fails_after_its_timeout(robot: Robot):
+    task = run_to_the_end(TwoPhases(robot, timeout=0.3))
+    assert task.reason == "one: not done after 0.3 s"

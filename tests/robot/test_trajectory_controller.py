@@ -22,8 +22,8 @@ ARM = tuple(f"arm_left_{i}_joint" for i in range(1, 8))
 TWO = ("arm_left_1_joint", "arm_left_4_joint")
 
 
-class Stage:
-    """A robot whose left arm a controller moves."""
+class ControlledArm:
+    """A robot whose left arm is moved by a trajectory controller."""
 
     def __init__(self, **tolerances) -> None:
         self.rigid = RigidWorld(assemble([]))
@@ -34,7 +34,7 @@ class Stage:
         self.rows: list[np.ndarray] = []
 
     def run(self, seconds: float, until: GoalHandle | None = None) -> None:
-        """Go on for some time, or until a trajectory has ended."""
+        """Step for ``seconds``, or until a trajectory has ended."""
         for _ in range(round(seconds / self.rigid.dt)):
             if until is not None and until.is_done:
                 return
@@ -51,28 +51,28 @@ class Stage:
         return self.rigid.joint_measurements("anna")[0][self.robot.joint_indices(joints)]
 
 
-def swing(stage: Stage, *, smooth: bool = True) -> Trajectory:
-    """Two joints to and fro in 3 s; their home is where they start."""
-    home = stage.at(TWO)
+def swing(arm: ControlledArm, *, smooth: bool = True) -> Trajectory:
+    """Two joints back and forth in 3 s, starting at home."""
+    home = arm.at(TWO)
     positions = home + np.array([[0.2, -0.3], [0.4, -0.6], [0.1, -0.2]])
     velocities = np.array([[0.3, -0.45], [0.0, 0.0], [0.0, 0.0]]) if smooth else None
     return Trajectory(TWO, np.array([1.0, 2.0, 3.0]), positions, velocities)
 
 
 @pytest.mark.parametrize("smooth", [True, False])
-def test_way_points_are_met_in_time(smooth: bool) -> None:
-    """Oracle: the way points, and for cubics scipy's Hermite spline in between."""
+def test_waypoints_are_reached_in_time(smooth: bool) -> None:
+    """Oracle: the waypoints, and for cubics scipy's Hermite spline between them."""
     from scipy.interpolate import CubicHermiteSpline
 
-    stage = Stage()
-    plan = swing(stage, smooth=smooth)
-    start = stage.at(TWO)
-    run = stage.controller.start(plan, 0.0)
-    stage.run(4.0, until=run)
+    arm = ControlledArm()
+    plan = swing(arm, smooth=smooth)
+    start = arm.at(TWO)
+    run = arm.controller.start(plan, 0.0)
+    arm.run(4.0, until=run)
     assert run.outcome is Outcome.SUCCESSFUL
-    assert stage.time == pytest.approx(3.0, abs=0.03)
+    assert arm.time == pytest.approx(3.0, abs=0.03)
     columns = [ARM.index(joint) for joint in TWO]
-    position = np.array(stage.rows)[:, 0, columns]
+    position = np.array(arm.rows)[:, 0, columns]
     for t, point in zip(plan.times, plan.positions, strict=True):
         np.testing.assert_allclose(position[round(t / 0.01) - 1], point, atol=4e-3)
     if smooth:
@@ -84,116 +84,116 @@ def test_way_points_are_met_in_time(smooth: bool) -> None:
         late = np.abs(position[times <= 3.0] - spline(times[times <= 3.0])).max()
         assert late < 2e-3
     others = [i for i, joint in enumerate(ARM) if joint not in TWO]
-    np.testing.assert_allclose(np.array(stage.rows)[:, 0, others], stage.home[others] + 0 * position[:, :1], atol=2e-3)
+    np.testing.assert_allclose(np.array(arm.rows)[:, 0, others], arm.home[others] + 0 * position[:, :1], atol=2e-3)
 
 
-def test_controller_says_where_it_should_be_and_is() -> None:
-    stage = Stage()
-    stage.controller.start(swing(stage), 0.0)
-    stage.run(1.5)
-    state = stage.controller.state(stage.time)
+def test_controller_reports_desired_and_actual_state() -> None:
+    arm = ControlledArm()
+    arm.controller.start(swing(arm), 0.0)
+    arm.run(1.5)
+    state = arm.controller.state(arm.time)
     assert state.joints == ARM
-    np.testing.assert_allclose(state.position, stage.at())
+    np.testing.assert_allclose(state.position, arm.at())
     assert np.abs(state.error).max() < 0.01
     assert np.abs(state.desired_velocity[[0, 3]]).min() > 0.05
     assert (state.desired_velocity[[1, 2, 4, 5, 6]] == 0.0).all()
 
 
-def test_a_trajectory_too_fast_for_the_drives_breaks_its_path_tolerance() -> None:
-    """The URDF allows 1.9 rad/s; 1.2 rad in 0.2 s are three times as fast. The arm stops where it is."""
-    stage = Stage(path_tolerance=Tolerance.uniform(7, position=0.1))
-    run = stage.controller.start(Trajectory(TWO, np.array([0.2]), stage.at(TWO) + np.array([[1.2, 0.0]])), 0.0)
-    stage.run(1.0, until=run)
+def test_a_trajectory_too_fast_for_the_drives_violates_its_path_tolerance() -> None:
+    """The URDF allows 1.9 rad/s; 1.2 rad in 0.2 s are three times as fast. The arm stops."""
+    arm = ControlledArm(path_tolerance=Tolerance.uniform(7, position=0.1))
+    run = arm.controller.start(Trajectory(TWO, np.array([0.2]), arm.at(TWO) + np.array([[1.2, 0.0]])), 0.0)
+    arm.run(1.0, until=run)
     assert run.outcome is Outcome.PATH_TOLERANCE_VIOLATED
     assert "arm_left_1_joint is off by 0.1" in run.text
-    assert stage.time < 0.1
-    stopped = stage.at()
-    stage.run(1.0)
-    assert np.abs(stage.at() - stopped).max() < 0.12
-    assert np.abs(stage.rows[-1][1]).max() < 1e-3
-    speeds = np.abs(np.array(stage.rows)[:, 1, 0])
-    assert speeds.max() < 1.1 * stage.robot.max_velocity[stage.controller.indices[0]]
+    assert arm.time < 0.1
+    stopped = arm.at()
+    arm.run(1.0)
+    assert np.abs(arm.at() - stopped).max() < 0.12
+    assert np.abs(arm.rows[-1][1]).max() < 1e-3
+    speeds = np.abs(np.array(arm.rows)[:, 1, 0])
+    assert speeds.max() < 1.1 * arm.robot.max_velocity[arm.controller.indices[0]]
 
 
 def test_a_blocked_arm_misses_its_goal_in_time() -> None:
-    stage = Stage(goal_tolerance=Tolerance.uniform(7, position=0.01), goal_time_tolerance=0.5)
-    stage.rigid.apply_wrench("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
-    run = stage.controller.start(Trajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
-    stage.run(3.0, until=run)
+    arm = ControlledArm(goal_tolerance=Tolerance.uniform(7, position=0.01), goal_time_tolerance=0.5)
+    arm.rigid.apply_wrench("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
+    run = arm.controller.start(Trajectory(TWO, np.array([1.0]), arm.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
+    arm.run(3.0, until=run)
     assert run.outcome is Outcome.GOAL_TOLERANCE_VIOLATED
     assert "arm_left_1_joint" in run.text
-    assert stage.time == pytest.approx(1.5, abs=0.05)
+    assert arm.time == pytest.approx(1.5, abs=0.05)
 
 
-def test_without_a_limit_of_time_it_waits_until_the_goal_is_met() -> None:
-    stage = Stage(goal_tolerance=Tolerance.uniform(7, position=0.01))
-    stage.rigid.apply_wrench("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
-    run = stage.controller.start(Trajectory(TWO, np.array([1.0]), stage.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
-    stage.run(3.0, until=run)
+def test_without_a_time_tolerance_it_waits_until_the_goal_is_reached() -> None:
+    arm = ControlledArm(goal_tolerance=Tolerance.uniform(7, position=0.01))
+    arm.rigid.apply_wrench("anna", "arm_left_4_link", np.array([600.0, 0.0, 0.0]))
+    run = arm.controller.start(Trajectory(TWO, np.array([1.0]), arm.at(TWO) - np.array([[0.3, 0.0]])), 0.0)
+    arm.run(3.0, until=run)
     assert not run.is_done
-    stage.rigid.apply_wrench("anna", "arm_left_4_link", np.zeros(3))
-    stage.run(3.0, until=run)
+    arm.rigid.apply_wrench("anna", "arm_left_4_link", np.zeros(3))
+    arm.run(3.0, until=run)
     assert run.outcome is Outcome.SUCCESSFUL
 
 
-def test_a_tolerance_of_the_trajectory_goes_before_the_controllers() -> None:
-    stage = Stage(path_tolerance=Tolerance.uniform(7, position=1e-9))
-    loose = swing(stage)
+def test_tolerances_of_the_trajectory_override_those_of_the_controller() -> None:
+    arm = ControlledArm(path_tolerance=Tolerance.uniform(7, position=1e-9))
+    trajectory = swing(arm)
     for tolerance, outcome in (
         (None, Outcome.PATH_TOLERANCE_VIOLATED),
         (Tolerance.uniform(2, 0.05), Outcome.SUCCESSFUL),
     ):
-        plan = Trajectory(TWO, loose.times, loose.positions, loose.velocities, path_tolerance=tolerance)
-        run = stage.controller.start(plan, stage.time)
-        stage.run(4.0, until=run)
+        plan = Trajectory(TWO, trajectory.times, trajectory.positions, trajectory.velocities, path_tolerance=tolerance)
+        run = arm.controller.start(plan, arm.time)
+        arm.run(4.0, until=run)
         assert run.outcome is outcome
 
 
-def test_a_newer_trajectory_takes_over_without_a_jerk() -> None:
-    stage = Stage()
-    first = stage.controller.start(swing(stage), 0.0)
-    stage.run(1.5)
-    there = stage.home[[0, 3]] + 0.1
-    second = stage.controller.start(Trajectory(TWO, np.array([1.5]), there[None], np.zeros((1, 2))), stage.time)
+def test_a_newer_trajectory_takes_over_without_a_velocity_step() -> None:
+    arm = ControlledArm()
+    first = arm.controller.start(swing(arm), 0.0)
+    arm.run(1.5)
+    there = arm.home[[0, 3]] + 0.1
+    second = arm.controller.start(Trajectory(TWO, np.array([1.5]), there[None], np.zeros((1, 2))), arm.time)
     assert first.outcome is Outcome.PREEMPTED
-    stage.run(3.0, until=second)
+    arm.run(3.0, until=second)
     assert second.outcome is Outcome.SUCCESSFUL
-    np.testing.assert_allclose(stage.at(TWO), there, atol=3e-3)
-    jerk = np.abs(np.diff(np.array(stage.rows)[20:, 1, 0]))
+    np.testing.assert_allclose(arm.at(TWO), there, atol=3e-3)
+    jerk = np.abs(np.diff(np.array(arm.rows)[20:, 1, 0]))
     assert jerk.max() < 0.04, "a step in speed"
 
 
-def test_cancelling_stops_where_it_is() -> None:
-    stage = Stage()
-    run = stage.controller.start(swing(stage), 0.0)
-    stage.run(1.5)
-    stage.controller.cancel()
+def test_cancelling_stops_the_arm() -> None:
+    arm = ControlledArm()
+    run = arm.controller.start(swing(arm), 0.0)
+    arm.run(1.5)
+    arm.controller.cancel()
     assert run.outcome is Outcome.CANCELED
-    here = stage.at()
-    stage.run(1.0)
-    np.testing.assert_allclose(stage.at(), here, atol=0.02)
-    assert np.abs(stage.rows[-1][1]).max() < 1e-3
-    stage.controller.cancel()  # nothing runs: nothing happens
+    here = arm.at()
+    arm.run(1.0)
+    np.testing.assert_allclose(arm.at(), here, atol=0.02)
+    assert np.abs(arm.rows[-1][1]).max() < 1e-3
+    arm.controller.cancel()  # without effect when no trajectory runs
 
 
-def test_a_trajectory_may_begin_later_and_must_not_be_over() -> None:
-    stage = Stage()
-    plan = swing(stage)
+def test_a_trajectory_may_start_later_but_not_be_over() -> None:
+    arm = ControlledArm()
+    plan = swing(arm)
     later = Trajectory(TWO, plan.times, plan.positions, plan.velocities, start_time=0.5)
-    run = stage.controller.start(later, 0.0)
-    stage.run(0.5)
-    np.testing.assert_allclose(stage.at(), stage.home, atol=1e-4)
-    stage.run(4.0, until=run)
-    assert stage.time == pytest.approx(3.5, abs=0.03)
+    run = arm.controller.start(later, 0.0)
+    arm.run(0.5)
+    np.testing.assert_allclose(arm.at(), arm.home, atol=1e-4)
+    arm.run(4.0, until=run)
+    assert arm.time == pytest.approx(3.5, abs=0.03)
     with pytest.raises(TrajectoryError, match=r"ended at 3\.50 s, now is 9\.00 s") as error:
-        stage.controller.start(later, 9.0)
+        arm.controller.start(later, 9.0)
     assert error.value.code is Outcome.OLD_HEADER_TIMESTAMP
 
 
-def test_trajectories_that_make_no_sense_are_refused_and_change_nothing() -> None:
-    stage = Stage()
-    run = stage.controller.start(swing(stage), 0.0)
-    here, one = stage.at(TWO), np.array([1.0])
+def test_invalid_trajectories_are_refused_without_effect() -> None:
+    arm = ControlledArm()
+    run = arm.controller.start(swing(arm), 0.0)
+    here, one = arm.at(TWO), np.array([1.0])
     for joints, times, positions, code, text in (
         (("head_1_joint",), one, np.zeros((1, 1)), Outcome.INVALID_JOINTS, "trajectory for head_1_joint"),
         ((TWO[0], TWO[0]), one, np.zeros((1, 2)), Outcome.INVALID_JOINTS, "once"),
@@ -204,18 +204,18 @@ def test_trajectories_that_make_no_sense_are_refused_and_change_nothing() -> Non
         (TWO, np.zeros(0), np.zeros((0, 2)), Outcome.INVALID_GOAL, "increase from 0"),
     ):
         with pytest.raises(TrajectoryError, match=text) as error:
-            stage.controller.start(Trajectory(joints, times, positions), 0.0)
+            arm.controller.start(Trajectory(joints, times, positions), 0.0)
         assert error.value.code is code
     with pytest.raises(TrajectoryError, match="path tolerances for 7 joints"):
-        stage.controller.start(Trajectory(TWO, one, here[None], path_tolerance=Tolerance.uniform(7)), 0.0)
+        arm.controller.start(Trajectory(TWO, one, here[None], path_tolerance=Tolerance.uniform(7)), 0.0)
     assert not run.is_done
 
 
-def test_two_runs_are_the_same_to_the_bit() -> None:
+def test_two_runs_are_bitwise_equal() -> None:
     ends = []
     for _ in range(2):
-        stage = Stage()
-        stage.controller.start(swing(stage), 0.0)
-        stage.run(2.0)
-        ends.append(np.array(stage.rows).tobytes())
+        arm = ControlledArm()
+        arm.controller.start(swing(arm), 0.0)
+        arm.run(2.0)
+        ends.append(np.array(arm.rows).tobytes())
     assert ends[0] == ends[1]

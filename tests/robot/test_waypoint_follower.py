@@ -1,4 +1,4 @@
-"""A base on its way: points in their order, the heading at the end, and an obstacle that is noticed."""
+"""A base that follows waypoints: their order, the final heading, speed limits, and obstacles."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ def heading(pose: np.ndarray) -> float:
     return 2.0 * float(np.arctan2(pose[5], pose[6]))
 
 
-def drive(way: WaypointFollower, seconds: float = 60.0) -> np.ndarray:
-    """Poses of the base [tick, 7] until the way is done, or the base stuck."""
-    robot, poses = way.robot, []
-    while not way.is_done and not way.is_stuck and len(poses) < 100 * seconds:
+def drive(follower: WaypointFollower, seconds: float = 60.0) -> np.ndarray:
+    """Poses of the base [tick, 7] until the path is done or the base is stuck."""
+    robot, poses = follower.robot, []
+    while not follower.is_done and not follower.is_stuck and len(poses) < 100 * seconds:
         time = 0.01 * len(poses)
-        way.control(time)
+        follower.control(time)
         robot.control(time)
         robot.rigid.predict()
         robot.rigid.integrate()
@@ -31,38 +31,38 @@ def drive(way: WaypointFollower, seconds: float = 60.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("backwards", [False, True])
-def test_points_are_passed_in_their_order_and_the_heading_is_the_last(backwards: bool):
+def test_waypoints_are_passed_in_order_with_the_final_heading(backwards: bool):
     robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     points = np.array([[1.0, 0.5], [1.0, 1.5], [0.2, 1.0]])
-    way = WaypointFollower(robot, points, 2.0, reverse=backwards)
-    poses = drive(way)
-    assert way.is_done
-    off = np.linalg.norm(poses[:, None, :2] - points, axis=-1)
-    assert (off.min(0) < 0.015).all()
-    assert (np.diff(off.argmin(0)) > 0).all()
+    follower = WaypointFollower(robot, points, 2.0, reverse=backwards)
+    poses = drive(follower)
+    assert follower.is_done
+    distance = np.linalg.norm(poses[:, None, :2] - points, axis=-1)
+    assert (distance.min(0) < 0.015).all()
+    assert (np.diff(distance.argmin(0)) > 0).all()
     assert heading(poses[-1]) == pytest.approx(2.0, abs=0.02)
-    # straight between the points, looking along each leg or back along it
-    leg = poses[off[:, 0].argmin() + 1 : off[:, 1].argmin(), :2]
+    # straight between the points, with the heading along each leg or opposite to it
+    leg = poses[distance[:, 0].argmin() + 1 : distance[:, 1].argmin(), :2]
     assert np.abs(leg[:, 0] - 1.0).max() < 0.03
-    middle = poses[int(0.5 * (off[:, 0].argmin() + off[:, 1].argmin()))]
+    middle = poses[int(0.5 * (distance[:, 0].argmin() + distance[:, 1].argmin()))]
     assert np.cos(heading(middle) - (-1.0 if backwards else 1.0) * np.pi / 2) > 0.99
 
 
-def test_a_base_keeps_to_its_speeds():
+def test_a_base_keeps_its_speed_limits():
     robot = Robot(RigidWorld(assemble([])), load_description("vinebot"), "anna")
     poses = drive(WaypointFollower(robot, np.array([[2.0, 0.0]]), 1.0, speed=0.4, turn_rate=0.3))
     assert np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).max() / 0.01 < 1.1 * 0.4
     assert np.abs(np.diff([heading(pose) for pose in poses])).max() / 0.01 < 1.1 * 0.3
 
 
-def test_an_obstacle_is_noticed():
+def test_a_base_stops_at_an_obstacle():
     wall = {"fixed_start": [[1.0, 0.0, -0.3]], "fixed_end": [[1.0, 0.0, 2.0]], "fixed_radius": [[0.1, 0.1]]}
     robot = Robot(
         RigidWorld(assemble([], **wall)), load_description("vinebot"), "anna", pose=frames.pose([0.0, 0.0, 0.0])
     )
-    way = WaypointFollower(robot, np.array([[2.0, 0.0]]))
-    poses = drive(way, 30.0)
-    assert way.is_stuck
-    assert not way.is_done
+    follower = WaypointFollower(robot, np.array([[2.0, 0.0]]))
+    poses = drive(follower, 30.0)
+    assert follower.is_stuck
+    assert not follower.is_done
     assert poses[-1][0] < 1.0
     assert len(poses) > 100 * STUCK_TIMEOUT

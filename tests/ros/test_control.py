@@ -26,7 +26,7 @@ from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
-from vinesim.ros.node import Node
+from vinesim.ros.robot_node import RobotNode
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
 
@@ -53,11 +53,9 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
     def head_of(message: JointState) -> float:
         return message.position[message.name.index("head_1_joint")]
 
-    with Node("robot", robot.description.urdf, base=robot.description.base) as node, StockNode() as peer:
+    with RobotNode("robot", robot.description.urdf, base=robot.description.base) as node, StockNode() as peer:
         client.pre_step.append(RosCommandHandler(robot, node.commands))
-        client.post_step.append(
-            lambda c: node.publish_robot_state(c.physics.time, robot.sample(c.physics.time, c.physics.contacts))
-        )
+        client.post_step.append(lambda c: node.publish_robot_state(robot.sample(c.physics.time, c.physics.contacts)))
         peer.node.create_subscription(JointState, "/joint_states", received.append, 10)
         arm = peer.node.create_publisher(JointTrajectory, "/head_controller/joint_trajectory", 10)
         wheels = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 10)

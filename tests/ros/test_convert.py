@@ -28,7 +28,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.messages.transforms import SerializedTransforms, split_time
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
+from vinesim.scene.values import CameraFrame, CameraInfo, ComponentStatus, Contact, JointSample, LidarScan, RobotSample
 
 INFO = CameraInfo(64, 48, 50.0, 51.0, 31.5, 23.5, "head_front_camera_optical")
 
@@ -338,8 +338,11 @@ def test_bad_trajectories_are_refused_in_words(message, words):
 
 
 def test_diagnostics_carry_the_figures():
-    message = over_the_wire(convert.diagnostics(1.0, "client", {"real_time_factor": 0.5, "dropped": 3}, healthy=False))
-    status = message.status[0]
+    loop = ComponentStatus("simulation", "warning", "behind", {"real_time_factor": 0.5, "dropped": 3})
+    status, other = over_the_wire(
+        convert.diagnostics(1.0, "/robot", [loop, ComponentStatus("sensors", "error")])
+    ).status
+    assert (status.name, status.message, other.level) == ("/robot: simulation", "behind", b"\x02")
     assert {value.key: value.value for value in status.values} == {"real_time_factor": "0.5", "dropped": "3"}
     assert status.level == b"\x01"
 

@@ -26,16 +26,17 @@ if middleware.unavailable_reason() is not None:
 import rclpy
 from geometry_msgs.msg import TwistStamped, WrenchStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Image, JointState
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tests.support.stock_node import TIMEOUT, StockNode, wait_until
 from vinesim.ros.commands.types import BaseVelocity, JointPositions
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
-from vinesim.ros.node import MAX_QUEUED, Node
+from vinesim.ros.robot_node import RobotNode
+from vinesim.ros.sensor_node import SensorNode
 from vinesim.ros.tools.topic_monitor import SimulationClock, TopicStats
-from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
+from vinesim.scene.values import CameraFrame, CameraInfo, ComponentStatus, Contact, JointSample, LidarScan, RobotSample
 
 REST = frames.pose(np.zeros(3))
 JOINTS = tuple(f"arm_left_{i}_joint" for i in range(1, 8))
@@ -111,11 +112,13 @@ def test_large_messages_reach_another_process():
     latched = ("/robot_description", "/tf_static")
     static = [("base_footprint", "base_link", REST)]
     with (
-        Node("vinebot", URDF, static_transforms=static, cameras=["head_front_camera"], lidars=["lidar"]) as node,
+        RobotNode("vinebot", URDF, static_transforms=static) as robot,
+        SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,
         topic_monitor(*small, *large, *latched) as report,
     ):
-        heard = [name if name == "/clock" else name[1:] for name in (*small, *large, *latched)]
-        wait_until(lambda: all(node.has_subscribers(name) for name in heard))
+        own = [name if name == "/clock" else name[1:] for name in (*small, *latched)]
+        wait_until(lambda: all(robot.has_subscribers(name) for name in own))
+        wait_until(lambda: all(sensors.has_subscribers(name[1:]) for name in large))
         ticks, offered = 400, dict.fromkeys((*small, *large), 0)
         due = time.monotonic()
         for tick in range(ticks):
@@ -123,17 +126,18 @@ def test_large_messages_reach_another_process():
             due = max(due + 0.01, time.monotonic())
             time.sleep(max(due - time.monotonic(), 0.0))
             t = tick / 100
-            node.publish_robot_state(t, robot_sample(t))
+            robot.publish_clock(t)
+            robot.publish_robot_state(robot_sample(t))
             for name in small:
                 offered[name] += 1
             if tick * 3 % 10 < 3:
-                node.publish_camera(camera_frame(t))
+                sensors.publish_camera(camera_frame(t))
                 offered[large[0]] += 1
                 offered[large[1]] += 1
             if tick % 10 == 0:
-                node.publish_lidar(lidar_scan(t, 100_000))
+                sensors.publish_lidar(lidar_scan(t, 100_000))
                 offered[large[2]] += 1
-        wait_until(lambda: not node.has_pending)
+        wait_until(lambda: not sensors.has_pending)
         received = report()
     assert offered[large[0]] == 120
     for name, count in offered.items():
@@ -148,22 +152,27 @@ def test_every_topic_is_heard_with_its_official_type():
     contact = Contact("vinebot", "vinebot/arm_left_7_link", 5, np.ones(3), np.ones(3), 0.0)
     names, poses = ("bunch_00001", "bunch_00002"), np.tile(REST, (2, 1))
     with (
-        Node("vinebot", URDF, cameras=["head_front_camera"], lidars=["lidar"]) as node,
+        RobotNode("vinebot", URDF) as robot,
+        SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,
         topic_monitor() as report,
     ):
-        node.publish_environment_static(("pole_0",), poses[:1])
+        robot.publish_environment_static(("pole_0",), poses[:1])
         ticks = iter(range(10**6))
 
         def tick() -> None:
             t = next(ticks) / 100
-            node.publish_robot_state(t, robot_sample(t, contacts=(contact,)))
-            node.publish_camera(camera_frame(t, 32, 24))
-            node.publish_lidar(lidar_scan(t, 10))
-            node.publish_environment(t, names, poses)
-            node.publish_diagnostics(t, {"real_time_factor": 1.0})
+            robot.publish_clock(t)
+            robot.publish_robot_state(robot_sample(t, contacts=(contact,)))
+            sensors.publish_camera(camera_frame(t, 32, 24))
+            sensors.publish_lidar(lidar_scan(t, 10))
+            robot.publish_environment(t, names, poses)
+            robot.publish_diagnostics(t, [ComponentStatus("simulation")])
             time.sleep(0.01)
 
-        wait_until(lambda: all(count >= 20 or name in LATCHED for name, count in node.sent.items()), tick)
+        def sent() -> dict[str, int]:
+            return robot.sent | sensors.sent
+
+        wait_until(lambda: all(count >= 20 or name in LATCHED for name, count in sent().items()), tick)
         received = report()
     assert {name: heard["type"] for name, heard in received.items()} == TYPES
     assert all(heard["count"] for heard in received.values()), received
@@ -196,31 +205,30 @@ TYPES = {
 
 def test_nothing_is_built_for_nobody(monkeypatch):
     with (
-        Node("vinebot", URDF, cameras=["head_front_camera"], lidars=["lidar"]) as node,
+        RobotNode("vinebot", URDF) as robot,
+        SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,
         StockNode() as peer,
     ):
         heard: list[JointState] = []
         peer.node.create_subscription(JointState, "/joint_states", heard.append, 10)
-        wait_until(lambda: node.has_subscribers("joint_states"))
-        assert not node.has_subscribers("head_front_camera")
-        assert not node.has_subscribers("lidar")
+        wait_until(lambda: robot.has_subscribers("joint_states"))
+        assert not sensors.has_subscribers("head_front_camera")
+        assert not sensors.has_subscribers("lidar")
 
         def tick() -> None:
-            node.publish_robot_state(1.0, robot_sample(1.0))
-            node.publish_camera(camera_frame(1.0, 32, 24))
-            node.publish_lidar(lidar_scan(1.0, 10))
+            robot.publish_robot_state(robot_sample(1.0))
+            sensors.publish_camera(camera_frame(1.0, 32, 24))
+            sensors.publish_lidar(lidar_scan(1.0, 10))
             peer.spin()
 
         wait_until(lambda: len(heard) >= 20, tick)
-        sent = {name for name, count in node.sent.items() if count and name not in LATCHED}
+        sent = {name for name, count in (robot.sent | sensors.sent).items() if count and name not in LATCHED}
         assert sent == {"joint_states"}
-        assert not any(node.dropped[name] for name in node.dropped if name != "joint_states")
+        assert not any((robot.dropped | sensors.dropped).values())
 
 
 def test_subscribers_are_counted_by_family_and_knows_its_topics():
-    with Node("vinebot", URDF, cameras=["left", "left_arm"]) as node, StockNode() as peer:
-        from sensor_msgs.msg import Image
-
+    with SensorNode("vinebot_sensors", cameras=["left", "left_arm"]) as node, StockNode() as peer:
         subscription = peer.node.create_subscription(
             Image, "/left_arm/depth/image_raw", lambda _: None, rclpy.qos.qos_profile_sensor_data
         )
@@ -231,12 +239,12 @@ def test_subscribers_are_counted_by_family_and_knows_its_topics():
         assert not node.has_subscribers("left")  # a name that the other begins with
         peer.node.destroy_subscription(subscription)
         wait_until(lambda: not node.has_subscribers("left_arm"))
-        with pytest.raises(ValueError, match=r"no topic 'right'; there are: /clock, diagnostics"):
+        with pytest.raises(ValueError, match=r"no topic 'right'; there are: left/depth/camera_info"):
             node.has_subscribers("right")
 
 
 def test_commands_come_back():
-    with Node("vinebot", URDF) as node, StockNode() as peer:
+    with RobotNode("vinebot", URDF) as node, StockNode() as peer:
         velocity = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 10)
         forward = peer.node.create_publisher(Float64MultiArray, "/forward_position_controller/commands", 10)
         arm = peer.node.create_publisher(JointTrajectory, "/arm_left_controller/joint_trajectory", 10)
@@ -263,7 +271,7 @@ def test_commands_come_back():
 
 
 def test_a_set_point_replaces_the_older_and_nonsense_is_refused():
-    with Node("vinebot", URDF) as node, StockNode() as peer:
+    with RobotNode("vinebot", URDF) as node, StockNode() as peer:
         velocity = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 100)
         wait_until(velocity.get_subscription_count)
         twist = TwistStamped()
@@ -277,8 +285,8 @@ def test_a_set_point_replaces_the_older_and_nonsense_is_refused():
 
 def test_two_robots_in_one_process_under_namespaces():
     with (
-        Node("one", "<robot name='one'/>", namespace="robot_1") as one,
-        Node("two", "<robot name='two'/>", namespace="robot_2", clock=False) as two,
+        RobotNode("one", "<robot name='one'/>", namespace="robot_1") as one,
+        RobotNode("two", "<robot name='two'/>", namespace="robot_2", clock=False) as two,
         StockNode() as peer,
     ):
         states: dict[str, list[float]] = {"robot_1": [], "robot_2": []}
@@ -293,8 +301,8 @@ def test_two_robots_in_one_process_under_namespaces():
             )
 
         def tick() -> None:
-            one.publish_robot_state(1.0, robot_sample(1.0))
-            two.publish_robot_state(2.0, robot_sample(2.0))
+            one.publish_robot_state(robot_sample(1.0))
+            two.publish_robot_state(robot_sample(2.0))
             peer.spin()
 
         wait_until(lambda: all(states.values()) and len(urdfs) == 2, tick)
@@ -313,10 +321,10 @@ def test_frames_lead_from_the_map_to_the_fingers():
     message_packages.ensure_importable(["tf2_msgs"])
     from tf2_msgs.msg import TFMessage
 
-    with Node("vinebot", URDF) as node, StockNode() as peer:
+    with RobotNode("vinebot", URDF) as node, StockNode() as peer:
         heard: list[TFMessage] = []
         peer.node.create_subscription(TFMessage, "/tf", heard.append, 100)
-        wait_until(lambda: heard, lambda: (node.publish_robot_state(3.21, robot_sample(3.21)), peer.spin()))
+        wait_until(lambda: heard, lambda: (node.publish_robot_state(robot_sample(3.21)), peer.spin()))
         tree = {t.child_frame_id: t for t in heard[0].transforms}
         assert [tree[child].header.frame_id for child in ("odom", "base_footprint", "arm_left_1_link")] == [
             "map",
@@ -346,34 +354,32 @@ def test_contacts_are_wrenches_of_the_touching_link():
     contact = Contact("vinebot", "vinebot/tip", 5, np.array([1.0, 3.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.0)
     nowhere = Contact("vinebot", "vinebot/unknown", 5, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.0)
     static = [("base_footprint", "tip", frames.pose(np.array([0.5, 0.0, 0.0])))]
-    with Node("vinebot", URDF, static_transforms=static) as node, StockNode() as peer:
+    with RobotNode("vinebot", URDF, static_transforms=static) as node, StockNode() as peer:
         heard: list[WrenchStamped] = []
         peer.node.create_subscription(WrenchStamped, "/vine/contacts", heard.append, 10)
         sample = robot_sample(1.0, contacts=(contact, nowhere))
-        wait_until(lambda: len(heard) >= 2, lambda: (node.publish_robot_state(1.0, sample), peer.spin()))
+        wait_until(lambda: len(heard) >= 2, lambda: (node.publish_robot_state(sample), peer.spin()))
         by_frame = {message.header.frame_id: message.wrench for message in heard}
         # The base stands at (1, 2) and looks along +y: the tip is at (1, 2.5), the contact half a metre ahead of it.
         assert (by_frame["tip"].force.z, by_frame["tip"].torque.y) == pytest.approx((5.0, -2.5))
         assert (by_frame["map"].force.z, by_frame["map"].torque.y) == pytest.approx((5.0, -5.0))
 
 
-@pytest.mark.parametrize(("name", "kept"), [("diagnostics", 1), ("joint_states", MAX_QUEUED)])
-def test_messages_beyond_the_queue_are_dropped_oldest_first_and_counted(name: str, kept: int):
-    """Of pictures and other low-priority messages the newest waits, of every step's messages half a second's worth."""
-    with Node("vinebot", URDF) as node:
-        topic = node._topics[name]
+def test_the_newest_replaces_what_waits_and_is_counted():
+    with SensorNode("vinebot", cameras=["left"]) as node:
+        topic = node._topics["left/rgb/image_raw"]
         busy, go = threading.Event(), threading.Event()
 
-        def slow() -> object:
+        def slow() -> Image:
             busy.set()
             go.wait(TIMEOUT)
-            return []
+            return Image()
 
         node._enqueue([(topic, slow)], always=True)
         assert busy.wait(TIMEOUT)
-        built, count = [], kept + 4
+        built, kept, count = [], 1, 5
         for i in range(count):  # the simulation does not wait while the first is being built
-            node._enqueue([(topic, lambda i=i: built.append(i) or [])], always=True)
+            node._enqueue([(topic, lambda i=i: built.append(i) or Image())], always=True)
         go.set()
         wait_until(lambda: not node.has_pending and len(built) == kept)
         assert built == list(range(4, count))
@@ -381,27 +387,26 @@ def test_messages_beyond_the_queue_are_dropped_oldest_first_and_counted(name: st
 
 
 def test_a_message_that_cannot_be_built_is_counted_and_the_rest_goes_on(caplog):
-    with Node("vinebot", URDF) as node:
-        topic = node._topics["joint_states"]
+    with SensorNode("vinebot", cameras=["left"]) as node:
+        topic = node._topics["left/rgb/image_raw"]
         for _ in range(3):
             before = topic.dropped
             node._enqueue([(topic, lambda: 1 / 0)], always=True)
             wait_until(lambda before=before: topic.dropped == before + 1)
-        node._enqueue([(topic, JointState)], always=True)
+        node._enqueue([(topic, Image)], always=True)
         wait_until(lambda: topic.sent == 1)
     assert [r.message for r in caplog.records if "could not publish" in r.message] == [
-        "could not publish joint_states; further failures are only counted"
+        "could not publish left/rgb/image_raw; further failures are only counted"
     ]
 
 
 def test_closing_leaves_nothing_behind():
     handler, threads = signal.getsignal(signal.SIGINT), set(threading.enumerate())
     for _ in range(3):
-        node = Node("vinebot", URDF, cameras=["head_front_camera"])
-        assert signal.getsignal(signal.SIGINT) is handler
-        node.publish_robot_state(0.0, robot_sample(0.0))
-        node.close()
-        node.close()
+        for node in (RobotNode("vinebot", URDF), SensorNode("vinebot_sensors", cameras=["head_front_camera"])):
+            assert signal.getsignal(signal.SIGINT) is handler
+            node.close()
+            node.close()
     assert set(threading.enumerate()) == threads
     assert signal.getsignal(signal.SIGINT) is handler
 
@@ -411,19 +416,19 @@ def test_closing_leaves_nothing_behind():
     [
         ({"name": "vine bot"}, "vine bot"),
         ({"name": "vinebot", "namespace": "robot-1"}, "robot-1"),
-        ({"name": "vinebot", "cameras": ["head camera"]}, "head camera"),
+        ({"name": "vinebot", "controllers": ["left arm"]}, "left arm"),
     ],
 )
 def test_names_that_ros_refuses_are_said_in_one_line(arguments, words):
     threads = set(threading.enumerate())
     with pytest.raises(ValueError, match=words) as caught:
-        Node(urdf=URDF, **arguments)
+        RobotNode(urdf=URDF, **arguments)
     assert "\n" not in str(caught.value)
     assert set(threading.enumerate()) == threads
 
 
 def test_unknown_camera_is_named():
-    with Node("vinebot", URDF, cameras=["left"]) as node, pytest.raises(ValueError, match=r"no camera 'right'.*: left"):
+    with SensorNode("vinebot", cameras=["left"]) as node, pytest.raises(ValueError, match=r"no camera 'right'.*: left"):
         node.publish_camera(camera_frame(0.0, 32, 24, name="right"))
 
 

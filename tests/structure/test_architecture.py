@@ -1,4 +1,4 @@
-"""docs/modules.md lists the modules as they are, and every module says what it is for."""
+"""docs/modules.md lists all modules, and every module has a docstring that states its purpose."""
 
 import importlib.util
 import pathlib
@@ -17,12 +17,12 @@ def test_the_list_of_modules_is_up_to_date():
     assert _tool().PAGE.read_text() == _tool().render(), "run: python tools/list_modules.py"
 
 
-def test_every_module_says_what_it_is_for():
+def test_every_module_states_its_purpose():
     summary = _tool().summary
     assert [str(p.relative_to(ROOT)) for p in (ROOT / "vinesim").rglob("*.py") if not summary(p)] == []
 
 
-def test_the_page_of_the_architecture_names_every_package():
+def test_docs_architecture_names_every_package():
     text = (ROOT / "docs/architecture.md").read_text()
     packages = {p.parent.relative_to(ROOT / "vinesim") for p in (ROOT / "vinesim").rglob("__init__.py")}
     assert [str(p) for p in packages if len(p.parts) == 1 and f"{p}/" not in text] == []

@@ -31,13 +31,13 @@ def test_the_glossary_names_places_that_exist():
 
 def test_the_python_of_the_readme_runs(tmp_path):
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.S)
-    done = subprocess.run(
+    result = subprocess.run(
         [sys.executable, "-c", code],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
     )
-    assert done.returncode == 0, done.stderr
-    last = done.stdout.splitlines()[-1]
+    assert result.returncode == 0, result.stderr
+    last = result.stdout.splitlines()[-1]
     assert last.startswith("3.0 ["), last

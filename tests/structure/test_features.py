@@ -1,4 +1,4 @@
-"""docs/features.md names tests and benches that there are, and every claim once."""
+"""docs/features.md names existing tests and benches, and every claim once."""
 
 import ast
 import functools
@@ -14,7 +14,7 @@ CLAIMS = [f"F{i:02}" for i in range(1, 99)]
 
 
 def rows():
-    """Claim -> (section, claim, what shows it)."""
+    """Claim -> (section, claim, evidence)."""
     lines = (ROOT / "docs/features.md").read_text().splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| F")]
     assert [len(row) for row in cells] == [4] * len(cells)
@@ -29,18 +29,18 @@ def names_in(path):
 
 
 @pytest.mark.parametrize("claim", CLAIMS)
-def test_what_shows_a_claim_is_there(claim):
-    section, text, shown = rows()[claim]
+def test_the_evidence_of_a_claim_exists(claim):
+    section, text, evidence = rows()[claim]
     assert re.fullmatch(r"[2-5](\.\d){0,2}", section)
     assert text
-    spans = re.findall(r"`((?:tests/|vinesim bench )[^`]*)`", shown)
+    spans = re.findall(r"`((?:tests/|vinesim bench )[^`]*)`", evidence)
     for span in spans:
         path, _, name = span.partition("::")
         if span.startswith("vinesim"):
             assert span.removeprefix("vinesim bench ") in BENCHES, span
         else:
             assert name in names_in(path), span
-    if shown.startswith(("`tests/", "partly: ", "measured: ")):
+    if evidence.startswith(("`tests/", "partly: ", "measured: ")):
         assert spans
     else:
-        assert shown.startswith(("not yet", "cannot be tested")), shown
+        assert evidence.startswith(("not yet", "cannot be tested")), evidence

@@ -70,5 +70,5 @@ def test_modules_import_each_other_in_one_direction() -> None:
     assert cycles(module_graph()) == []
 
 
-def test_a_cycle_would_be_found() -> None:
+def test_a_cycle_is_found() -> None:
     assert cycles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]

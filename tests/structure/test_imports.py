@@ -1,4 +1,4 @@
-"""Import weight and one-way imports, seen from outside."""
+"""Cost and direction of imports, measured in new processes."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ def modules_after(statement):
     return set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split())
 
 
-def test_the_command_line_opens_without_the_engines():
+def test_the_command_line_starts_without_mujoco_and_warp():
     assert modules_after("import vinesim.cli") == set()
 
 

@@ -28,11 +28,11 @@ def fade(
 
 
 TO_DO: set[str] = set()
-"""Folders of kernels whose docstrings and arguments are still to be brought to the grammar; empties, never grows."""
+"""Folders of kernels that do not follow the grammar yet; it only shrinks."""
 
 
 @pytest.mark.parametrize("path", KERNELS, ids=lambda path: path.name)
-def test_kernels_keep_to_the_grammar(path: Path) -> None:
+def test_kernels_follow_the_grammar(path: Path) -> None:
     found = breaches(path.read_text(), path.name)
     if path.parent.name in TO_DO:
         found = [breach for breach in found if "one thread does" not in breach and "arguments; group" not in breach]
@@ -43,14 +43,14 @@ def test_there_are_kernels() -> None:
     assert any("@wp.kernel" in path.read_text() for path in KERNELS)
 
 
-def test_good_is_good() -> None:
+def test_a_valid_kernel_has_no_breaches() -> None:
     assert breaches(GOOD.replace("one light.", "one light.\n\n    light: [light] lx.\n    ")) == []
     assert breaches(GOOD) == []
     assert breaches(GOOD.replace("@wp.kernel", "@wp.kernel(enable_backward=False)")) == []
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "says"),
+    ("old", "new", "message"),
     [
         ("    # model\n", "", "# model, # in, # out, in that order"),
         ("    # in\n", "    # out\n", "light is under # out; call it light_out"),
@@ -65,12 +65,12 @@ def test_good_is_good() -> None:
         ("    pair[0] = light[i]\n", "    light[i][0], i = 1.0, 2\n", "writes light, which is not under # out"),
     ],
 )
-def test_breaches_are_found(old: str, new: str, says: str) -> None:
+def test_each_breach_is_reported(old: str, new: str, message: str) -> None:
     found = breaches(GOOD.replace(old, new))
-    assert any(says in breach for breach in found), found
+    assert any(message in breach for breach in found), found
 
 
-def test_functions_name_what_they_write() -> None:
+def test_functions_mark_arrays_that_they_write() -> None:
     source = "@wp.func\ndef set(a: wp.array(dtype=float), i: int):\n    a[i] = 1.0\n"
     assert breaches(source) == ["<source>:3: set writes its argument a; call it a_out"]
     assert breaches(source.replace("(a:", "(a_out:").replace("    a[", "    a_out[")) == []

@@ -1,4 +1,4 @@
-"""Files and functions fit a reader: at most 500 lines a file, 80 lines a function, or a reason in the docstring."""
+"""Sizes: at most 500 lines a file, 80 lines a function, or a reason in the docstring."""
 
 from __future__ import annotations
 

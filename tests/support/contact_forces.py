@@ -9,7 +9,7 @@ from vinesim.physics.step import Physics
 
 
 def pressed_on_ground(physics: Physics, box: int) -> float:
-    """Upward force of the ground on a box [N], from MuJoCo's own contacts: its weight, with all that lies in it."""
+    """Upward force of the ground on a box [N], from MuJoCo's own contacts: its weight and that of its contents."""
     world, data = physics.rigid.mj_model, physics.rigid.mj_data
     ground, body = world.geom("ground").id, world.body(f"box/{box}").id
     total = 0.0

@@ -103,7 +103,7 @@ def bar(at, name: str = "bar", stiffness: float = 0.0, damping: float = 0.0) -> 
 def probe(at, name: str = "probe", mass: float = 3.0, drives: tuple[Drive, ...] | None = None) -> RobotSpec:
     """A level rod of 20 cm along y that moves along x (drive ``along``) and up and down (``press``).
 
-    Unless told otherwise ``along`` is held and ``press`` coasts.
+    By default ``along`` is held and ``press`` coasts.
     """
     urdf = f"""<robot name="probe"><link name="base_footprint">{_inertial(500)}</link>
 <link name="carriage">{_inertial(1)}</link><link name="rod">{_inertial(mass)}
@@ -119,7 +119,7 @@ def probe(at, name: str = "probe", mass: float = 3.0, drives: tuple[Drive, ...] 
 
 
 def bunch_scene(mass: float = 0.5) -> tuple[Model, int, np.ndarray]:
-    """A model with one hanging bunch, the bunch's body, and its middle in the world."""
+    """A model with one hanging bunch, the bunch's body, and the world position of its centre."""
     model = assemble([cane((0.0, 0.0, 2.0), bunch=mass)])
     body = int(model.bunch_body[0])
     pose = model.forward_kinematics(model.joint_settled)[body]
@@ -129,7 +129,7 @@ def bunch_scene(mass: float = 0.5) -> tuple[Model, int, np.ndarray]:
 def grasp(t: float) -> tuple[np.ndarray, float]:
     """Commands of a grasp at time t [s]: set-points of the gripper's drives, and an extra force on the hand [N].
 
-    Close, lift 10 cm, move 20 cm aside, be pulled down, release.
+    Close, lift 10 cm, move 20 cm sideways, be pulled down, release.
     """
 
     def ramp(a: float, b: float) -> float:

@@ -1,4 +1,4 @@
-"""One robot on bare ground with a clock, and what its left wrist sensor must measure."""
+"""One robot on bare ground with a clock, and the expected reading of its left wrist sensor."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Yard:
 
 
 def hand_of(description: RobotDescription, position: np.ndarray | None = None) -> tuple[float, np.ndarray]:
-    """Mass [kg] of what hangs on the left wrist sensor, and its centre [3] in the base, from the URDF; at home."""
+    """Mass [kg] beyond the left wrist sensor, and its centre [3] m in the base, from the URDF; at home by default."""
     poses, mass, moment = description.link_poses(description.home if position is None else position), 0.0, np.zeros(3)
     for link in ElementTree.fromstring(description.urdf).iterfind("link"):
         name = link.get("name")

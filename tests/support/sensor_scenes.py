@@ -1,4 +1,4 @@
-"""Scenes that the tests of the sensors look at."""
+"""Scenes for tests of the sensors."""
 
 from __future__ import annotations
 

@@ -117,8 +117,8 @@ class Server:
     def tick(self) -> None:
         for key, payload in self.bus.poll():
             _, x, y, _ = key.split("/")
-            for fact in messages.decode_records(payload):
-                self.records.merge((int(x), int(y)), fact)
+            for record in messages.decode_records(payload):
+                self.records.merge((int(x), int(y)), record)
 
 
 class World:

@@ -43,6 +43,7 @@ class Client:
         pose: Sequence[float] | np.ndarray | None = None,
         spawn: int = 0,
         certificates: pathlib.Path | None = None,
+        device: str = "cpu",
     ) -> None:
         """Join.
 
@@ -54,6 +55,7 @@ class Client:
             pose: (x, y, yaw) in m and rad, or [7] of the base; a start place of the scene unless given.
             spawn: number of that start place.
             certificates: folder of this actor's certificate, for a server with TLS.
+            device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``: where plants are stepped.
 
         Raises:
             NameTaken: an actor of this name is there. Refused: the server said no. Both name the remedy.
@@ -72,7 +74,9 @@ class Client:
 
                 bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=certificates))
             executor = stack.enter_context(ThreadPoolExecutor(1, "spawner"))
-            self._client = RobotClient(self.scene, self.model, described, bus, name=name, pose=place, executor=executor)
+            self._client = RobotClient(
+                self.scene, self.model, described, bus, name=name, pose=place, executor=executor, device=device
+            )
             stack.callback(self._client.leave)
             self._stack = stack.pop_all()
 

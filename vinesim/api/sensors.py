@@ -3,7 +3,7 @@
     frame = Camera("d435").render(simulation, look_at((1.0, -1.0, 1.5), (0.0, 0.0, 1.2)))
     scan = Lidar("vlp16").scan(simulation, robot=robot)
 
-A sensor may look at several simulations in turn.
+A sensor may look at several simulations in turn; it computes on the device of the one that it looks at.
 """
 
 from __future__ import annotations
@@ -72,8 +72,9 @@ class Camera:
         if self._camera is None or self._last is not simulation:
             sun = DEFAULT_SUN if simulation.scene is None else simulation.scene.sun.direction()
             self._camera = rgbd.Camera(
-                self.spec, self.info, self._name, sun, self._quality, seed=self._seed, shadow_period=0.0
-            )
+                self.spec, self.info, self._name, sun, self._quality, seed=self._seed, shadow_period=0.0,
+                device=simulation.device,
+            )  # fmt: skip
             self._last = simulation
         return self._camera.render(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
 
@@ -87,7 +88,8 @@ class Lidar:
         :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used.
         """
         self.spec = lidar.LidarSpec.load(kind)
-        self._lidar = lidar.Lidar(self.spec, name, seed=seed)
+        self._name, self._seed = name, seed
+        self._lidars: dict[str, lidar.Lidar] = {}
 
     def scan(
         self,
@@ -107,7 +109,10 @@ class Lidar:
         """
         if robot is not None and frame is None and robot.description.lidars:
             frame = robot.description.lidars[0].frame
-        return self._lidar.scan(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+        device = simulation.device
+        if device not in self._lidars:
+            self._lidars[device] = lidar.Lidar(self.spec, self._name, seed=self._seed, device=device)
+        return self._lidars[device].scan(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
 
 
 def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -69,7 +69,8 @@ class Simulation:
             parameters: all numbers of the physics, in place of those of the scene.
             sleep: whether trees at rest fall asleep, in place of ``parameters.sleep``.
             detach: whether bunches detach when they are pulled too hard.
-            device: ``"cpu"`` or ``"cuda"``: where plants are stepped.
+            device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``: where plants are stepped, and cameras and lidars that look
+                at this world compute.
             threads: of the CPU that share the plants.
         """
         self.scene: Scene | None = None
@@ -83,6 +84,8 @@ class Simulation:
         changes = {name: value for name, value in (("dt", dt), ("sleep", sleep)) if value is not None}
         self.parameters: PhysicsParameters = msgspec.structs.replace(chosen, **changes)
         """All numbers of the physics; they are fixed from the start."""
+        self.device = device
+        """Where plants are stepped and sensors compute."""
         self.physics = Physics(model, parameters=self.parameters, device=device, threads=threads, detachment=detach)
         """The solver below, for what this class does not offer."""
         self.robots: dict[str, Robot] = {}
@@ -263,7 +266,7 @@ class Simulation:
         if self._primitives is None:
             from vinesim.sensors.scene.primitives import Primitives
 
-            self._primitives = Primitives(self.model)
+            self._primitives = Primitives(self.model, device=self.device)
         self._primitives.update(self.snapshot())
         return self._primitives
 

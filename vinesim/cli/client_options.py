@@ -95,7 +95,7 @@ def check_options(options: ClientOptions) -> None:
     from vinesim.sensors.raster import renderer_selection
 
     find_device(options.device)
-    renderer_selection.check_renderer(options.renderer)
+    renderer_selection.check_renderer(options.renderer, options.device)
     if options.threads > 1 and options.device != "cpu":
         raise UsageError(
             f"--threads {options.threads} --device {options.device}: threads are for the CPU; leave one of the two out"

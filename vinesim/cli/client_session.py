@@ -55,7 +55,7 @@ class ClientSession:
         """Index of the start pose in the scene."""
         if options.pose is not None:
             self.scene, self.spawn = with_start_pose(self.scene, *options.pose), 0
-        compile_kernels()
+        compile_kernels(device=options.device)
         self.model = generate(self.scene)
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()
@@ -102,14 +102,15 @@ class ClientSession:
 
     def run(
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
-        publish: Callable[[dict[str, Any]], None] = lambda _: None,
+        sensors: Callable[[], dict[str, Any]] = dict, publish: Callable[[dict[str, Any]], Any] = lambda _: None,
     ) -> Status:  # fmt: skip
         """Step in real time until a signal, the time limit or the end of the ``task``; returns the final status.
 
-        ``sent`` counts the ROS messages by topic, ``publish`` takes every status for /diagnostics.
+        ``sent`` counts the ROS messages by topic, ``sensors`` gives the status of sensors, ``publish`` takes every
+        status for /diagnostics.
         """
         loop = RateLoop(client.physics.dt)
-        status = Status(client, loop, sent, task)
+        status = Status(client, loop, sent, task, sensors)
         reporter = threading.Thread(
             target=report_status, args=(status, publish, self.options.status, self._stop), name="status"
         )
@@ -153,7 +154,7 @@ def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
     partial.replace(out / "report.json")
 
 
-def report_status(status: Status, publish: Callable[[dict[str, Any]], None], form: str, stop: threading.Event) -> None:
+def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form: str, stop: threading.Event) -> None:
     """Every second hand the status to ``publish`` and print it as text or JSON; runs until ``stop``."""
     period = FIRST_STATUS
     try:
@@ -174,5 +175,6 @@ def status_line(values: dict[str, Any]) -> str:
     return (
         f"{values['time']:7.1f} s  {values['tick_hz']:6.2f} Hz  p99 {values['tick_p99_ms']:5.2f} ms  "
         f"awake {values['awake']:3d}  force {values['force']:6.2f} N  "
+        f"dropped {values['frames_dropped']} frames {values['messages_dropped']} messages  "
         f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'nobody'}"
     )

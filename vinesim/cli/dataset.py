@@ -17,6 +17,7 @@ from vinesim.cli.render import parse_size
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.errors import UsageError
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
+from vinesim.physics.plants.device_buffers import find_device
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
@@ -37,12 +38,14 @@ def run(
     workers: int | None,
     actors: float,
     renderer: str,
+    device: str,
 ) -> int:
     """Render the missing images, then gather the annotations of all images; the exit code."""
     if seed < 0:
         raise UsageError(f"--seed is {seed}: give 0 or more")
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
+    find_device(device)
     randomizer = SceneRandomizer(actors) if actors > 0.0 else None
     plan = DatasetPlan(
         load_scene(scene),
@@ -50,15 +53,18 @@ def run(
         camera,
         None if size is None else parse_size(size),
         randomizer,
-        renderer_selection.check_renderer(renderer),
+        renderer_selection.check_renderer(renderer, device),
+        device,
     )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     running: list[Worker] = []
     try:
         dataset.prepare_folder(plan, out)
-        compile_kernels(SENSOR_PACKAGES)
+        compile_kernels(SENSOR_PACKAGES, device)
         wanted = dataset.missing_images(out, images)
-        shares = _shares(wanted, workers or max((os.cpu_count() or 2) // 2, 1))
+        # Of an image on a GPU the cores only generate, write and compute the truth; they share the GPU.
+        cores = os.cpu_count() or 2
+        shares = _shares(wanted, workers or max(cores // 2 if device == "cpu" else cores, 1))
         running += [_start_worker(plan, out, share) for share in shares]
         with Progress(*columns) as progress:
             task = progress.add_task("images", total=images, completed=images - len(wanted))

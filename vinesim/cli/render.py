@@ -1,11 +1,14 @@
-"""``vinesim render``: one picture of a scene with its ground truth."""
+"""``vinesim render``: pictures of a scene with their ground truth, from one viewpoint or from many."""
 
 from __future__ import annotations
 
+import concurrent.futures
+import csv
+import dataclasses
 import pathlib
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -14,14 +17,42 @@ from vinesim.errors import UsageError
 
 if TYPE_CHECKING:
     from vinesim.client.composition.scene_composer import SceneComposer
+    from vinesim.scene.model import Model
+    from vinesim.scene.spec import Scene
+    from vinesim.scene.values import CameraInfo, Snapshot
+    from vinesim.sensors.camera.camera import CameraSpec
+    from vinesim.sensors.scene.primitives import Primitives
+    from vinesim.sensors.scene.ray_caster import RayCaster
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Viewpoint:
+    """Where a camera stands and what it looks at."""
+
+    eye: np.ndarray
+    """[3] m"""
+    target: np.ndarray
+    """[3] m"""
+    place: str
+    """Where the user gave it, for messages."""
+
+    def __post_init__(self) -> None:
+        for name, point in (("position", self.eye), ("target", self.target)):
+            if point.shape != (3,) or not np.isfinite(point).all() or np.abs(point).max() > 1e4:
+                raise UsageError(f"{self.place} has the {name} {point.tolist()}; give x, y, z in metres")
+        if np.linalg.norm(self.target - self.eye) < 1e-6:
+            raise UsageError(f"{self.place} looks at where the camera stands; look at another point")
+        if self.eye[2] <= 0.0:
+            raise UsageError(f"{self.place} lies in the ground; give a height above 0")
 
 
 def run(
     scene: str,
     *,
     camera: str,
-    at: str,
-    look: str,
+    at: str | None,
+    look: str | None,
+    path: pathlib.Path | None = None,
     size: str | None,
     seed: int | None,
     out: pathlib.Path,
@@ -30,67 +61,171 @@ def run(
     crates: Sequence[str] = (),
     hour: float | None = None,
     renderer: str = "warp",
+    device: str = "cpu",
 ) -> int:
-    """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON."""
-    from vinesim.scene.camera_geometry import depth_millimetres
+    """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON.
+
+    The viewpoint is ``at`` and ``look``; those of a ``path`` file go to the folders ``0000``, ``0001``, ... of ``out``.
+    """
+    viewpoints = _viewpoints(at, look, path)
+    if device != "cpu":  # these imports cost half a second
+        from vinesim.physics.plants.device_buffers import find_device
+
+        find_device(device)
+    from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
     from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.ids import unlabel
     from vinesim.scene.spec import load_scene, with_seed
-    from vinesim.sensors.camera.camera import Camera, CameraSpec
-    from vinesim.sensors.export import annotations as formats
-    from vinesim.sensors.export import images as picture
+    from vinesim.sensors.camera.camera import CameraSpec
     from vinesim.sensors.export.dataset import resized_intrinsics
     from vinesim.sensors.raster import renderer_selection
     from vinesim.sensors.scene.primitives import Primitives
-    from vinesim.sensors.scene.ray_caster import enclosing_primitive
-    from vinesim.sensors.truth import ground_truth
+    from vinesim.sensors.scene.ray_caster import RayCaster
 
-    renderer_selection.check_renderer(renderer)
-    eye, target = parse_point("--at", at), parse_point("--look", look)
-    if np.linalg.norm(target - eye) < 1e-6:
-        raise UsageError(f"--look {look} is where the camera stands; look at another point")
-    if eye[2] <= 0.0:
-        raise UsageError(f"--at {at} lies in the ground; give a height above 0")
+    renderer_selection.check_renderer(renderer, device)
     spec = CameraSpec.load(camera)
     info = resized_intrinsics(spec, None if size is None else parse_size(size))
     plan, staged = with_seed(load_scene(scene), seed), parse_composition(robots, people, crates)
-    sun = plan.sun if hour is None else msgspec.structs.replace(plan.sun, hour=hour)
+    if hour is not None:
+        plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
+    if device == "cpu":
+        compile_kernels(SENSOR_PACKAGES)
     model = generate(plan)
     view = staged.compose(model)
-    primitives = Primitives(model, renderer=renderer)
+    primitives = Primitives(model, renderer=renderer, device=device)
     primitives.update(view)
-    inside = enclosing_primitive(primitives, eye)
-    if inside >= 0:
-        organ, index = unlabel(int(primitives.label[inside]))
-        raise UsageError(f"--at {at} lies inside {organ.name.lower()} {index}; move the camera out of it")
-    pose = picture.look_at(eye, target)
-    seen = ground_truth.render_buffers(primitives, info, pose)
-    truths = ground_truth.bunch_truths(primitives, view, seen)
-    frame = Camera(spec, info, "camera", sun.direction(), quality="still").render(primitives, pose)
-    assert frame.exact_depth is not None, "a camera that renders by itself gives exact depth"
-    images = {
-        "rgb": frame.rgb,
-        "depth": depth_millimetres(frame.exact_depth),
-        "measured": depth_millimetres(frame.depth),
-        "labels": formats.encode_labels(frame.labels),
-        "overlay": formats.draw_overlay(frame.rgb, truths),
-    }
-    actors = formats.actor_records(staged.actor_records(model), seen.labels)
-    described = {"scene": plan.name, "seed": plan.seed, "digest": model.digest(), "actors": actors}
+    for viewpoint in viewpoints:
+        _check_not_enclosed(primitives, viewpoint)
+    stage = _Stage(plan, model, staged, view, primitives, RayCaster(primitives), spec, info)
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name, image in images.items():
-            picture.write_png(out / f"{name}.png", image)
-        formats.write_json(out / "camera.json", formats.camera_record(spec.model, info, pose))
-        formats.write_json(out / "truth.json", {**described, "bunches": formats.bunch_records(truths, info)})
+        with concurrent.futures.ThreadPoolExecutor(1, "png") as writer:
+            written: list[concurrent.futures.Future[None]] = []
+            for number, viewpoint in enumerate(viewpoints):
+                folder = out if path is None else out / f"{number:04d}"
+                folder.mkdir(parents=True, exist_ok=True)
+                picture, sight = stage.render(viewpoint)
+                written.append(writer.submit(picture.write, folder))  # while the next picture is rendered
+                if number:
+                    written[number - 1].result()
+                print(f"{folder}: {sight}")
+            written[-1].result()
     except OSError as bad:
         raise UsageError(f"--out {out} cannot be written: {bad.strerror or bad}") from None
-    in_sight = [one for one in truths if one.pixels]
-    print(
-        f"{out}: {len(in_sight)} bunches, {sum(t.berries_seen for t in in_sight)} of "
-        f"{sum(t.berries for t in in_sight)} berries and {sum(t.cut_seen for t in in_sight)} cut points in sight"
-    )
     return 0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Picture:
+    """A picture with its truth, ready to be written."""
+
+    images: dict[str, np.ndarray]
+    records: dict[str, Any]
+
+    def write(self, folder: pathlib.Path) -> None:
+        """Write PNG and JSON files; OSError if that fails."""
+        from vinesim.sensors.export import annotations as formats
+        from vinesim.sensors.export import images as picture
+
+        for name, image in self.images.items():
+            picture.write_png(folder / f"{name}.png", image)
+        for name, record in self.records.items():
+            formats.write_json(folder / f"{name}.json", record)
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Stage:
+    """A composed scene, ready to be looked at."""
+
+    plan: Scene
+    model: Model
+    composer: SceneComposer
+    view: Snapshot
+    primitives: Primitives
+    caster: RayCaster
+    spec: CameraSpec
+    info: CameraInfo
+
+    def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
+        """The picture from a viewpoint, and in words what is in sight."""
+        from vinesim.scene.camera_geometry import depth_millimetres
+        from vinesim.sensors.camera.camera import Camera
+        from vinesim.sensors.export import annotations as formats
+        from vinesim.sensors.export import images as picture
+        from vinesim.sensors.truth import ground_truth
+
+        pose = picture.look_at(viewpoint.eye, viewpoint.target)
+        seen = ground_truth.render_buffers(self.primitives, self.info, pose)
+        truths = ground_truth.bunch_truths(self.primitives, self.view, seen, self.caster)
+        # a camera for each picture: none depends on those before it
+        camera = Camera(
+            self.spec, self.info, "camera", self.plan.sun.direction(), quality="still", device=self.primitives.device
+        )
+        frame = camera.render(self.primitives, pose)
+        assert frame.exact_depth is not None, "a camera that renders by itself gives exact depth"
+        images = {
+            "rgb": frame.rgb,
+            "depth": depth_millimetres(frame.exact_depth),
+            "measured": depth_millimetres(frame.depth),
+            "labels": formats.encode_labels(frame.labels),
+            "overlay": formats.draw_overlay(frame.rgb, truths),
+        }
+        actors = formats.actor_records(self.composer.actor_records(self.model), seen.labels)
+        described: dict[str, Any] = {
+            "scene": self.plan.name, "seed": self.plan.seed, "digest": self.model.digest(), "actors": actors,
+        }  # fmt: skip
+        records = {
+            "camera": formats.camera_record(self.spec.model, self.info, pose),
+            "truth": {**described, "bunches": formats.bunch_records(truths, self.info)},
+        }
+        in_sight = [one for one in truths if one.pixels]
+        return _Picture(images, records), (
+            f"{len(in_sight)} bunches, {sum(t.berries_seen for t in in_sight)} of "
+            f"{sum(t.berries for t in in_sight)} berries and {sum(t.cut_seen for t in in_sight)} cut points in sight"
+        )
+
+
+def _check_not_enclosed(primitives: Primitives, viewpoint: Viewpoint) -> None:
+    """:class:`UsageError` if a camera stands inside something."""
+    from vinesim.scene.ids import unlabel
+    from vinesim.sensors.scene.ray_caster import enclosing_primitive
+
+    inside = enclosing_primitive(primitives, viewpoint.eye)
+    if inside >= 0:
+        organ, index = unlabel(int(primitives.label[inside]))
+        raise UsageError(f"{viewpoint.place} lies inside {organ.name.lower()} {index}; move the camera out of it")
+
+
+def _viewpoints(at: str | None, look: str | None, path: pathlib.Path | None) -> list[Viewpoint]:
+    """The viewpoints of the command line; :class:`UsageError` if one is wrong or none is given."""
+    if path is not None:
+        if at is not None or look is not None:
+            raise UsageError("--path has the viewpoints; leave out --at and --look")
+        return _read_path(path)
+    if at is None or look is None:
+        raise UsageError("no viewpoint; give --at X,Y,Z and --look X,Y,Z, or --path FILE")
+    return [Viewpoint(parse_point("--at", at), parse_point("--look", look), f"--at {at}")]
+
+
+_COLUMNS = ("x", "y", "z", "look_x", "look_y", "look_z")
+
+
+def _read_path(path: pathlib.Path) -> list[Viewpoint]:
+    """Viewpoints of a CSV file with the columns x, y, z, look_x, look_y, look_z [m], or of a JSON list of objects with
+    those keys; :class:`UsageError` if there are none or one is wrong."""
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as bad:
+        raise UsageError(f"--path {path} cannot be read: {getattr(bad, 'strerror', None) or bad}") from None
+    try:
+        rows = msgspec.json.decode(text) if path.suffix == ".json" else list(csv.DictReader(text.splitlines()))
+        points = [np.array([float(row[name]) for name in _COLUMNS]) for row in rows]
+    except (msgspec.DecodeError, csv.Error, KeyError, TypeError, ValueError) as bad:
+        raise UsageError(
+            f"--path {path}: {type(bad).__name__} {bad}; give a CSV file with the columns {', '.join(_COLUMNS)} in "
+            "metres, or a JSON list of objects with these keys"
+        ) from None
+    if not points:
+        raise UsageError(f"--path {path} has no viewpoint")
+    return [Viewpoint(p[:3], p[3:], f"--path {path}, viewpoint {i}") for i, p in enumerate(points)]
 
 
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
-from vinesim.client.sensing.sensor_process import SensorProcess
+from vinesim.client.sensing.robot_processes import RobotProcesses
 from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.client.tasks.task_registry import plan_task, validate_task_name
@@ -42,7 +44,8 @@ def run(options: ClientOptions) -> int:
         task = None if begin is None else begin(client.physics, client.robot)
         _add_behaviour(session, client, task, approach)
         status = session.run(
-            client, task=task, sent=sensors[0].sent_messages, publish=sensors[0].publish_diagnostics
+            client, task=task, sent=sensors[0].sent_messages, sensors=lambda: _sensor_status(sensors),
+            publish=lambda values: [one.publish_diagnostics(values) for one in sensors],
         )  # fmt: skip
         if options.out is not None:
             report = status.report() | sensors[0].report()
@@ -57,18 +60,29 @@ def run(options: ClientOptions) -> int:
 
 def _start_sensors(
     session: ClientSession, names: list[str], descriptions: list[RobotDescription]
-) -> list[SensorProcess]:
-    """A sensor process for each robot; of several robots each publishes under its own namespace."""
+) -> list[RobotProcesses]:
+    """Processes for each robot; of several robots each publishes under its own namespace."""
     options, processes = session.options, []
     for i, (name, description) in enumerate(zip(names, descriptions, strict=True)):
         parts = (options.namespace,) if len(names) == 1 else (options.namespace, ros_name(name))
-        process = SensorProcess(
+        process = RobotProcesses(
             name, session.scene, session.model, description, namespace="/".join(filter(None, parts)), ros=options.ros,
             keep_pictures=options.out is not None and i == 0, sensor_hz=options.sensor_hz,
-            clock=not options.namespace and i == 0, renderer=options.renderer,
+            clock=not options.namespace and i == 0, renderer=options.renderer, device=options.device,
         )  # fmt: skip
         processes.append(session.enter(process))
     return processes
+
+
+def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
+    """The status of the processes of all robots together."""
+    statuses = [one.status() for one in processes]
+    awaited = [part for status in statuses for part in status["sensors_awaited"]]
+    counts = {
+        key: sum(status[key] for status in statuses)
+        for key in ("frames_dropped", "messages_dropped", "sensor_restarts", "ros_restarts")
+    }
+    return {"sensors_ready": not awaited, "sensors_awaited": awaited, **counts}
 
 
 def _build_client(

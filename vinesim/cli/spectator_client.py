@@ -25,7 +25,13 @@ def run(options: ClientOptions) -> int:
         )  # fmt: skip
         pictures = None
         if options.out is not None:
-            pictures = PictureWriter(spectator, options.out, 1.0 / (options.sensor_hz or 1.0), options.renderer)
+            pictures = PictureWriter(
+                spectator,
+                options.out,
+                1.0 / (options.sensor_hz or 1.0),
+                options.renderer,
+                options.device,
+            )
         session.run(spectator)
         if pictures is not None:
             pictures.save(spectator)

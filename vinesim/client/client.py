@@ -263,13 +263,14 @@ class Client:
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
-        here = {name: self.physics.rigid.actor_position(name)[:2] for name in inboxes}
         trees = {update.tree: update for update in inbox.trees}
         moved = {update.object: update for update in inbox.objects}
         nearest: dict[str, tuple[float, RobotUpdate | HumanUpdate]] = {}
         for name, other_inbox in inboxes.items():
-            for other, update in (*other_inbox.robots.items(), *other_inbox.people.items()):
-                away = float(np.hypot(*(update.base_q[:2] - here[name])))
+            seen = (*other_inbox.robots.items(), *other_inbox.people.items())
+            here = self.physics.rigid.actor_position(name)[:2] if seen else None
+            for other, update in seen:
+                away = float(np.hypot(*(update.base_q[:2] - here)))
                 if other not in nearest or away < nearest[other][0]:
                     nearest[other] = away, update
             trees.update((update.tree, update) for update in other_inbox.trees)
@@ -331,6 +332,11 @@ class InterestAudit:
     def update(self, client: Client, touching: bool) -> None:
         """Count one tick, by the positions of the remote actors' copies."""
         sent = sum(replicator.counters.environment.bytes_out for replicator in client.replicators.values())
+        if not client.remote_actors:
+            self.bytes += sent - self._seen
+            self.ticks_touching += touching
+            self._seen = sent
+            return
         rigid = client.physics.rigid
         here = [rigid.actor_position(name)[:2] for name in client.replicators]
         there = [rigid.actor_position(name)[:2] for name in client.remote_actors]

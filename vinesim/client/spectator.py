@@ -83,9 +83,13 @@ class PictureWriter:
     WIDTH, HEIGHT, ANGLE = 960, 640, 1.2
     """Size [px] and horizontal field of view [rad]."""
 
-    def __init__(self, spectator: Spectator, folder: pathlib.Path, period: float = 1.0, renderer: str = "warp") -> None:
+    def __init__(
+        self, spectator: Spectator, folder: pathlib.Path, period: float = 1.0, renderer: str = "warp",
+        device: str = "cpu",
+    ) -> None:  # fmt: skip
         """One picture every ``period`` [s] of simulated time, into a ``folder`` that exists."""
-        load_kernels()
+        if device == "cpu":
+            load_kernels()
         focal = 0.5 * self.WIDTH / np.tan(0.5 * self.ANGLE)
         info = CameraInfo(
             self.WIDTH, self.HEIGHT, focal, focal, 0.5 * (self.WIDTH - 1), 0.5 * (self.HEIGHT - 1), "viewpoint"
@@ -93,8 +97,10 @@ class PictureWriter:
         sun = spectator.scene.sun.direction
         self.folder, self.count = folder, 0
         self.last: CameraFrame | None = None
-        self._camera = Camera(CameraSpec.load("pinhole"), info, "viewpoint", sun, quality="full", shadow_period=0.0)
-        self._primitives = Primitives(spectator.model, renderer=renderer)
+        self._camera = Camera(
+            CameraSpec.load("pinhole"), info, "viewpoint", sun, quality="full", shadow_period=0.0, device=device
+        )
+        self._primitives = Primitives(spectator.model, renderer=renderer, device=device)
         self._moved = np.zeros(len(spectator.model.tree_first), bool)
         self._every = max(round(period / spectator.physics.dt), 1)
         spectator.post_step.append(self._after_step)

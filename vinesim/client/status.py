@@ -12,6 +12,12 @@ from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import touch_to_motion
 from vinesim.robot.tasks.task import Task
 
+_WITHOUT_SENSORS = {
+    "sensors_ready": True, "sensors_awaited": [], "frames_dropped": 0, "messages_dropped": 0, "sensor_restarts": 0,
+    "ros_restarts": 0,
+}  # fmt: skip
+"""Status of sensors of a client that has none."""
+
 
 class Status:
     """Measurements of a running client; reads only, and may be used from another thread than the loop's."""
@@ -22,10 +28,12 @@ class Status:
         rate_loop: RateLoop,
         sent: Callable[[], dict[str, int]] | None = None,
         task: Task | None = None,
+        sensors: Callable[[], dict[str, Any]] = dict,
     ) -> None:
         """``sent`` gives the number of ROS messages sent so far by topic; ``task``: what the robot does, if
-        anything."""
+        anything; ``sensors`` gives the status of sensors."""
         self.client, self.rate_loop, self._task = client, rate_loop, task
+        self._sensors = sensors
         self._sent: Callable[[], dict[str, int]] = sent or dict
         self._before: dict[str, int] = {}
         self._before_time = 0.0
@@ -59,6 +67,8 @@ class Status:
             "phase": "" if self._task is None else self._task.phase,
             "others": sorted(client.remote_actors),
             "topics": rates,
+            **_WITHOUT_SENSORS,
+            **self._sensors(),
         }
 
     def report(self) -> dict[str, Any]:

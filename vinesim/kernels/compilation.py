@@ -24,11 +24,15 @@ TIMEOUT = 600.0
 _CUDA_ONLY = ("vinesim.kernels.raster.cuda_raster",)
 
 
-def compile_kernels(packages: tuple[str, ...] = ()) -> int:
-    """Compile the kernels of some ``packages`` of :mod:`vinesim.kernels` for the CPU, all unless given.
+def compile_kernels(packages: tuple[str, ...] = (), device: str = "cpu") -> int:
+    """Compile the kernels of some ``packages`` of :mod:`vinesim.kernels`, all unless given.
 
-    Returns how many modules were compiled here: 0 where all are in Warp's cache, which takes a millisecond to find.
+    For the CPU always, and for ``device`` (``"cpu"``, ``"cuda"``, ``"cuda:N"``; it must be there). Returns how many
+    modules were compiled for the CPU: 0 where all are in Warp's cache, which takes a millisecond to find.
     """
+    if device != "cpu":
+        with disk_cache.exclusive("kernels-cuda", TIMEOUT, waiting_for="another process that compiles kernels"):
+            _compile(_modules(packages, without=()), device)
     stamp = _stamp(packages)
     if _is_valid(stamp):
         return 0
@@ -38,30 +42,30 @@ def compile_kernels(packages: tuple[str, ...] = ()) -> int:
         modules = _modules(packages)
         folders = [os.path.join(wp.config.kernel_cache_dir, m.get_module_identifier(1)) for m in modules]
         missing = [m for m, folder in zip(modules, folders, strict=True) if not os.path.isdir(folder)]
-        _compile(missing)
+        _compile(missing, "cpu")
         stamp.write_text("\n".join(folders))
     return len(missing)
 
 
-def _compile(modules: list[wp.Module]) -> None:
-    """Compile modules on all cores; the compiler works without the interpreter lock."""
+def _compile(modules: list[wp.Module], device: str) -> None:
+    """Compile modules, or load them if they are, on all cores; the compiler works without the interpreter lock."""
 
     def compile_one(number: int) -> None:
         name = modules[number].name.removeprefix("vinesim.kernels.")
-        disk_cache.progress.info("compiling kernels: %s (%d of %d)", name, number + 1, len(modules))
-        wp.force_load("cpu", [modules[number]], max_workers=0)
+        disk_cache.progress.info("compiling kernels for %s: %s (%d of %d)", device, name, number + 1, len(modules))
+        wp.force_load(device, [modules[number]], max_workers=0)
 
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         for _ in pool.map(compile_one, range(len(modules))):
             pass
 
 
-def _modules(packages: tuple[str, ...]) -> list[wp.Module]:
+def _modules(packages: tuple[str, ...], without: tuple[str, ...] = _CUDA_ONLY) -> list[wp.Module]:
     """All Warp modules of the packages that have kernels, by name."""
     found = []
     for info in pkgutil.walk_packages(vinesim.kernels.__path__, "vinesim.kernels."):
         part = info.name.split(".")[2]
-        if info.ispkg or info.name in _CUDA_ONLY or (packages and part not in packages):
+        if info.ispkg or info.name in without or (packages and part not in packages):
             continue
         python: types.ModuleType = importlib.import_module(info.name)
         module = wp.get_module(python.__name__)

@@ -16,6 +16,9 @@ import sys
 PROFILE_FILE = pathlib.Path(__file__).resolve().parent / "shared_memory.xml"
 """Fast DDS profile with a shared-memory segment that large messages fit into."""
 
+SMALL_PROFILE_FILE = PROFILE_FILE.with_name("small_messages.xml")
+"""The same with an eighth of the memory, for processes that send no pictures or clouds."""
+
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 WHEEL_MIDDLEWARE = "rmw_fastrtps_cpp"
 """The only middleware among the wheels."""
@@ -52,18 +55,18 @@ def unavailable_reason() -> str | None:
     return None
 
 
-def configure() -> None:
+def configure(*, large_messages: bool = True) -> None:
     """Set the environment for the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
 
-    A profile that the user has chosen stays.
+    ``large_messages``: whether the process sends pictures or clouds. A profile that the user has chosen stays.
     """
     reason = unavailable_reason()
     if reason is not None:
         raise RosUnavailableError(reason)
-    os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE_FILE))
+    os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE_FILE if large_messages else SMALL_PROFILE_FILE))
 
 
 def clear_profile() -> None:
     """Remove vinesim's own profile again, to run as a program that knows nothing of vinesim."""
-    if os.environ.get(PROFILE_VARIABLE) == str(PROFILE_FILE):
+    if os.environ.get(PROFILE_VARIABLE) in (str(PROFILE_FILE), str(SMALL_PROFILE_FILE)):
         del os.environ[PROFILE_VARIABLE]

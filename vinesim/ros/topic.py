@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Any, Protocol
 
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+log = logging.getLogger(__name__)
 
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -15,31 +18,39 @@ TRANSIENT_LOCAL = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 """A late subscriber receives the last message, too."""
-SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
+"""Pictures and clouds: reliable, so that reliable and best-effort subscribers both receive them (REP-2003)."""
 
 Build = Callable[[], Any]
 """Makes a message, its serialised bytes, or a list of messages; called only if the topic has subscribers."""
 
 
 class Topic:
-    """A publisher with its counts; only the node's sending threads call :meth:`send`."""
+    """A publisher with its counts; one thread at a time may send."""
 
-    def __init__(self, name: str, publisher: Publisher, high_priority: bool) -> None:
+    def __init__(self, name: str, publisher: Publisher) -> None:
         self.name = name
         """Relative to the node's namespace unless it begins with a slash."""
-        self.high_priority = high_priority
-        """Small messages of every step, which have a thread of their own beside pictures and clouds."""
         self.subscription_count = 0
         """Number of subscribers when last counted."""
         self.sent = 0
         """Messages."""
         self.dropped = 0
-        """Messages that were replaced by newer ones before their turn, or that could not be built."""
+        """Messages that were replaced by newer ones before their turn, or that could not be built or sent."""
         self._publisher = publisher
 
     def update_subscription_count(self) -> None:
         """Query the middleware for the number of subscribers."""
         self.subscription_count = self._publisher.get_subscription_count()
+
+    def build_and_send(self, build: Build) -> None:
+        """Build a message and publish it; a failure is counted, and logged once."""
+        try:
+            self.send(build())
+        except Exception:
+            self.dropped += 1
+            if self.dropped == 1:
+                log.exception("could not publish %s; further failures are only counted", self.name)
 
     def send(self, message: Any) -> None:
         """Publish a message, its serialised bytes, or each message of a list."""
@@ -51,8 +62,8 @@ class Topic:
 class Advertise(Protocol):
     """How a publisher class creates its topics in the node."""
 
-    def __call__(self, message: type, name: str, qos: QoSProfile = ..., *, high_priority: bool = ...) -> Topic: ...
+    def __call__(self, message: type, name: str, qos: QoSProfile = ...) -> Topic: ...
 
 
 PendingMessage = tuple[Topic, Build]
-"""A topic and the function that builds its next message; a thread of the node calls it and sends the result."""
+"""A topic and the function that builds its next message; the node calls it and sends the result."""

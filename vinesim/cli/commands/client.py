@@ -37,7 +37,9 @@ JitterBuffer = Annotated[
     float,
     typer.Option(min=0.0, max=500.0, help="Show other actors this much later, without the network's jitter [ms]."),
 ]
-Device = Annotated[str, typer.Option(help="Where plants are simulated: cpu, cuda or cuda:N.")]
+Device = Annotated[
+    str, typer.Option(help="Where plants are simulated, cameras and lidars compute: cpu, cuda or cuda:N.")
+]
 Threads = Annotated[
     int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 32 awake trees, on free cores.")
 ]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Seed
+from vinesim.cli.commands.options import Device, Seed
 
 
 def demo(
@@ -25,6 +25,7 @@ def demo(
     robot: Annotated[
         str | None, typer.Option(help="A URDF file, or the name of one that ships; vinebot, or logistic to exchange.")
     ] = None,
+    device: Device = "cpu",
     headless: Annotated[bool, typer.Option(help="No live table; one line a second.")] = False,
     out: Annotated[pathlib.Path, typer.Option(help="Folder for pictures, plot and summary.json.")] = pathlib.Path(
         "out"
@@ -33,8 +34,8 @@ def demo(
     """A robot pushes a bunch, another client sees it move, ROS topics carry it; or a robot does a job.
 
     Starts a server, two robot clients (one for a job) and a plain rclpy subscriber, each a process of its own, on free
-    ports. The seconds of a push count from the first message of every sensor topic on. summary.json holds the
-    measurements; of a job whether it was done ("picked", "exchanged") and if not, why.
+    ports. The seconds of a push begin when server, clients, sensors and subscriber are all ready. summary.json holds
+    the measurements; of a job whether it was done ("picked", "exchanged") and if not, why.
 
     \b
     Examples:
@@ -48,11 +49,13 @@ def demo(
         from vinesim.cli.demo.push_demo import run_push
 
         code = run_push(
-            seconds=seconds or 20.0, seed=seed, scene=scene or "demo", robot=robot or "vinebot", headless=headless,
-            out=out,
+            seconds=seconds or 20.0, seed=seed, scene=scene or "demo", robot=robot or "vinebot", device=device,
+            headless=headless, out=out,
         )  # fmt: skip
     else:
         from vinesim.cli.demo.task_demo import run_job
 
-        code = run_job(job, seconds=seconds, seed=seed, scene=scene, robot=robot, headless=headless, out=out)
+        code = run_job(
+            job, seconds=seconds, seed=seed, scene=scene, robot=robot, device=device, headless=headless, out=out
+        )
     raise typer.Exit(code)

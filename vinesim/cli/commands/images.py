@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Camera, ImageSize, Renderer, Scene, Seed
+from vinesim.cli.commands.options import Camera, Device, ImageSize, Renderer, Scene, Seed
 
 
 def scene_show(
@@ -29,8 +29,12 @@ def scene_show(
 
 def render(
     scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
-    at: Annotated[str, typer.Option(help="Position of the camera, X,Y,Z [m].")],
-    look: Annotated[str, typer.Option(help="The point it looks at, X,Y,Z [m].")],
+    at: Annotated[str | None, typer.Option(help="Position of the camera, X,Y,Z [m].")] = None,
+    look: Annotated[str | None, typer.Option(help="The point it looks at, X,Y,Z [m].")] = None,
+    path: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Many viewpoints: CSV or JSON with x, y, z, look_x, look_y, look_z [m] of each."),
+    ] = None,
     camera: Camera = "d435",
     size: ImageSize = None,
     seed: Seed = None,
@@ -47,15 +51,17 @@ def render(
         list[str] | None, typer.Option(help="X,Y[,YAW[,FILL]]: a crate, filled with bunches from 0 to 1.")
     ] = None,
     renderer: Renderer = "warp",
+    device: Device = "cpu",
 ) -> None:
-    """Render one picture with its ground truth: ids, masks, boxes, berries, cut points.
+    """Render pictures with their ground truth: ids, masks, boxes, berries, cut points.
 
     Writes rgb.png, depth.png (16 bits, mm), labels.png (id = R + 256 G + 65536 B), overlay.png, camera.json and
-    truth.json. Bunches in a crate were picked from the nearest vines.
+    truth.json; with --path into folders 0000, 0001, ... Bunches in a crate were picked from the nearest vines.
 
     \b
     Examples:
       vinesim render demo --at 0.4,1.2,1.3 --look 3,1,1.7
+      vinesim render demo --path viewpoints.csv --out tour
       vinesim render vsp --camera pinhole --at 1,-1.2,1.1 --look 1,0,1 --size 1280x960 --seed 4 --out shot
       vinesim render harvest --at 0,0.15,1.35 --look 2.6,0.35,1 --robot vinebot@2.9,1,-2.5 --person 2.2,-0.28,2.3,pick
       --crate 1.8,0.75,0,0.4
@@ -63,8 +69,8 @@ def render(
     from vinesim.cli.render import run
 
     code = run(
-        scene, camera=camera, at=at, look=look, size=size, hour=hour, seed=seed, out=out, renderer=renderer,
-        robots=robot or (), people=person or (), crates=crate or (),
+        scene, camera=camera, at=at, look=look, path=path, size=size, hour=hour, seed=seed, out=out, renderer=renderer,
+        device=device, robots=robot or (), people=person or (), crates=crate or (),
     )  # fmt: skip
     raise typer.Exit(code)
 
@@ -77,9 +83,11 @@ def dataset(
     camera: Camera = "d435",
     size: ImageSize = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=256, help="Processes; half as many as cores unless given.")
+        int | None,
+        typer.Option(min=1, max=256, help="Processes; half as many as cores unless given, as many with a GPU."),
     ] = None,
     renderer: Renderer = "warp",
+    device: Device = "cpu",
     actors: Annotated[
         float, typer.Option(help="Share of the images with people, robots, crates and wind; 0 leaves the vines alone.")
     ] = 0.4,

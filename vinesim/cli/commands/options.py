@@ -11,6 +11,7 @@ Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that 
 Renderer = Annotated[
     str, typer.Option(help="Rasterizer: warp, taichi (all cores) or taichi-gpu (Vulkan, Metal); needs vinesim[taichi].")
 ]
+Device = Annotated[str, typer.Option(help="cpu, cuda or cuda:N (an NVIDIA GPU).")]
 Camera = Annotated[str, typer.Option(help="A camera file, or d435, pinhole.")]
 ImageSize = Annotated[
     str | None, typer.Option(help="WxH [px] at the same horizontal field of view; the camera's own unless given.")

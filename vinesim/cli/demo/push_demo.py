@@ -15,6 +15,8 @@ from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, process_group
 from vinesim.client.processes.ros_listener import RosListener
+from vinesim.kernels.compilation import compile_kernels
+from vinesim.physics.plants.device_buffers import find_device
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
@@ -35,6 +37,8 @@ class ListenedTopics:
     always: tuple[str, ...]
     once: tuple[str, ...]
     """Only until their first message."""
+    events: tuple[str, ...]
+    """Nobody waits for these: they may stay silent."""
     owners: Mapping[str, str]
     """Topic: the sensor that it comes from, in words."""
 
@@ -43,11 +47,16 @@ class ListenedTopics:
         return self.owners.get(topic, topic)
 
 
-def run_push(*, seconds: float, seed: int | None, scene: str, robot: str, headless: bool, out: pathlib.Path) -> int:
+def run_push(
+    *, seconds: float, seed: int | None, scene: str, robot: str, device: str, headless: bool, out: pathlib.Path
+) -> int:
     """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``; the exit code."""
     console = Console(stderr=True)
     begin = time.time()
+    find_device(device)
     plan = with_seed(load_scene(scene), seed)
+    if device == "cpu":
+        compile_kernels()
     description = load_description(robot)  # refused once, and before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
@@ -57,13 +66,15 @@ def run_push(*, seconds: float, seed: int | None, scene: str, robot: str, headle
         console.print(f"ROS 2 is not usable here, the demo runs without it: {no_ros}")
     with process_group() as group:
         topics = listened_topics(description)
-        listener = None if no_ros else RosListener(group, topics.always, topics.once)
+        listener = None if no_ros else RosListener(group, topics.always, topics.once, topics.events)
         server, endpoint = group.start_server()
         bunch, poses = choose_poses(plan, generate(plan))
         console.print(
             f"server on {endpoint}; {PICKER} will push bunch {bunch} for {seconds:.0f} s (a first run compiles kernels)"
         )
-        clients = _start_clients(group, endpoint, scene, seed, robot, bunch, poses, out)
+        common = ["--connect", endpoint, "--scene", scene, "--robot", robot, "--device", device]
+        common += [] if seed is None else ["--seed", str(seed)]
+        clients = _start_clients(group, common, bunch, poses, out)
         newest = Statuses()
         ready = wait_until_ready(clients, [server], listener, newest, topics.describe, console, START_TIMEOUT)
         took = time.time() - begin
@@ -111,12 +122,10 @@ class _RunTimer:
 
 
 def _start_clients(
-    group: ProcessGroup, endpoint: str, scene: str, seed: int | None, robot: str, bunch: int,
-    poses: tuple[list[str], list[str]], out: pathlib.Path,
-) -> dict[str, Process]:  # fmt: skip
-    """The clients by name: one pushes the ``bunch``, the other drives up to it."""
-    common = ["-m", "vinesim.cli", "client", "--role", "robot", "--scene", scene, "--robot", robot, "--status", "json"]
-    common += ["--connect", endpoint, "--watch", str(bunch)] + ([] if seed is None else ["--seed", str(seed)])
+    group: ProcessGroup, common: list[str], bunch: int, poses: tuple[list[str], list[str]], out: pathlib.Path
+) -> dict[str, Process]:
+    """The clients by name, with ``common`` options: one pushes the ``bunch``, the other drives up to it."""
+    common = ["-m", "vinesim.cli", "client", "--role", "robot", *common, "--status", "json", "--watch", str(bunch)]
     own = {
         PICKER: [*poses[0], "--push", str(bunch)],
         VISITOR: [
@@ -134,7 +143,7 @@ def listened_topics(robot: RobotDescription) -> ListenedTopics:
     """All topics of the picker; of the visitor its joints, its first picture and its first scan."""
     always = [
         "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment",
-        "/tf_environment_static", "/vine/contacts", "/mobile_base_controller/odom", "/diagnostics",
+        "/tf_environment_static", "/mobile_base_controller/odom", "/diagnostics",
         f"/{VISITOR}/joint_states",
     ]  # fmt: skip
     once, owners = [], {f"/{VISITOR}/joint_states": VISITOR}
@@ -152,4 +161,4 @@ def listened_topics(robot: RobotDescription) -> ListenedTopics:
     ):
         once.append(f"/{VISITOR}/{sensor.name}/{topic}")
         owners[once[-1]] = f"{sensor.name} of {VISITOR}"
-    return ListenedTopics(tuple(always), tuple(once), owners)
+    return ListenedTopics(tuple(always), tuple(once), ("/vine/contacts",), owners)

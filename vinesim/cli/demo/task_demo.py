@@ -12,6 +12,7 @@ from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, process_group
 from vinesim.client.tasks.task_registry import UnknownTask
+from vinesim.physics.plants.device_buffers import find_device
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
 from vinesim.scene.spec import load_scene, with_seed
@@ -23,13 +24,14 @@ TIME_LIMIT = 120.0
 
 
 def run_job(
-    job: str, *, seconds: float | None, seed: int | None, scene: str | None, robot: str | None, headless: bool,
-    out: pathlib.Path,
+    job: str, *, seconds: float | None, seed: int | None, scene: str | None, robot: str | None, device: str,
+    headless: bool, out: pathlib.Path,
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {' or '.join(JOBS)}")
     console = Console(stderr=True)
+    find_device(device)
     default_robot, done_key = JOBS[job]
     robot, scene = robot or default_robot, scene or "harvest"
     plan = with_seed(load_scene(scene), seed)
@@ -40,7 +42,7 @@ def run_job(
         server, endpoint = group.start_server()
         console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
         common = ["-m", "vinesim.cli", "client", "--role", "robot", "--connect", endpoint, "--scene", scene]
-        common += ["--seed", str(plan.seed), "--robot", robot, "--status", "json"]
+        common += ["--seed", str(plan.seed), "--robot", robot, "--device", device, "--status", "json"]
         visitor, newest = None, Statuses()
         if (place := visitor_pose(plan)) is not None:
             visitor = group.start(

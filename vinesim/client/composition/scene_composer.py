@@ -11,13 +11,13 @@ Bunches in a crate are picked from the nearest vines and fall in one after anoth
 from __future__ import annotations
 
 import dataclasses
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vinesim import frames
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
 from vinesim.scene import appearance
 from vinesim.scene.berries import VARIETIES
@@ -25,6 +25,9 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import HumanSpec, Snapshot
 from vinesim.sensors.scene.primitives import rest_snapshot
+
+if TYPE_CHECKING:
+    from vinesim.physics.step import Physics
 
 HEAP_DENSITY = 330.0
 """Bulk density of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
@@ -92,6 +95,8 @@ class SceneComposer:
         """Snapshot of the vineyard with all of them at rest; :class:`PlacementError` if two would overlap."""
         furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
+            from vinesim.physics.step import Physics  # the kernels of plants: half a second that few pictures need
+
             return self.populate(Physics(furnished))
         rigid = RigidWorld(furnished)  # plants that nobody picks from need not be ready to move
         self._add_actors(rigid)

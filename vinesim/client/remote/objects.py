@@ -230,11 +230,13 @@ class ObjectSync:
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
         """All that moves and that a local actor touches, itself or by an object of ``mine``, or that slips off it."""
-        tracker = self.physics.support_tracker
-        found = {
-            number for number in tracker.moving if self._supporting_actor(number) == name
-        } | tracker.objects_moved_by(name)
-        for number, actor in (*tracker.touched, *self.physics.touched):
+        tracker, touched = self.physics.support_tracker, self.physics.touched
+        found: set[int] = set()
+        if moving := tracker.moving:
+            found = {number for number in moving if self._supporting_actor(number) == name}
+            found |= tracker.objects_moved_by(name)
+            touched = (*tracker.touched, *touched)
+        for number, actor in touched:
             other = parse_object_name(actor)
             if (other is not None and other in mine) or (actor == name and is_tree(number)):
                 found.add(number)

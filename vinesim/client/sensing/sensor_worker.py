@@ -1,4 +1,4 @@
-"""The sensor process of one robot: renders what is subscribed to, and runs the robot's ROS node."""
+"""The sensor process of one robot: renders what is subscribed to, and publishes it as the drivers of sensors do."""
 
 from __future__ import annotations
 
@@ -7,40 +7,43 @@ import dataclasses
 import logging
 import os
 import pathlib
-import pickle
 import signal
 import sys
+import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
+from multiprocessing.context import BaseContext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.client.sensing.latest_value import LatestValue, make_poll
+from vinesim.client.sensing.rigid_visual_list import VisualListMessage, VisualListReceiver
+from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
+from vinesim.physics.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
-from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, RigidVisual, RobotSample, Snapshot
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot
 
 if TYPE_CHECKING:
-    from vinesim.ros.node import Node
+    from vinesim.ros.sensor_node import SensorNode
     from vinesim.sensors.camera.sunlight import SunPath
     from vinesim.sensors.scheduler import SensorScheduler
 
 log = logging.getLogger(__name__)
 
-STATISTICS_PERIOD = 0.1
-"""Simulated time between two reports to the client: subscriptions and message counts [s]."""
-GROUND_TRUTH_PERIOD = 10
-"""Ticks between two messages of true poses: 10 Hz."""
+STATISTICS_PERIOD = 0.2
+"""Wall time between two reports to the client [s]."""
+POLL_PERIOD = 0.02
+"""Longest time without a look at requests and subscribers [s]."""
 SWITCH_INTERVAL = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
-PROCESS_NICE, RENDER_NICE = 10, 15
-"""Niceness where cores are scarce: the client's loop comes first (0), then ROS messages, then pictures."""
+NICE = 5
+"""Niceness where cores are scarce: the client's loop and its ROS process come first."""
+POSE_HISTORY = 128
+"""Poses of the sensors that are kept for lidars: of 2.5 s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,58 +63,54 @@ class SensorConfig:
     """Whether the first camera renders even without subscribers, and the best picture is kept."""
     sensor_hz: float | None
     """Rate of all sensors [Hz]; None: each sensor's own."""
-    clock: bool
-    """Whether the node publishes /clock."""
     renderer: str = "warp"
+    device: str = "cpu"
+    """Where they compute; the CPU from the next start on if a GPU fails."""
+
+    @property
+    def sensor_frames(self) -> dict[str, str]:
+        """Link that carries each camera and lidar, by name; the order of poses in snapshots."""
+        return {mount.name: mount.frame for mount in (*self.description.cameras, *self.description.lidars)}
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class MovedPlants:
-    """Poses of the plants that moved since the last snapshot that was acknowledged."""
+class SensorChannel:
+    """What the client and the process share: the newest snapshot of the world, and what is wanted."""
 
-    trees: np.ndarray
-    """[tree] indices."""
-    bodies: np.ndarray
-    """[body] indices of their bodies."""
-    body_q: np.ndarray
-    """[body, 7] m, 1."""
+    def __init__(self, config: SensorConfig, context: BaseContext) -> None:
+        model, sensors = config.model, len(config.sensor_frames)
+        bodies, trees, bunches = len(model.body_mass), len(model.tree_first), len(model.bunch_body)
+        self.snapshot = SharedSnapshot(
+            {
+                "time": ((1,), "f8"), "frame_score": ((1,), "f8"),
+                "tick": ((1,), "i8"), "number": ((1,), "i8"),  # counts snapshots from 1
+                "visuals_version": ((1,), "i8"), "visual_count": ((1,), "i8"),
+                "body_q": ((bodies, 7), "f4"), "bunch_attached": ((bunches,), "?"),
+                "tree_number": ((trees,), "i8"),  # the snapshot in which each tree moved last
+                "pose_count": ((1,), "i8"), "pose_time": ((POSE_HISTORY,), "f8"),  # a ring of sensor poses
+                "pose": ((POSE_HISTORY, sensors, 7), "f8"),
+            },
+            context,
+        )  # fmt: skip
+        self.wanted = SharedArrays({"renders": ((1,), "?")})
+        """Whether any sensor renders, written by the process."""
 
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class StepSnapshot:
-    """What the client passes to the worker after a step; poses only when a sensor or subscriber needs them."""
-
-    number: int
-    """Counts snapshots from 1."""
-    tick: int
-    time: float
-    """[s]"""
-    sample: RobotSample
-    plants: MovedPlants | None
-    attached: np.ndarray
-    """Bit field: whether each bunch hangs on its plant."""
-    visuals: tuple[RigidVisual, ...] | None
-    """All rigid bodies, if the list is not the one of the last acknowledged snapshot."""
-    visual_q: np.ndarray | None
-    """[visual, 7] their poses, if a sensor renders."""
-    sensor_poses: dict[str, np.ndarray] | None
-    """[7] world pose of each sensor by name, if one renders."""
-    frame_score: float
-    """How much there is to see: see ``Client.frame_score``."""
+    def close(self) -> None:
+        """Release the memory."""
+        self.snapshot.close()
+        self.wanted.close()
 
 
-def run_sensor_worker(config: SensorConfig, snapshots: LatestValue, pipe: Connection) -> None:
-    """Entry of the process: render and publish until asked to stop, or until the client's process has ended."""
+def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connection) -> None:
+    """Entry of the process: render and publish until told to stop, or until the client's process has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.setswitchinterval(SWITCH_INTERVAL)
     if hasattr(os, "nice"):
-        os.nice(PROCESS_NICE)
+        os.nice(NICE)
     code = 0
     try:
         with contextlib.ExitStack() as stack:
-            stack.callback(snapshots.close)
-            SensorWorker(config, pipe, stack).run(snapshots)
+            SensorWorker(config, channel, pipe, stack).run()
     except (EOFError, BrokenPipeError, ConnectionResetError):
         pass  # the client is gone
     except Exception as error:
@@ -125,67 +124,77 @@ def run_sensor_worker(config: SensorConfig, snapshots: LatestValue, pipe: Connec
 
 
 class SensorWorker:
-    """The robot's ROS node and its sensors, fed with snapshots."""
+    """The robot's sensors and their ROS node, fed with snapshots."""
 
-    def __init__(self, config: SensorConfig, pipe: Connection, stack: contextlib.ExitStack) -> None:
-        """Starts the node and the sensors in ``stack``, then reports "ready"."""
-        self.config, self.pipe = config, pipe
+    def __init__(
+        self, config: SensorConfig, channel: SensorChannel, pipe: Connection, stack: contextlib.ExitStack
+    ) -> None:
+        """Starts the node and the sensors in ``stack``."""
+        self.config, self.channel, self.pipe = config, channel, pipe
+        self.frames_skipped = 0
+        """Snapshots that could not be shown as their list of bodies had not arrived."""
         self._state = State.at_rest(config.model)
-        self._visuals: tuple[RigidVisual, ...] = ()
+        self._visuals = VisualListReceiver()
+        self._last_number = 0
+        self._pose_count = 0
         self._best_frame: CameraFrame | None = None
         self._best_score = -1.0
         self._frame_score = 0.0
-        self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(len(config.model.bunch_body)))
-        self._attached_names: tuple[str, ...] = self._bunch_names
         self._next_statistics = 0.0
+        self._awaits("kernels and scene")
         self.node = self._open_node(stack) if config.ros else None
-        self.scheduler = self._open_sensors(stack)
-        pipe.send(("statistics", self._statistics()))
-        pipe.send(("ready", None))
+        self.scheduler = self._open_sensors()
+
+    def _awaits(self, *parts: str) -> None:
+        self.pipe.send(("awaited", parts))
 
     # ------------------------------------------------------------------ construction
 
-    def _open_node(self, stack: contextlib.ExitStack) -> Node:
-        from vinesim.ros.node import Node
+    def _open_node(self, stack: contextlib.ExitStack) -> SensorNode:
+        from vinesim.ros.sensor_node import SensorNode
 
         config, description = self.config, self.config.description
-        fixed = [(p, c, q) for (p, c), q in zip(description.fixed_frames, description.fixed_poses, strict=True)]
-        node = stack.enter_context(
-            Node(
-                ros_name(config.name), description.urdf, namespace=config.namespace,
-                static_transforms=fixed, cameras=[m.name for m in description.cameras],
-                lidars=[m.name for m in description.lidars], base=description.base,
-                clock=config.clock,
+        return stack.enter_context(
+            SensorNode(
+                f"{ros_name(config.name)}_sensors", namespace=config.namespace,
+                cameras=[m.name for m in description.cameras], lidars=[m.name for m in description.lidars],
             )
         )  # fmt: skip
-        poles = np.flatnonzero(config.model.fixed_organ == Organ.POLE)
-        poses = frames.pose(config.model.fixed_start[poles])
-        node.publish_environment_static(tuple(f"pole_{i:04d}" for i in range(len(poles))), poses)
-        return node
 
-    def _open_sensors(self, stack: contextlib.ExitStack) -> SensorScheduler:
+    def _open_sensors(self) -> SensorScheduler:
         from vinesim.sensors.camera.camera import Camera, CameraSpec
         from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
         from vinesim.sensors.scene.primitives import Primitives
         from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
 
-        load_kernels()
+        device = self._working_device()
+        if device == "cpu":
+            load_kernels()
         config, sensors = self.config, []
         seed = zlib.crc32(config.name.encode())  # no two robots have the same noise
         for i, mount in enumerate(config.description.cameras):
             spec = CameraSpec.load(mount.type)
-            camera = Camera(spec, spec.info(mount.frame), mount.name, config.sun, quality="fast", seed=seed)
+            camera = Camera(
+                spec, spec.info(mount.frame), mount.name, config.sun, quality="fast", seed=seed, device=device
+            )
             always = config.keep_pictures and i == 0
             wanted = self._camera_demand(mount.name, always)
             sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, config.sensor_hz))
         for mount in config.description.lidars:
-            lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed)
+            lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed, device=device)
             wanted = self._lidar_demand(mount.name)
             sensors.append(ScheduledSensor(lidar, self._deliver_lidar, wanted, config.sensor_hz))
-        primitives = Primitives(config.model, renderer=config.renderer)
-        return stack.enter_context(
-            SensorScheduler(config.model, sensors, primitives=primitives, nice=RENDER_NICE)
-        )  # fmt: skip
+        primitives = Primitives(config.model, renderer=config.renderer, device=device)
+        return SensorScheduler(config.model, sensors, primitives=primitives)
+
+    def _working_device(self) -> str:
+        """The device of the configuration, or the CPU if it cannot be used any more, which is logged and reported."""
+        device = self.config.device
+        if device != "cpu" and (fault := device_fault(device)) is not None:
+            log.error("cameras and lidars of %s compute on the CPU: %s", self.config.name, fault)
+            device = "cpu"
+        self.pipe.send(("device", device))
+        return device
 
     def _camera_demand(self, name: str, always: bool) -> Callable[[], CameraOutput]:
         """The outputs of a camera that its subscribers need now; all but the exact depth if ``always``."""
@@ -202,80 +211,78 @@ class SensorWorker:
 
     # ------------------------------------------------------------------ loop
 
-    def run(self, snapshots: LatestValue) -> None:
-        """Take snapshots and requests until a "stop"."""
-        has_request = make_poll(self.pipe)
-        while True:
-            value = snapshots.take(0.05)
-            if value is not None:
-                self._take(pickle.loads(value))
-            while has_request():
-                kind, value = self.pipe.recv()
-                if kind == "stop":
-                    return
-                if kind == "save":
-                    self._save_best_frame(value)
-                elif kind == "diagnose" and self.node is not None:
-                    time = value.pop("time")
-                    self.node.publish_diagnostics(time, value, healthy=value["real_time_factor"] > 0.99)
+    def run(self) -> None:
+        """Warm the sensors up with the first snapshot, report "ready", then render until a "stop"."""
+        is_ready = False
+        self._awaits("snapshot of the world")
+        while self._take_requests():
+            if self.channel.snapshot.wait(POLL_PERIOD) and (world := self._read()) is not None:
+                snapshot, earlier = world
+                poses = earlier.pop()[1]
+                if is_ready:
+                    self.scheduler.advance(snapshot, poses, earlier)
+                else:
+                    for name in self.scheduler.warm_up(snapshot, poses):
+                        self._awaits(name)
+                    is_ready = True
+                    self._awaits()
+                    self.pipe.send(("ready", None))
+            self.channel.wanted["renders"][0] = any(sensor.wanted() for sensor in self.scheduler.sensors)
+            if time.monotonic() >= self._next_statistics:
+                self._next_statistics = time.monotonic() + STATISTICS_PERIOD
+                self.pipe.send(("statistics", self._statistics()))
 
-    def _take(self, snapshot: StepSnapshot) -> None:
-        """Bring the copy of the world up to date, pass it to the sensors, publish the robot's state."""
-        self._frame_score = snapshot.frame_score
-        plants = snapshot.plants
-        if plants is not None:
-            self._state.body_q[plants.bodies] = plants.body_q
-        if snapshot.visuals is not None:
-            self._visuals = snapshot.visuals
-        self._submit(snapshot)
-        if plants is not None:
-            self.pipe.send(("read", (snapshot.number, snapshot.visuals is not None)))
-        if self.node is not None:
-            self.node.publish_robot_state(snapshot.time, snapshot.sample)
-            is_due = snapshot.tick % GROUND_TRUTH_PERIOD == 0 and plants is not None
-            if is_due and self.node.has_subscribers("tf_environment"):
-                self._publish_ground_truth(self.node, snapshot.time)
-            if commands := self.node.commands():
-                self.pipe.send(("commands", commands))
-        if snapshot.time >= self._next_statistics:
-            self._next_statistics = snapshot.time + STATISTICS_PERIOD
-            self.pipe.send(("statistics", self._statistics()))
+    def _take_requests(self) -> bool:
+        """Do what the client asks for; False after a "stop"."""
+        while self.pipe.poll():
+            kind, value = self.pipe.recv()
+            if kind == "stop":
+                return False
+            if kind == "visuals":
+                assert isinstance(value, VisualListMessage)
+                self._visuals.take(value)
+            elif kind == "save":
+                self._save_best_frame(value)
+        return True
 
-    def _submit(self, step: StepSnapshot) -> None:
-        """Pass the world to the sensors, if the step has the poses of all rigid bodies that are known here."""
-        if step.plants is None or step.visual_q is None or step.sensor_poses is None:
-            return
-        if len(step.visual_q) != len(self._visuals):
-            return
-        self._state.bunch_attached[:] = np.unpackbits(step.attached, count=len(self._bunch_names))
-        world = Snapshot(
-            step.time, step.tick, self._state.body_q.copy(), self._state.bunch_attached.copy(), self._visuals,
-            step.visual_q, step.plants.trees,
+    def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
+        """The newest snapshot, and sensor poses with their times [s] since the last one; the last are of its time.
+
+        None, and counted, if the list of bodies that it belongs to has not arrived.
+        """
+        with self.channel.snapshot.reading() as shared:
+            memory = self._visuals.memory
+            if memory is None or shared["visuals_version"][0] != self._visuals.version:
+                self.frames_skipped += 1
+                return None
+            visual_q = memory["visual_q"][: int(shared["visual_count"][0])].copy()
+            has_moved = shared["tree_number"] > self._last_number
+            bodies = np.flatnonzero(has_moved[self.config.model.body_tree])
+            self._state.body_q[bodies] = shared["body_q"][bodies]
+            self._last_number = int(shared["number"][0])
+            self._state.bunch_attached[:] = shared["bunch_attached"]
+            self._frame_score = float(shared["frame_score"][0])
+            time, tick = float(shared["time"][0]), int(shared["tick"][0])
+            count = int(shared["pose_count"][0])
+            rows = np.arange(max(self._pose_count, count - POSE_HISTORY), count) % POSE_HISTORY
+            times, poses = shared["pose_time"][rows], shared["pose"][rows]
+            self._pose_count = count
+        state, names = self._state, tuple(self.config.sensor_frames)
+        snapshot = Snapshot(
+            time, tick, state.body_q, state.bunch_attached, self._visuals.visuals, visual_q,
+            np.flatnonzero(has_moved),
         )  # fmt: skip
-        self.scheduler.submit(world, step.sensor_poses)
-
-    def _publish_ground_truth(self, node: Node, time: float) -> None:
-        """True poses of the bunches that hang on their plants."""
-        attached = np.flatnonzero(self._state.bunch_attached)
-        if len(attached) != len(self._attached_names):
-            self._attached_names = tuple(self._bunch_names[i] for i in attached)
-        poses = self._state.body_q[self.config.model.bunch_body[attached]]
-        node.publish_environment(time, self._attached_names, poses.astype(float))
+        return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 
     def _statistics(self) -> dict[str, Any]:
-        """What is subscribed to, and what was rendered, sent and dropped."""
-        statistics = {
-            "sent": {},
-            "renders": any(sensor.wanted() for sensor in self.scheduler.sensors),
+        """What was rendered, sent and dropped."""
+        statistics: dict[str, Any] = {
             "frames": dict(self.scheduler.frames),
             "frames_dropped": dict(self.scheduler.dropped),
+            "frames_skipped": {"snapshots": self.frames_skipped},
         }
         if self.node is not None:
-            statistics |= {
-                "sent": self.node.sent,
-                "ros_dropped": self.node.dropped,
-                "publishes_truth": self.node.has_subscribers("tf_environment"),
-            }
+            statistics |= {"sent": self.node.sent, "ros_dropped": self.node.dropped}
         return statistics
 
     def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
@@ -297,4 +304,4 @@ class SensorWorker:
 
             images.save_frame(self._best_frame, folder, "")
         self.pipe.send(("statistics", self._statistics()))
-        self.pipe.send(("saved", None))
+        self.pipe.send(("saved", self._best_frame is not None))

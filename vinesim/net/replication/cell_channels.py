@@ -28,6 +28,8 @@ class CellChannels:
         """Of states and of events."""
         self.publishers: dict[Cell, tuple[Publisher, Publisher]] = {}
         """Of states and of events."""
+        self.changes = 0
+        """How often channels were opened or closed."""
 
     def update(self, owned_cells: set[Cell]) -> None:
         """Move the 3x3 window to the position and keep the cells in which an owned object is."""
@@ -36,6 +38,7 @@ class CellChannels:
             return
         self.centre = centre
         wanted = interest.cell_window(centre) | owned_cells
+        self.changes += 1
         for cell in sorted(self.subscriptions.keys() - wanted):
             for channel in (*self.subscriptions.pop(cell), *self.publishers.pop(cell)):
                 channel.close()

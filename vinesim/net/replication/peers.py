@@ -51,7 +51,9 @@ class PeerRegistry:
         """``jitter_buffer`` [s]: delay with which poses of peers are shown. Joins the world; see :meth:`Bus.join`."""
         self.bus, self.hello, self.counters = bus, hello, counters
         self._jitter_buffer = JitterBuffer(jitter_buffer).delay
-        self.local_actors: set[str] = set()
+        self._local_actors: set[str] = set()
+        self._alive: frozenset[str] | None = None
+        """Live names when all of them were known or rejected; None while a hello is missing."""
         self.clock = NetworkClock(bus)
         self.known: dict[str, RemotePose] = {}
         self.seen_names: set[str] = set()
@@ -75,9 +77,22 @@ class PeerRegistry:
 
     # ------------------------------------------------------------ who is here
 
+    @property
+    def local_actors(self) -> set[str]:
+        """Other actors of the same client, which are no peers."""
+        return self._local_actors
+
+    @local_actors.setter
+    def local_actors(self, names: set[str]) -> None:
+        self._local_actors, self._alive = names, None
+
     def poll_liveliness(self, now: float) -> list[str]:
         """Query new peers for their hello and the clock when due; the names of peers that have left."""
-        alive = self.bus.alive() - self.local_actors
+        live_names = self.bus.alive()
+        if live_names == self._alive:
+            self.clock.ping_if_due()
+            return []
+        alive = live_names - self._local_actors
         gone = sorted(self.known.keys() - alive)
         for name in gone:
             actor = self.known.pop(name)
@@ -87,10 +102,12 @@ class PeerRegistry:
                 actor.near.close()
         self._rejected &= alive
         self._initial_names &= alive
-        for name in sorted(alive - self.known.keys() - self._rejected - {self.hello.name}):
+        strangers = sorted(alive - self.known.keys() - self._rejected - {self.hello.name})
+        for name in strangers:
             if now - self._queried.get(name, _LONG_AGO) >= ASK_PERIOD:
                 self._queried[name] = now
                 self.bus.query(f"hello/{name}")
+        self._alive = None if strangers else live_names
         self.clock.ping_if_due()
         return gone
 

@@ -6,7 +6,8 @@ publishes all of its own records again, for the new one may know nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Collection
 
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
@@ -37,6 +38,9 @@ class RetainedSync:
         self._subscriptions: dict[Cell, Subscription] = {}
         self._asked: dict[Cell, tuple[float, float]] = {}
         self._is_disconnected = False
+        self._window_changes = -1
+        self._next_query = math.inf
+        """When the server is asked next [s]."""
 
     def publish(self, cell: Cell, record: RetainedRecord) -> None:
         """Queue an own record about an object in ``cell``."""
@@ -57,15 +61,20 @@ class RetainedSync:
                 self._pending.get(cell_before, {}).pop(record.object, None)
         return is_new
 
-    def update_window(self, window: Iterable[Cell], now: float) -> None:
-        """Subscribe to records of these cells and query the server for those that are new."""
-        wanted, is_disconnected = set(window), bool(self.bus.status_message)
+    def update_window(self, window: Collection[Cell], changes: int, now: float) -> None:
+        """Subscribe to records of these cells and query the server for those that are new.
+
+        ``changes``: how often the window has changed; while that and all else stays the same, nothing is done.
+        """
+        is_disconnected = bool(self.bus.status_message)
         if (
-            not self._asked
+            (now < self._next_query or is_disconnected)
             and is_disconnected == self._is_disconnected
-            and wanted == self._subscriptions.keys() == self._publishers.keys()
+            and changes == self._window_changes
+            and len(self._publishers) == len(window)
         ):
             return
+        wanted, self._window_changes = set(window), changes
         if self._is_disconnected and not is_disconnected:
             for object_id, (cell, record) in self._authored.items():
                 self._pending.setdefault(cell, {})[object_id] = record
@@ -86,6 +95,7 @@ class RetainedSync:
                 if now >= due:
                     self._asked[cell] = now + period, min(2.0 * period, MAX_QUERY_PERIOD)
                     self.bus.query(f"snap/{cell[0]}/{cell[1]}")
+        self._next_query = min((due for due, _ in self._asked.values()), default=math.inf)
 
     def mark_answered(self, cell: Cell) -> None:
         """The server has replied for a cell."""

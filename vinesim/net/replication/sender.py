@@ -38,7 +38,7 @@ it comes to rest. GUESSED."""
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(slots=True)
 class LocalStep:
     """What the own simulation reports about one step; see
     :meth:`vinesim.net.replication.replicator.Replicator.send`."""
@@ -73,7 +73,8 @@ class Sender:
             touched.add(object_id)
         for object_id in sorted(touched):
             state.ownership.touch(object_id)
-        self._adopt_orphans(step.moving - touched, step)
+        if step.moving or self._orphans:
+            self._adopt_orphans(step.moving - touched, step)
         self._update_interest(step.now)
         owned = state.ownership.owned
         active = tuple(sorted(owned & (touched | step.moving)))
@@ -107,7 +108,7 @@ class Sender:
         state = self._state
         owned = {cell for object_id in state.ownership.owned if (cell := state.cell_of(object_id)) is not None}
         state.cells.update(owned)
-        state.retained.update_window(state.cells.subscriptions, now)
+        state.retained.update_window(state.cells.subscriptions, state.cells.changes, now)
         state.peers.update_interest(state.cells.position)
 
     # ------------------------------------------------------------ moving

@@ -38,6 +38,8 @@ class MemoryHub:
         self._visible_names: dict[str, set[str]] = {}
         self._hidden: set[str] = set()
         self._last_arrival: dict[tuple[str, str], float] = {}
+        self._subscribers: dict[str, list[str]] = {}
+        """Sorted names of the members that subscribe to a key, until subscriptions or members change."""
 
     def bus(self, name: str, *, live: bool = True) -> MemoryBus:
         """Add a member; :class:`NameTaken` if the name is live. Not ``live``: it has no liveliness token."""
@@ -52,6 +54,7 @@ class MemoryHub:
             self._visible_names[name].discard(name)
             self._hidden.add(name)
         self._members[name] = bus
+        self.forget_subscribers()
         return bus
 
     def advance(self, dt: float) -> None:
@@ -72,13 +75,22 @@ class MemoryHub:
 
     def has_subscriber(self, sender: str, key: str) -> bool:
         """Whether another member subscribes to this key."""
-        return not self.down and any(bus.is_subscribed(key) for name, bus in self._members.items() if name != sender)
+        return not self.down and any(name != sender for name in self._subscribers_of(key))
+
+    def _subscribers_of(self, key: str) -> list[str]:
+        if key not in self._subscribers:
+            self._subscribers[key] = sorted(name for name, bus in self._members.items() if bus.is_subscribed(key))
+        return self._subscribers[key]
+
+    def forget_subscribers(self) -> None:
+        """Subscriptions or members have changed."""
+        self._subscribers.clear()
 
     def send(self, sender: str, key: str, payload: bytes, reliable: bool) -> None:
         """Send a sample to every other member that is subscribed now; a closed subscription ignores it on arrival."""
-        for name in sorted(self._members):
+        for name in self._subscribers_of(key):
             bus = self._members[name]
-            if name == sender or not bus.is_subscribed(key):
+            if name == sender:
                 continue
             if reliable:
                 self._schedule(functools.partial(self._deliver, bus, key, payload), (sender, name))
@@ -110,6 +122,7 @@ class MemoryHub:
     def remove(self, name: str) -> None:
         """Remove a member; the others notice after one delay."""
         self._members.pop(name, None)
+        self.forget_subscribers()
         self._visible_names.pop(name, None)
         self._hidden.discard(name)
         for other in sorted(self._members):
@@ -186,11 +199,13 @@ class MemoryBus:
     def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> MemorySubscription:
         subscription = MemorySubscription(self, pattern, depth)
         self._subscriptions.append(subscription)
+        self.hub.forget_subscribers()
         return subscription
 
     def unsubscribe(self, subscription: MemorySubscription) -> None:
         if subscription in self._subscriptions:
             self._subscriptions.remove(subscription)
+            self.hub.forget_subscribers()
 
     def is_subscribed(self, key: str) -> bool:
         return any(matches(subscription.pattern, key) for subscription in self._subscriptions)

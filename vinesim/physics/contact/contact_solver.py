@@ -56,6 +56,7 @@ class ContactSolver:
         """
         self._awake = np.zeros(0, np.int32)
         self._reported: tuple[Contact, ...] | None = ()
+        self._touched: tuple[tuple[int, str], ...] | None = ()
         self._generation = 0
         numbers = kernel_parameters(self.parameters)
         self._arrays = PlantArrays(model, plants, self.capsules)
@@ -84,14 +85,14 @@ class ContactSolver:
     def solve(self) -> None:
         """Find the contacts of all awake trees and their forces."""
         self._awake = awake = self.plants.awake
-        self.count, self._reported = 0, ()
+        self.count, self._reported, self._touched = 0, (), ()
         self.impulses.clear()
         if len(awake) and self._rigid_arrays is not None and self._rigid_arrays.count:
             self._find_contacts(awake)
             self._predict_impacted(awake)
         if self.count:
             self.impulses.solve(self.count, self.detection.counters)
-            self._reported = None
+            self._reported = self._touched = None
         else:
             self.impulses.warm_start.count[0] = 0
 
@@ -174,7 +175,9 @@ class ContactSolver:
     @property
     def touched_trees(self) -> tuple[tuple[int, str], ...]:
         """(tree, actor) for every tree that an actor pressed on in the last step, sorted."""
-        return tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
+        if self._touched is None:
+            self._touched = tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
+        return self._touched
 
     def _actor_and_link(self, other: int) -> tuple[str, str]:
         """Actor and link of the other side of a contact."""

@@ -57,8 +57,11 @@ class EffectiveMass:
         touched = np.zeros(m.ntree, bool)
         touched[m.dof_treeid[J.any(axis=0)]] = True
         if d.nefc and d.nisland:
-            islands = np.unique(d.tree_island[touched])
-            touched |= np.isin(d.tree_island, islands[islands >= 0])
+            island = d.tree_island
+            is_coupled = np.zeros(d.nisland + 1, bool)  # the last one stands for -1, trees without an island
+            is_coupled[island[touched]] = True
+            is_coupled[-1] = False
+            touched |= is_coupled[island]
         return np.flatnonzero(touched[m.dof_treeid])
 
 
@@ -80,7 +83,7 @@ class _Block:
         diagonal = d.qHDiagInv[self.dofs]
         if diagonal.all():
             H[self.row, self.column] = d.qH[self.entry]
-            np.fill_diagonal(H, 1.0)
+            H.ravel()[:: self.count + 1] = 1.0  # the diagonal
             H = H.T @ (H / diagonal[:, None])
         else:  # nothing is implicit in the whole world: MuJoCo leaves the factor unset, and M^ is M
             H[self.row, self.column] = H[self.column, self.row] = d.M[self.entry]

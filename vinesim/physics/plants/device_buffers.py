@@ -45,6 +45,16 @@ def find_device(name: str) -> wp.Device:
         ) from None
 
 
+def device_fault(name: str) -> str | None:
+    """Why a device cannot be used now, in words, or None if a number that was written there can be read."""
+    try:
+        find_device(name)
+        wp.ones(1, dtype=float, device=name).numpy()
+    except (DeviceUnavailable, RuntimeError) as fault:
+        return " ".join(str(fault).split())
+    return None
+
+
 class DeviceBuffers:
     """The arrays of one model on one device, by name.
 

@@ -33,6 +33,8 @@ class LevelOfDetail:
         self._points, self._radius = np.zeros((0, 3)), 0.0
         self._attached = -1
         self._worth = np.zeros(trees, bool)
+        self._rated_trees = self._clusters = self._first_cluster = np.zeros(0, np.int64)
+        """Trees of the last :meth:`_rate`, all their clusters, and where those of each tree begin."""
 
     def set_focus(self, points: np.ndarray, radius: float) -> None:
         """Look closely at what hangs within ``radius`` [m] of ``points`` [n, 3], until told otherwise; none: stop."""
@@ -58,12 +60,12 @@ class LevelOfDetail:
         fine = self.fine_trees
         if len(fine):
             self._wanted[wanted] = True
-            self._alone[fine] = np.where(self._wanted[fine], 0, self._alone[fine] + 1)
+            alone = self._alone[fine] = np.where(self._wanted[fine], 0, self._alone[fine] + 1)
             self._wanted[wanted] = False
-            self._still[fine] = np.where(self._rate(fine) < self.rest_rate, self._still[fine] + 1, 0)
-            done = fine[(self._alone[fine] > self.fine_steps) & (self._still[fine] >= self.rest_steps)]
-            if len(done):
-                plants.coarsen(done)
+            still = self._still[fine] = np.where(self._rate(fine) < self.rest_rate, self._still[fine] + 1, 0)
+            is_done = (alone > self.fine_steps) & (still >= self.rest_steps)
+            if is_done.any():
+                plants.coarsen(fine[is_done])
         fresh = wanted[~state.tree_fine[wanted]]
         if len(fresh):
             self._alone[fresh] = self._still[fresh] = 0
@@ -79,10 +81,12 @@ class LevelOfDetail:
 
     def _rate(self, trees: np.ndarray) -> np.ndarray:
         """The fastest cluster of each tree [k] rad/s, against what it hangs on."""
-        model = self.plants.model
-        core = model.tree_core[trees]
-        count = model.tree_size[trees] - core
-        start = np.cumsum(count) - count
-        clusters = np.repeat(model.tree_first[trees] + core - start, count) + np.arange(count.sum())
-        rate = self.plants.state.joint_qd[clusters]
-        return np.sqrt(np.maximum.reduceat((rate * rate).sum(1), start))
+        if not np.array_equal(trees, self._rated_trees):
+            model, self._rated_trees = self.plants.model, trees
+            core = model.tree_core[trees]
+            count = model.tree_size[trees] - core
+            self._first_cluster = np.cumsum(count) - count
+            first = np.repeat(model.tree_first[trees] + core - self._first_cluster, count)
+            self._clusters = first + np.arange(count.sum())
+        rate = self.plants.state.joint_qd[self._clusters]
+        return np.sqrt(np.maximum.reduceat((rate * rate).sum(1), self._first_cluster))

@@ -76,7 +76,9 @@ class RobotAccess(WorldCore):
         Force [N] and moment about the link's centre of mass [N m], world axes. :meth:`joint_measurements` counts them
         as contacts. Raises :class:`RobotError` if a link does not exist.
         """
-        self.robot(name).set_remote_wrenches(self.mj_data, wrenches)
+        robot = self.robot(name)
+        if wrenches or robot.remote_wrenches:
+            robot.set_remote_wrenches(self.mj_data, wrenches)
 
     # ------------------------------------------------------------------ joints and base
 

@@ -56,7 +56,8 @@ class SupportTracker:
         self._row_of_object: dict[int, int] = {}
         self._touching_pairs = np.zeros((0, 2), np.int64)
         """[k, 2] Row and MuJoCo body of all contacts of the last step."""
-        self._bands_before = np.zeros((0, 2))
+        self._bands_before = self._bands_on_ground = np.zeros((0, 2))
+        """[object, 2] m, rad: bands in the last step, and bands of objects that all rest on the ground."""
         self._touched: list[tuple[int, str]] | None = None
         self._rebuild_tables()
 
@@ -266,6 +267,8 @@ class SupportTracker:
 
     def _band_sizes(self) -> np.ndarray:
         """[object, 2] m, rad: how far each may move and turn within its band."""
+        if not self._support.any():
+            return self._bands_on_ground
         on = self._row_of_body[self._support]
         carried = self._kind_of_body[self._support] == _LINK
         shaken = (on >= 0) & ((np.minimum(self._still_steps, self._slow_steps)[on] < self._rest_steps) | carried[on])
@@ -347,7 +350,7 @@ class SupportTracker:
         self._still_steps = np.where(self.object_ids >= object_id(ObjectKind.BOX, 0), self._rest_steps, 0)
         self._slow_steps = self._still_steps.copy()
         self._touching_pairs, self._touched = np.zeros((0, 2), np.int64), None
-        self._bands_before = np.tile(STILL_BAND, (len(self.object_ids), 1))
+        self._bands_before = self._bands_on_ground = np.tile(STILL_BAND, (len(self.object_ids), 1))
         for number, (support, anchor, still, slow) in known.items():
             if number in self._row_of_object:
                 row = self._row_of_object[number]

@@ -54,7 +54,7 @@ class Limit:
 class Mimic:
     """Position = multiplier x that of another joint + offset."""
 
-    joint: str | None
+    joint: str
     multiplier: float
     offset: float
 
@@ -154,7 +154,7 @@ def _parse_joint(element: etree._Element) -> Joint:
         limit=None if limit is None else Limit(*(_number(limit, k) for k in ("effort", "velocity", "lower", "upper"))),
         mimic=None
         if mimic is None
-        else Mimic(mimic.get("joint"), float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))),
+        else Mimic(mimic.get("joint", ""), float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))),
     )
 
 

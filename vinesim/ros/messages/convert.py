@@ -11,10 +11,9 @@ import array
 import functools
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 
-import cv2
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -38,7 +37,7 @@ from vinesim.scene.camera_geometry import (
     write_points,
 )
 from vinesim.scene.ids import LABEL_STRIDE, Organ
-from vinesim.scene.values import CameraFrame, CameraInfo, Contact, JointSample, LidarScan, RobotSample
+from vinesim.scene.values import CameraFrame, CameraInfo, ComponentStatus, Contact, JointSample, LidarScan, RobotSample
 
 """One point of a depth camera's cloud; rgb is 0x00RRGGBB, which PointCloud2 carries as a float32 (PCL's way)."""
 
@@ -153,6 +152,8 @@ def label_map() -> String:
 
 def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
     """The picture as JPEG."""
+    import cv2  # here, as a process that sends no pictures should not load it
+
     encoded, data = cv2.imencode(".jpg", frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not encoded:
         raise ValueError(f"camera {frame.name}: could not encode a picture of shape {frame.rgb.shape}")
@@ -199,12 +200,18 @@ def lidar_cloud(scan: LidarScan) -> PointCloud2:
     return message
 
 
-def diagnostics(time: float, name: str, values: Mapping[str, object], healthy: bool) -> DiagnosticArray:
-    """Statistics of one component by name, and whether it is healthy."""
-    status = DiagnosticStatus(name=name, level=DiagnosticStatus.OK if healthy else DiagnosticStatus.WARN)
-    status.message = "well" if healthy else "behind"
-    status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-    return DiagnosticArray(header=header(time, ""), status=[status])
+_LEVELS = {"ok": DiagnosticStatus.OK, "warning": DiagnosticStatus.WARN, "error": DiagnosticStatus.ERROR}
+
+
+def diagnostics(time: float, prefix: str, components: Iterable[ComponentStatus]) -> DiagnosticArray:
+    """States of the components of a client; their names get the ``prefix``."""
+    statuses = []
+    for one in components:
+        values = [KeyValue(key=key, value=str(value)) for key, value in one.values.items()]
+        statuses.append(
+            DiagnosticStatus(name=f"{prefix}: {one.name}", level=_LEVELS[one.level], message=one.message, values=values)
+        )
+    return DiagnosticArray(header=header(time, ""), status=statuses)
 
 
 def base_velocity(message: TwistStamped) -> BaseVelocity:

@@ -15,7 +15,7 @@ class ClockPublisher:
     """/clock: one for each ROS domain, so its name is absolute under every namespace."""
 
     def __init__(self, advertise: Advertise) -> None:
-        self._topic = advertise(ClockMessage, "/clock", RELIABLE, high_priority=True)
+        self._topic = advertise(ClockMessage, "/clock", RELIABLE)
 
     def pending(self, time: float) -> Iterator[PendingMessage]:
         """The message of a simulation time [s]."""

@@ -39,10 +39,10 @@ class RobotPublisher:
         self._pairs: tuple[tuple[str, str], ...] | None = None
         self._transforms = SerializedTransforms([])
 
-        self._joints = advertise(JointState, "joint_states", RELIABLE, high_priority=True)
-        self._tf = advertise(tf_message, "tf", TRANSFORMS, high_priority=True)
-        self._odometry = advertise(Odometry, "mobile_base_controller/odom", RELIABLE, high_priority=True)
-        self._contacts = advertise(WrenchStamped, "vine/contacts", RELIABLE, high_priority=True)
+        self._joints = advertise(JointState, "joint_states", RELIABLE)
+        self._tf = advertise(tf_message, "tf", TRANSFORMS)
+        self._odometry = advertise(Odometry, "mobile_base_controller/odom", RELIABLE)
+        self._contacts = advertise(WrenchStamped, "vine/contacts", RELIABLE)
 
         advertise(String, "robot_description", TRANSIENT_LOCAL).send(String(data=urdf))
         static = SerializedTransforms([(parent, child) for child, (parent, _) in self._fixed.items()])

@@ -10,6 +10,7 @@ from vinesim.scene.values.network import HumanUpdate, ObjectUpdate, RobotUpdate,
 from vinesim.scene.values.rigid import Mesh, RigidVisual, Shape
 from vinesim.scene.values.robot import Drive, ElasticSample, Imu, JointSample, RobotSample, RobotSpec, Wrench
 from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
+from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "CameraFrame",
     "CameraInfo",
     "CameraOutput",
+    "ComponentStatus",
     "Contact",
     "Detachment",
     "Drive",

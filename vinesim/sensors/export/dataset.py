@@ -101,6 +101,7 @@ class DatasetPlan:
     snapshot_source: SnapshotSource | None = None
     """Actors and wind; without it all plants hang at rest."""
     renderer: str = "warp"
+    device: str = "cpu"
 
     def settings(self) -> dict[str, Any]:
         """All that decides what the images show, as JSON."""
@@ -112,6 +113,7 @@ class DatasetPlan:
             "camera": self.camera,
             "size": [info.width, info.height],
             "renderer": self.renderer,
+            "device": self.device.partition(":")[0],  # the same on each of several GPUs
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
         }
 
@@ -134,7 +136,7 @@ class VineyardRenderer:
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
         self.rest: Snapshot = rest_snapshot(self.model)
         self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
-        self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer)
+        self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer, device=plan.device)
         self.primitives.update(self.rest)
         self.caster = RayCaster(self.primitives)
         self.spec = CameraSpec.load(plan.camera)
@@ -147,7 +149,10 @@ class VineyardRenderer:
         snapshot, near, activity = self._pose_scene(image)
         seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
         truths = ground_truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
-        camera = Camera(self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image)
+        camera = Camera(
+            self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image,
+            device=self.plan.device,
+        )  # fmt: skip
         frame = camera.render(self.primitives, seen.pose)
         assert frame.exact_depth is not None
         bunches = formats.bunch_records(truths, self.info, self.ripeness.bunch)

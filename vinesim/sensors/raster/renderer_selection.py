@@ -16,24 +16,24 @@ class RendererUnavailable(ValueError):
     exit_code = 3
 
 
-def check_renderer(renderer: str) -> str:
-    """Its name, if it is known and installed; :class:`RendererUnavailable` in words if not."""
+def check_renderer(renderer: str, device: str = "cpu") -> str:
+    """Its name, if it is known, installed and draws on ``device``; :class:`RendererUnavailable` in words if not."""
     if renderer not in RENDERERS:
         raise RendererUnavailable(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
     if renderer != "warp" and importlib.util.find_spec("taichi") is None:
         raise RendererUnavailable(
             f"renderer {renderer!r}: Taichi is not installed; type: pip install 'vinesim[taichi]'"
         )
+    if renderer != "warp" and device != "cpu":
+        raise RendererUnavailable(
+            f"renderer {renderer!r} with device {device!r}: that is Warp's; leave one of the two out"
+        )
     return renderer
 
 
 def create_rasterizer(renderer: str, device: str) -> PrimitiveRasterizer | None:
     """The rasteriser of that name for primitives on ``device``; None for Warp's own on a CPU."""
-    if check_renderer(renderer) != "warp":
-        if device != "cpu":
-            raise RendererUnavailable(
-                f"renderer {renderer!r} with device {device!r}: that is Warp's; leave one of the two out"
-            )
+    if check_renderer(renderer, device) != "warp":
         from vinesim.sensors.raster.taichi_rasterizer import TaichiRasterizer
 
         try:

@@ -1,0 +1,81 @@
+"""``vinesim render``: one viewpoint or many, and every way in which they can be wrong."""
+
+from __future__ import annotations
+
+import pathlib
+
+import msgspec
+import pytest
+
+from vinesim.cli.render import run
+from vinesim.errors import UsageError
+
+HEADER = "x,y,z,look_x,look_y,look_z\n"
+
+
+def render(out: pathlib.Path, **options: object) -> int:
+    defaults = {"at": None, "look": None, "camera": "pinhole", "size": "160x120", "seed": None, "out": out}
+    return run("demo", **defaults | options)  # type: ignore[arg-type]
+
+
+def files(folder: pathlib.Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
+
+
+@pytest.mark.parametrize("kind", ["csv", "json"])
+def test_each_viewpoint_of_a_path_gives_the_picture_that_it_gives_alone(kind: str, tmp_path: pathlib.Path) -> None:
+    points = [(0.4, 1.2, 1.3, 3.0, 1.0, 1.7), (1.0, 1.3, 1.2, 3.0, 1.0, 1.7), (0.4, 1.2, 1.3, 3.0, 1.0, 1.7)]
+    path = tmp_path / f"tour.{kind}"
+    if kind == "csv":
+        path.write_text(HEADER + "".join(",".join(map(str, p)) + "\n" for p in points))
+    else:
+        names = HEADER.strip().split(",")
+        path.write_bytes(msgspec.json.encode([dict(zip(names, p, strict=True)) for p in points]))
+    assert render(tmp_path / "tour", path=path) == 0
+    assert sorted(f.name for f in (tmp_path / "tour").iterdir()) == ["0000", "0001", "0002"]
+    for number, point in enumerate(points[:2]):
+        at, look = (",".join(map(str, part)) for part in (point[:3], point[3:]))
+        render(tmp_path / "alone", at=at, look=look)
+        assert files(tmp_path / "tour" / f"{number:04d}") == files(tmp_path / "alone")
+    assert files(tmp_path / "tour" / "0000") == files(tmp_path / "tour" / "0002")
+    assert files(tmp_path / "tour" / "0000") != files(tmp_path / "tour" / "0001")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (HEADER, "no viewpoint"),
+        ("x,y,z\n1,2,3\n", "KeyError 'look_x'"),
+        (HEADER + "1,2,three,4,5,6\n", "three"),
+        (HEADER + "1,2\n", "columns x, y, z"),
+        (HEADER + "1,2,1.5,1,2,1.5\n", "viewpoint 0 looks at where the camera stands"),
+        (HEADER + "0,0.5,1,2,2,1\n1,2,-1.5,1,2,1.5\n", "viewpoint 1 lies in the ground"),
+        (HEADER + "nan,2,1,1,2,1.5\n", "position [nan, 2.0, 1.0]"),
+    ],
+)
+def test_a_wrong_path_is_named_before_anything_is_rendered(text: str, words: str, tmp_path: pathlib.Path) -> None:
+    path = tmp_path / "tour.csv"
+    path.write_text(text)
+    with pytest.raises(UsageError) as caught:
+        render(tmp_path / "out", path=path)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_viewpoint_is_needed_and_only_once(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(UsageError, match="no viewpoint; give --at"):
+        render(tmp_path, at="1,1,1")
+    with pytest.raises(UsageError, match="leave out --at and --look"):
+        render(tmp_path, at="1,1,1", path=tmp_path / "tour.csv")
+    with pytest.raises(UsageError, match=r"tour\.json cannot be read: No such file"):
+        render(tmp_path, path=tmp_path / "tour.json")
+    (tmp_path / "tour.json").write_text('{"x": 1}')
+    with pytest.raises(UsageError, match=r"tour\.json: TypeError"):
+        render(tmp_path, path=tmp_path / "tour.json")
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match=r"--out .* cannot be written: Not a directory"):
+        render(tmp_path / "file" / "out", at="0.4,1.2,1.3", look="3,1,1.7")

@@ -1,0 +1,141 @@
+"""The sensor process of a robot: its pictures continue when actors join and when processes fail."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+import pytest
+import warp as wp
+
+from tests.support.contact_scenes import cane
+from tests.support.waiting import wait
+from vinesim import frames
+from vinesim.client.client import Client
+from vinesim.client.sensing import worker_process
+from vinesim.client.sensing.sensor_process import SensorProcess
+from vinesim.client.sensing.worker_process import WorkerError
+from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.robot.description.loader import load_description
+from vinesim.scene.builder import assemble
+from vinesim.scene.spec import load_scene
+from vinesim.scene.values import HumanSpec
+
+CAMERA = "head_front_camera"
+
+
+class Robot:
+    """A client with one vinebot far from a single cane, and its sensor process."""
+
+    def __init__(self, device: str = "cpu") -> None:
+        scene, vinebot = load_scene("demo"), load_description("vinebot")
+        model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+        self.hub = MemoryHub()
+        self.sensors = SensorProcess("robot", scene, model, vinebot, ros=False, keep_pictures=True, device=device)
+        self.client = Client(scene, model, vinebot, self.hub.bus("robot"), name="robot", pose=spawn_pose(scene, 0))
+
+    def frames(self) -> int:
+        """Pictures so far."""
+        return self.sensors.report()["frames"].get(CAMERA, 0)
+
+    def run_until(self, condition: Callable[[], object], description: str) -> None:
+        """Step about as fast as in real time until ``condition`` holds."""
+        wait(lambda: (self.client.tick(), time.sleep(0.003), condition())[-1], description)
+
+    def run_for_pictures(self, count: int) -> None:
+        """Step until so many pictures more have been rendered."""
+        seen = self.frames()
+        self.run_until(lambda: self.frames() >= seen + count, f"{count} pictures")
+
+    def add_human(self, name: str) -> None:
+        pose = frames.pose(np.array([1.0, 1.0, 0.0]))
+        self.client.add_human(HumanSpec(name, 7, standing_pose(pose, 1.75), 1.75), None, self.hub.bus(name))
+
+    def kill_sensors(self) -> None:
+        os.kill(self.sensors.worker.current().process.pid, signal.SIGKILL)
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    one = Robot()
+    with one.sensors:
+        one.sensors.attach(one.client)
+        yield one
+
+
+@pytest.mark.skipif(wp.get_cuda_device_count() > 0, reason="needs a GPU that is gone")
+def test_sensors_whose_gpu_is_gone_compute_on_the_cpu_and_the_report_says_so():
+    """What the restarted process of a robot meets whose GPU was lost in mid-run."""
+    lost = Robot(device="cuda:0")
+    with lost.sensors:
+        lost.sensors.attach(lost.client)
+        lost.run_for_pictures(1)
+        assert lost.sensors.report()["sensor_device"] == "cpu"
+
+
+def test_a_body_that_joins_while_a_list_is_on_its_way_does_not_end_the_pictures(robot):
+    """The list of bodies changes after a snapshot with the old list has left and before the process has read it."""
+    robot.run_for_pictures(1)
+    process = robot.sensors.worker.current().process
+    os.kill(process.pid, signal.SIGSTOP)
+    for name in ("anna", "bert", "carl"):
+        robot.client.tick()
+        robot.client.tick()  # a snapshot with the former list has left
+        robot.add_human(name)
+    os.kill(process.pid, signal.SIGCONT)
+    robot.run_for_pictures(3)
+    assert robot.sensors.report()["sensor_restarts"] == 0
+
+
+def test_a_killed_process_is_started_again(robot, caplog):
+    caplog.set_level(logging.WARNING)
+    robot.run_for_pictures(1)
+    assert robot.sensors.awaited() == []
+    robot.kill_sensors()
+    robot.run_until(lambda: robot.sensors.report()["sensor_restarts"] == 1, "a restart")
+    robot.run_until(lambda: not robot.sensors.awaited(), "sensors that are ready again")
+    robot.run_for_pictures(3)
+    assert [r.message for r in caplog.records] == [
+        "the sensor process of robot failed: it ended with exit code -9; starting it again"
+    ]
+
+
+def test_repeated_failures_are_logged_twice_and_counted(robot, caplog, monkeypatch):
+    monkeypatch.setattr(worker_process, "LONGEST_PAUSE", 0.0)
+    caplog.set_level(logging.WARNING)
+    for count in range(1, 4):
+        robot.run_until(lambda: not robot.sensors.awaited(), "sensors that are ready")
+        robot.kill_sensors()
+        robot.run_until(lambda count=count: robot.sensors.report()["sensor_restarts"] == count, "a restart")
+    assert [record.levelname for record in caplog.records] == ["WARNING", "ERROR"]
+
+
+def test_a_fault_in_the_process_does_not_end_the_loop(robot, caplog):
+    robot.run_for_pictures(1)
+    robot.sensors.worker.send("save", 3)  # not a folder
+    robot.run_until(lambda: robot.sensors.report()["sensor_restarts"] == 1, "a restart")
+    robot.run_for_pictures(1)
+    assert "TypeError" in caplog.text
+
+
+def test_a_process_that_cannot_start_is_an_error_in_one_line(tmp_path):
+    scene, vinebot = load_scene("demo"), load_description("vinebot")
+    model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+    client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
+    with SensorProcess("robot", scene, model, vinebot, ros=False, renderer="pencil") as sensors:
+        with pytest.raises(WorkerError, match=r"the sensor process of robot failed: .*pencil") as caught:
+            sensors.attach(client)
+        assert "\n" not in str(caught.value)
+
+
+def test_the_kept_picture_is_written(robot, tmp_path):
+    robot.run_for_pictures(1)
+    robot.sensors.save_picture(tmp_path)
+    assert cv2.imread(str(tmp_path / "rgb.png")).std() > 10.0

@@ -1,0 +1,123 @@
+"""The processes of one robot of the client: its sensors, and its ROS node if ROS 2 can be used."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import logging
+import pathlib
+from typing import Any, Self
+
+from vinesim.client.client import Client
+from vinesim.client.sensing.ros_process import RosProcess
+from vinesim.client.sensing.sensor_process import SensorProcess
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.ros import middleware
+from vinesim.scene.model import Model
+from vinesim.scene.spec import Scene
+from vinesim.scene.values import ComponentStatus
+
+log = logging.getLogger(__name__)
+
+_LOOP_VALUES = ("tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "bytes_in", "bytes_out")
+"""Values of a client's status that /diagnostics shows."""
+
+
+class RobotProcesses:
+    """Starts the processes of one robot; a context: they end with it."""
+
+    def __init__(
+        self, name: str, scene: Scene, model: Model, description: RobotDescription, *, namespace: str = "",
+        ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
+        renderer: str = "warp", device: str = "cpu",
+    ) -> None:  # fmt: skip
+        """``clock``: publish /clock; a ROS domain has one. For the others see :class:`SensorProcess`."""
+        if ros and (reason := middleware.unavailable_reason()) is not None:
+            log.warning("running without ROS 2: %s", reason)
+            ros = False
+        with contextlib.ExitStack() as stack:
+            self.sensors = stack.enter_context(
+                SensorProcess(
+                    name, scene, model, description, namespace=namespace, ros=ros, keep_pictures=keep_pictures,
+                    sensor_hz=sensor_hz, renderer=renderer, device=device,
+                )
+            )  # fmt: skip
+            self.ros = (
+                stack.enter_context(RosProcess(name, model, description, namespace=namespace, clock=clock))
+                if ros
+                else None
+            )
+            self._stack = stack.pop_all()
+
+    def attach(self, client: Client, robot: Robot | None = None) -> None:
+        """Connect the processes with a robot of the client, its first unless given; waits until they are ready."""
+        self.sensors.attach(client, robot)
+        if self.ros is not None:
+            self.ros.attach(client, robot)
+
+    def sent_messages(self) -> dict[str, int]:
+        """ROS messages sent so far, by topic."""
+        return self.sensors.sent_messages() | ({} if self.ros is None else self.ros.sent_messages())
+
+    def dropped_messages(self) -> dict[str, int]:
+        """ROS messages that had subscribers and were not sent, by topic; topics that lost none are left out."""
+        dropped = collections.Counter(self.sensors.dropped_messages())
+        if self.ros is not None:
+            dropped.update(self.ros.dropped_messages())
+        return {topic: count for topic, count in sorted(dropped.items()) if count}
+
+    def awaited(self) -> list[str]:
+        """What has to be done before pictures and messages are sent."""
+        ros = [] if self.ros is None or self.ros.worker.is_ready else [f"{self.sensors.name}: ROS node"]
+        return self.sensors.awaited() + ros
+
+    def status(self) -> dict[str, Any]:
+        """Whether the sensors are ready, and what was lost so far; for the status of a client."""
+        report, awaited = self.sensors.report(), self.awaited()
+        return {
+            "sensors_ready": not awaited,
+            "sensors_awaited": awaited,
+            "frames_dropped": sum(report["frames_dropped"].values()),
+            "messages_dropped": sum(self.dropped_messages().values()),
+            "sensor_restarts": report["sensor_restarts"],
+            "ros_restarts": 0 if self.ros is None else self.ros.worker.restarts,
+        }
+
+    def report(self) -> dict[str, Any]:
+        """Everything that was counted, by sensor and topic."""
+        restarts = 0 if self.ros is None else self.ros.worker.restarts
+        return self.sensors.report() | {"ros_dropped": self.dropped_messages(), "ros_restarts": restarts}
+
+    def publish_diagnostics(self, status: dict[str, Any]) -> None:
+        """Publish a client's status on /diagnostics, with that of the sensors."""
+        if self.ros is None:
+            return
+        is_behind = status["real_time_factor"] <= 0.99
+        loop = {key: status[key] for key in _LOOP_VALUES}
+        report, awaited = self.report(), self.sensors.awaited()
+        self.ros.publish_diagnostics(
+            status["time"],
+            [
+                ComponentStatus(
+                    "simulation", "warning" if is_behind else "ok", "behind" if is_behind else "well", loop
+                ),
+                ComponentStatus(
+                    "sensors", "error" if awaited else "ok", f"not ready: {awaited[0]}" if awaited else "well", report
+                ),
+            ],
+        )
+
+    def save_picture(self, folder: pathlib.Path) -> None:
+        """Write the kept picture; see :meth:`SensorProcess.save_picture`."""
+        self.sensors.save_picture(folder)
+
+    def close(self) -> None:
+        """End the processes."""
+        self._stack.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        self._stack.__exit__(*exception)

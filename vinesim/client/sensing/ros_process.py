@@ -1,0 +1,136 @@
+"""The client's side of a robot's ROS process: it passes the robot's state of every step, and takes commands."""
+
+from __future__ import annotations
+
+import collections
+import types
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.client.client import Client
+from vinesim.client.sensing.ros_worker import STEP_TOPICS, RosChannel, RosConfig, run_ros_worker
+from vinesim.client.sensing.step_record import StepRecords
+from vinesim.client.sensing.worker_process import WorkerProcess
+from vinesim.client.tasks.ros_command_handler import RosCommandHandler
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.ros.commands.types import Command
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import ComponentStatus
+
+START_TIMEOUT = 120.0
+"""How long the process may take to start; a first run builds message packages [s]."""
+TRUTH_PERIOD = 10
+"""Ticks between two messages of true poses: 10 Hz."""
+
+
+class RosProcess:
+    """The ROS node of one robot of the client, in a process of its own. A context: the process ends with it."""
+
+    def __init__(
+        self, name: str, model: Model, description: RobotDescription, *, namespace: str = "", clock: bool = True
+    ) -> None:
+        """Starts the process; :meth:`attach` connects it with a client. ``clock``: publish /clock."""
+        self._model = model
+        self._commands: collections.deque[Command] = collections.deque()
+        self._sent: dict[str, int] = {}
+        self._dropped: dict[str, int] = {}
+        self._sent_before: collections.Counter[str] = collections.Counter()
+        self._dropped_before: collections.Counter[str] = collections.Counter()
+        """Counts of the runs of the process before this one."""
+        self._lost = np.zeros(len(STEP_TOPICS), np.int64)
+        """[topic] messages of steps that found no room on the way to the process."""
+        self._contacts_left_out = 0
+        self._missed_truth = 0
+        poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
+        fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
+        self._records = StepRecords(name, description)
+        config = RosConfig(
+            name, description.urdf, description.base, namespace, clock, tuple((p, c, q) for (p, c), q in fixed),
+            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
+        )  # fmt: skip
+        self.worker = WorkerProcess(
+            f"the ROS process of {name}", run_ros_worker, config, lambda context: RosChannel(config, context),
+            self._receive,
+        )  # fmt: skip
+
+    def attach(self, client: Client, robot: Robot | None = None) -> None:
+        """Publish a robot of the client from now on, the first unless ``robot`` is given, and obey its commands.
+
+        Waits until the process is ready; :class:`WorkerError` if it fails.
+        """
+        self.client, self.robot = client, robot or client.robot
+        self.worker.wait_until_ready(START_TIMEOUT)
+        client.post_step.append(self._after_step)
+        client.pre_step.insert(0, RosCommandHandler(self.robot, self._take_commands))
+
+    # ------------------------------------------------------------------ in the loop
+
+    def _after_step(self, client: Client) -> None:
+        """Pass the state to the process, as far as its topics have subscribers."""
+        physics, channel = client.physics, self.worker.current().shared
+        wanted = channel.wanted["steps"]
+        if wanted.any():
+            has_state = wanted[1:].any()
+            sample = self.robot.sample(physics.time, physics.contacts) if has_state else None
+            with channel.steps.put() as record:
+                if record is None:
+                    self._lost += wanted
+                    if sample is None or not sample.contacts:
+                        self._lost[-1] -= wanted[-1]
+                else:
+                    self._contacts_left_out += self._records.write(record, physics.time, sample)
+        if physics.tick % TRUTH_PERIOD == 0 and channel.wanted["truth"][0]:
+            physics.update_kinematics()
+            with channel.truth.writing() as truth:
+                if truth is None:
+                    self._missed_truth += 1
+                else:
+                    truth["time"][0] = physics.time
+                    truth["attached"][:] = physics.state.bunch_attached
+                    truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
+
+    def _take_commands(self) -> list[Command]:
+        return [self._commands.popleft() for _ in range(len(self._commands))]
+
+    # ------------------------------------------------------------------ outside the loop
+
+    def _receive(self, kind: str, value: Any) -> None:
+        """Take a message of the process; in a thread."""
+        if kind == "commands":
+            self._commands.extend(value)
+        elif kind == "statistics":
+            if any(value["sent"].get(topic, 0) < count for topic, count in self._sent.items()):  # a new run
+                self._sent_before.update(self._sent)
+                self._dropped_before.update(self._dropped)
+            self._sent, self._dropped = value["sent"], value["dropped"]
+
+    def sent_messages(self) -> dict[str, int]:
+        """Messages sent so far, by topic."""
+        return {topic: count + self._sent_before[topic] for topic, count in self._sent.items()}
+
+    def dropped_messages(self) -> dict[str, int]:
+        """Messages that had subscribers and were not sent, by topic."""
+        dropped = collections.Counter(self._dropped) + self._dropped_before
+        dropped.update(dict(zip(STEP_TOPICS, self._lost.tolist(), strict=True)))
+        dropped["vine/contacts"] += self._contacts_left_out
+        dropped["tf_environment"] += self._missed_truth
+        return dict(dropped)
+
+    def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
+        """Publish states of parts of the client on /diagnostics at simulation time ``time`` [s]."""
+        self.worker.send("diagnose", (time, list(components)))
+
+    def close(self) -> None:
+        """End the process."""
+        self.worker.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: types.TracebackType | type[BaseException] | BaseException | None) -> None:
+        self.close()

@@ -1,0 +1,162 @@
+"""The ROS process of one robot: publishes its state, the ground truth and diagnostics, and takes commands.
+
+It renders nothing and imports neither Warp nor the renderer, so that it starts at once, needs little memory, and keeps
+the rate of the topics of every step whatever the sensors do.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+import signal
+import sys
+import time
+from multiprocessing.connection import Connection
+from multiprocessing.context import BaseContext
+from typing import Any
+
+import numpy as np
+
+from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
+from vinesim.client.sensing.shared_queue import SharedQueue
+from vinesim.client.sensing.step_record import StepRecords
+from vinesim.ros.names import ros_name
+
+log = logging.getLogger(__name__)
+
+STEP_TOPICS = ("/clock", "joint_states", "tf", "mobile_base_controller/odom", "vine/contacts")
+"""Topics with a message for every step."""
+TRUTH_TOPIC = "tf_environment"
+QUEUE_CAPACITY = 100
+"""Steps that may wait for the process, a second of them; later ones are lost, and counted."""
+STATISTICS_PERIOD = 0.2
+"""Wall time between two reports to the client [s]."""
+POLL_PERIOD = 0.02
+"""Longest time without a look at commands and requests [s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RosConfig:
+    """What the process needs to start: plain values only, so that it imports nothing large."""
+
+    name: str
+    """The robot's."""
+    urdf: str
+    base: str
+    namespace: str
+    """Prefix of its topics."""
+    clock: bool
+    """Whether the node publishes /clock."""
+    static_transforms: tuple[tuple[str, str, np.ndarray], ...]
+    poles: np.ndarray
+    """Poses [pole, 7] m, 1."""
+    records: StepRecords
+    bunch_count: int
+
+
+class RosChannel:
+    """What the client and the process share."""
+
+    def __init__(self, config: RosConfig, context: BaseContext) -> None:
+        self.steps = SharedQueue(config.records.dtype, QUEUE_CAPACITY, context)
+        self.truth = SharedSnapshot(
+            {
+                "time": ((1,), "f8"), "attached": ((config.bunch_count,), "?"),
+                "bunch_q": ((config.bunch_count, 7), "f4"),
+            },
+            context,
+        )  # fmt: skip
+        self.wanted = SharedArrays({"steps": ((len(STEP_TOPICS),), "?"), "truth": ((1,), "?")})
+        """Whether topics have subscribers, written by the process."""
+
+    def close(self) -> None:
+        """Release the memory."""
+        for part in (self.steps, self.truth, self.wanted):
+            part.close()
+
+
+def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
+    """Entry of the process: publish until told to stop, or until the client's process has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    code = 0
+    try:
+        RosWorker(config, channel, pipe).run()
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass  # the client is gone
+    except Exception as error:
+        log.exception("the ROS process failed")
+        pipe.send(("failed", f"{type(error).__name__}: {error}"))
+        code = 1
+    # Taking the interpreter down in order would only delay the client, which waits.
+    logging.shutdown()
+    sys.stdout.flush()
+    os._exit(code)
+
+
+class RosWorker:
+    """The robot's ROS node, fed with the records of steps."""
+
+    def __init__(self, config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
+        from vinesim.ros import middleware
+        from vinesim.ros.robot_node import RobotNode
+
+        middleware.configure(large_messages=False)
+        self.config, self.channel, self.pipe = config, channel, pipe
+        self.node = RobotNode(
+            ros_name(config.name), config.urdf, namespace=config.namespace, static_transforms=config.static_transforms,
+            base=config.base, clock=config.clock,
+        )  # fmt: skip
+        poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
+        self.node.publish_environment_static(poles, config.poles)
+        self._step_topics = [name if config.clock or name != "/clock" else None for name in STEP_TOPICS]
+        self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
+        self._attached_names = self._bunch_names
+        self._next_statistics = 0.0
+
+    def run(self) -> None:
+        """Publish until a "stop"."""
+        self.pipe.send(("ready", None))
+        with self.node:
+            while self._take_requests():
+                record = self.channel.steps.take(POLL_PERIOD)
+                if record is not None:
+                    self.node.publish_clock(float(record["time"]))
+                    if record["has_state"]:
+                        self.node.publish_robot_state(self.config.records.read(record))
+                if self.channel.truth.wait(0.0):
+                    self._publish_truth()
+                if commands := self.node.commands():
+                    self.pipe.send(("commands", commands))
+                self._report()
+
+    def _take_requests(self) -> bool:
+        """Answer the client's requests; False after a "stop"."""
+        while self.pipe.poll():
+            kind, value = self.pipe.recv()
+            if kind == "stop":
+                return False
+            if kind == "diagnose":
+                self.node.publish_diagnostics(*value)
+        return True
+
+    def _publish_truth(self) -> None:
+        """True poses of the bunches that hang on their plants."""
+        with self.channel.truth.reading() as truth:
+            now, attached = float(truth["time"][0]), np.flatnonzero(truth["attached"])
+            poses = truth["bunch_q"][attached].astype(float)
+        if len(attached) != len(self._attached_names):
+            self._attached_names = tuple(self._bunch_names[i] for i in attached)
+        self.node.publish_environment(now, self._attached_names, poses)
+
+    def _report(self) -> None:
+        """Tell the client what is subscribed to, and now and then what was sent."""
+        wanted = self.channel.wanted
+        wanted["steps"][:] = [name is not None and self.node.has_subscribers(name) for name in self._step_topics]
+        wanted["truth"][0] = self.node.has_subscribers(TRUTH_TOPIC)
+        now = time.monotonic()
+        if now >= self._next_statistics:
+            self._next_statistics = now + STATISTICS_PERIOD
+            statistics: dict[str, Any] = {"sent": self.node.sent, "dropped": self.node.dropped}
+            self.pipe.send(("statistics", statistics))

@@ -1,0 +1,55 @@
+"""A queue of records in shared memory, from one process to another: none is replaced, each lost one is counted."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from multiprocessing.context import BaseContext
+from typing import Any
+
+import numpy as np
+
+from vinesim.client.sensing.shared_arrays import SharedArrays
+
+
+class SharedQueue:
+    """One writer, one reader, and room for ``capacity`` records of one structured type. The writer never waits."""
+
+    def __init__(self, record: np.dtype, capacity: int, context: BaseContext) -> None:
+        self.lost = 0
+        """Records that found no room."""
+        self._capacity = capacity
+        self._memory = SharedArrays({"records": ((capacity,), record)})
+        self._free = context.Semaphore(capacity)
+        self._filled = context.Semaphore(0)
+        self._next = 0
+
+    @contextlib.contextmanager
+    def put(self) -> Iterator[Any | None]:
+        """The record to fill, which is sent when the block is left; None if there is no room, which is counted."""
+        if not self._free.acquire(block=False):
+            self.lost += 1
+            yield None
+            return
+        try:
+            yield self._memory["records"][self._next]
+        except BaseException:
+            self._free.release()
+            raise
+        self._next = (self._next + 1) % self._capacity
+        self._filled.release()
+
+    def take(self, timeout: float) -> Any | None:
+        """The oldest record, a copy; waits up to ``timeout`` [s] for one, then None."""
+        if not self._filled.acquire(timeout=timeout):
+            return None
+        record = self._memory["records"][self._next].copy()
+        self._next = (self._next + 1) % self._capacity
+        self._free.release()
+        return record
+
+    def close(self) -> None:
+        """Release the memory and the semaphores; a second call does nothing."""
+        self._memory.close()
+        self.__dict__.pop("_free", None)  # a semaphore is freed with the last reference to it
+        self.__dict__.pop("_filled", None)

@@ -1,0 +1,199 @@
+"""A child process of the client that is started again when it fails or dies, and never ends the client's loop.
+
+Its threads here start it, send it messages and take its messages, so that the loop never waits for it. What the two
+share in memory is made anew for every run of the process: a process that dies while it holds a lock leaves no trace.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import queue
+import threading
+import time
+from collections.abc import Callable
+from multiprocessing import connection
+from multiprocessing.context import BaseContext
+from typing import Any, Generic, Protocol, TypeVar
+
+log = logging.getLogger(__name__)
+
+EXIT_TIMEOUT = 1.2
+"""How long a process may take to end [s]."""
+STABLE_TIME = 60.0
+"""A process that ran this long before it failed is started again at once [s]; else there is a pause before."""
+LONGEST_PAUSE = 60.0
+"""Pauses double with every failure, up to this [s]."""
+
+
+class WorkerError(RuntimeError):
+    """A process of the client could not start; the text says why."""
+
+    exit_code = 3
+
+
+class Shared(Protocol):
+    """What the client and one run of the process share in memory."""
+
+    def close(self) -> None: ...
+
+
+S = TypeVar("S", bound=Shared)
+
+
+class Run(Generic[S]):
+    """One run of the process, from its start to its end."""
+
+    def __init__(self, title: str, target: Callable[..., None], config: Any, shared: S, context: BaseContext) -> None:
+        self.shared = shared
+        self.pipe, worker_end = context.Pipe()
+        self.ready_since: float | None = None
+        """Time at which the process was ready [s]."""
+        # BaseContext lacks Process in its annotations, every context has it
+        self.process = context.Process(target=target, args=(config, shared, worker_end), name=title, daemon=True)  # type: ignore[attr-defined]
+        self.process.start()
+        worker_end.close()
+        self._outgoing: queue.SimpleQueue[tuple[str, Any] | None] = queue.SimpleQueue()
+        threading.Thread(target=self._send, name=f"to {title}", daemon=True).start()
+
+    def send(self, kind: str, value: Any = None) -> None:
+        """Send a message in order; a thread packs and writes it."""
+        self._outgoing.put((kind, value))
+
+    def _send(self) -> None:
+        with contextlib.suppress(OSError):
+            while (message := self._outgoing.get()) is not None:
+                self.pipe.send(message)
+
+    def end(self) -> None:
+        """Release what is left of a process that ends or should have; only the supervising thread may wait for it."""
+        self._outgoing.put(None)
+        self.process.join(EXIT_TIMEOUT)
+        if self.process.is_alive():
+            self.process.kill()
+            self.process.join()
+        self.pipe.close()
+
+
+class WorkerProcess(Generic[S]):
+    """Keeps one process running. ``title`` names it in messages: "the sensor process of picker".
+
+    ``target(config, shared, pipe)`` runs in the process; it sends ("ready", None) when it is, ("failed", text) before
+    it ends with an error, and ends at ("stop", None) or when the pipe is closed. ``share(context)`` makes what is
+    shared with one run. ``receive(kind, value)`` takes all other messages, in a thread.
+    """
+
+    def __init__(
+        self, title: str, target: Callable[..., None], config: Any, share: Callable[[BaseContext], S],
+        receive: Callable[[str, Any], None],
+    ) -> None:  # fmt: skip
+        self.title = title
+        self.restarts = 0
+        """How often the process was started again."""
+        self._target, self._config, self._share, self._receive = target, config, share, receive
+        self._context = multiprocessing.get_context("spawn")
+        self._closing = threading.Event()
+        self._first_result = threading.Event()
+        self._failure = ""
+        """Why the first run failed before it was ready."""
+        self._newest = self._current = self._start()
+        self._thread = threading.Thread(target=self._supervise, name=f"supervisor of {title}", daemon=True)
+        self._thread.start()
+
+    # ------------------------------------------------------------------ for the loop
+
+    def current(self) -> Run[S]:
+        """The run to share memory with; call it in one thread only, as memory of a former run is released here."""
+        if self._newest is not self._current:
+            former, self._current = self._current, self._newest
+            former.shared.close()
+        return self._current
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether the process is ready now."""
+        return self._newest.ready_since is not None
+
+    # ------------------------------------------------------------------ outside the loop
+
+    def wait_until_ready(self, timeout: float) -> None:
+        """Wait for the first run to be ready; :class:`WorkerError` if it fails, or after ``timeout`` [s]."""
+        if not self._first_result.wait(timeout):
+            raise WorkerError(f"{self.title} was not ready within {timeout:.0f} s")
+        if self._failure:
+            raise WorkerError(f"{self.title} failed: {self._failure}")
+
+    def send(self, kind: str, value: Any = None) -> None:
+        """Send a message to the newest run."""
+        self._newest.send(kind, value)
+
+    def close(self) -> None:
+        """End the process; a second call does nothing."""
+        if self._closing.is_set():
+            return
+        was_ready = self.is_ready
+        self._closing.set()
+        self._newest.send("stop")
+        self._thread.join(EXIT_TIMEOUT if was_ready else 0.0)
+        if self._thread.is_alive() and was_ready:
+            log.warning("%s did not end by itself", self.title)
+        while self._thread.is_alive():
+            self._newest.process.kill()
+            self._thread.join(0.05)
+        self._current.shared.close()
+        self._newest.shared.close()
+
+    # ------------------------------------------------------------------ the supervising thread
+
+    def _start(self) -> Run[S]:
+        return Run(self.title, self._target, self._config, self._share(self._context), self._context)
+
+    def _supervise(self) -> None:
+        failures = 0
+        while True:
+            run = self._newest
+            reason = self._serve(run)
+            was_ready, run.ready_since = run.ready_since, None
+            run.end()
+            if self._closing.is_set():
+                return
+            if not self._first_result.is_set():
+                self._failure = reason
+                self._first_result.set()
+                return
+            is_stable = was_ready is not None and time.monotonic() - was_ready > STABLE_TIME
+            failures = 1 if is_stable else failures + 1
+            pause = min(2.0 ** (failures - 2), LONGEST_PAUSE) if failures > 1 else 0.0
+            self._log_failure(failures, reason)
+            if self._closing.wait(pause):
+                return
+            self.restarts += 1
+            self._newest = self._start()
+
+    def _log_failure(self, failures: int, reason: str) -> None:
+        if failures == 1:
+            log.warning("%s failed: %s; starting it again", self.title, reason)
+        elif failures == 2:
+            log.error("%s failed again: %s; further attempts follow without a message", self.title, reason)
+
+    def _serve(self, run: Run[S]) -> str:
+        """Take the messages of a run until it ends; why it did."""
+        reason = ""
+        while True:
+            connection.wait([run.pipe, run.process.sentinel])
+            try:
+                while run.pipe.poll():
+                    kind, value = run.pipe.recv()
+                    if kind == "ready":
+                        run.ready_since = time.monotonic()
+                        self._first_result.set()
+                    elif kind == "failed":
+                        reason = value
+                    else:
+                        self._receive(kind, value)
+            except (EOFError, OSError):
+                run.process.join(EXIT_TIMEOUT)
+                return reason or f"it ended with exit code {run.process.exitcode}"
+            if not run.process.is_alive():
+                return reason or f"it ended with exit code {run.process.exitcode}"

@@ -1,0 +1,94 @@
+"""The ROS 2 node of a robot: state, transforms, ground truth, diagnostics and commands; everything but its pictures.
+
+Every message is built and sent by the thread that passes its values, in order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+
+from vinesim.ros.commands.subscriptions import CommandSubscriptions
+from vinesim.ros.commands.types import Command
+from vinesim.ros.messages import convert, message_packages
+from vinesim.ros.node import Node
+from vinesim.ros.publishers.clock import ClockPublisher
+from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
+from vinesim.ros.publishers.robot import RobotPublisher
+from vinesim.ros.topic import RELIABLE, PendingMessage
+from vinesim.scene.values import ComponentStatus, RobotSample
+
+TRAJECTORY_CONTROLLERS = ("arm_left_controller", "arm_right_controller", "torso_controller", "head_controller")
+"""Names of the controllers that take joint trajectories, as vinebot has them."""
+
+
+class RobotNode(Node):
+    """One robot's topics but those of its cameras and lidars (:mod:`vinesim.ros.sensor_node`).
+
+    ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``controllers`` those that take
+    trajectories. All topics but /clock stand under the namespace, tf too (as Nav2 does with several robots); a second
+    robot of a ROS domain should be made with ``clock=False``.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        urdf: str,
+        *,
+        namespace: str = "",
+        static_transforms: Sequence[tuple[str, str, np.ndarray]] = (),
+        controllers: Sequence[str] = TRAJECTORY_CONTROLLERS,
+        base: str = "base_footprint",
+        clock: bool = True,
+    ) -> None:
+        message_packages.ensure_importable(["tf2_msgs"])
+        self._urdf, self._static_transforms, self._base = urdf, static_transforms, base
+        self._has_clock, self._controllers = clock, controllers
+        super().__init__(name, namespace, controllers)
+
+    def _open(self) -> None:
+        from tf2_msgs.msg import TFMessage
+
+        self._clock = ClockPublisher(self._advertise) if self._has_clock else None
+        self._robot = RobotPublisher(self._advertise, TFMessage, self._urdf, self._static_transforms, self._base)
+        self._ground_truth = GroundTruthPublisher(self._advertise, TFMessage)
+        self._diagnostics = self._advertise(DiagnosticArray, "diagnostics", RELIABLE)
+        self._commands = CommandSubscriptions(self._node, self._controllers)
+
+    def publish_clock(self, time: float) -> None:
+        """Publish /clock at simulation time ``time`` [s], if this node has it; for every step."""
+        if self._clock is not None:
+            self._send(self._clock.pending(time))
+
+    def publish_robot_state(self, sample: RobotSample) -> None:
+        """Publish joint states, transforms, odometry and contacts; for every step."""
+        self._send(self._robot.pending(sample))
+
+    def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
+        """Publish true poses [name, 7] m, 1 in the map of what moves; 10 to 30 Hz will do.
+
+        Pass the same tuple object as long as the names stay: the serialised message is then patched, not built.
+        """
+        self._send(self._ground_truth.pending(time, names, poses))
+
+    def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
+        """Publish true poses [name, 7] m, 1 in the map of poles, once; late subscribers receive them, too."""
+        self._send(self._ground_truth.pending_static(names, poses), always=True)
+
+    def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
+        """Publish the states of parts of the client; the node adds its own. 1 Hz will do."""
+        own = {"refused_commands": self._commands.rejected}
+        prefix = self._node.get_fully_qualified_name()
+        statuses = [*components, ComponentStatus("ros", values=own)]
+        self._send([(self._diagnostics, lambda: convert.diagnostics(time, prefix, statuses))])
+
+    def commands(self) -> list[Command]:
+        """Commands that arrived since the last call, in order."""
+        return self._commands.drain()
+
+    def _send(self, messages: Iterable[PendingMessage], *, always: bool = False) -> None:
+        for topic, build in messages:
+            if topic.subscription_count or always:
+                topic.build_and_send(build)

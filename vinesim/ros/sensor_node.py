@@ -1,0 +1,88 @@
+"""The ROS 2 node of a robot's cameras and lidars, as their drivers are on a real robot.
+
+Frames are passed by the thread that renders them; a thread of the node builds and sends the messages. Of each topic
+only the newest frame waits: an older one that was not sent is replaced and counted as dropped.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TypeVar
+
+from vinesim.ros.node import Node
+from vinesim.ros.publishers.camera import CameraPublisher
+from vinesim.ros.publishers.lidar import LidarPublisher
+from vinesim.ros.topic import Build, PendingMessage, Topic
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan
+
+SensorPublisher = TypeVar("SensorPublisher", CameraPublisher, LidarPublisher)
+
+
+class SensorNode(Node):
+    """The topics of ``cameras`` and ``lidars``, the names under which they publish."""
+
+    def __init__(
+        self, name: str, *, namespace: str = "", cameras: Sequence[str] = (), lidars: Sequence[str] = ()
+    ) -> None:
+        self._camera_names, self._lidar_names = cameras, lidars
+        self._pending: dict[Topic, Build] = {}
+        """The newest message of each topic; the one that waits longest is the first."""
+        self._changed = threading.Condition()
+        self._sending = False
+        super().__init__(name, namespace, (*cameras, *lidars))
+
+    def _open(self) -> None:
+        self._cameras = {camera: CameraPublisher(self._advertise, camera) for camera in self._camera_names}
+        self._lidars = {lidar: LidarPublisher(self._advertise, lidar) for lidar in self._lidar_names}
+
+    def _own_threads(self, name: str) -> list[threading.Thread]:
+        return [threading.Thread(target=self._send, name=f"ros send {name}", daemon=True)]
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
+
+    def publish_camera(self, frame: CameraFrame) -> None:
+        """Publish one picture of one of ``cameras``; :class:`ValueError` if there is no such camera."""
+        self._enqueue(self._publisher(self._cameras, "camera", frame.name).pending(frame))
+
+    def publish_lidar(self, scan: LidarScan) -> None:
+        """Publish one revolution of one of ``lidars``; :class:`ValueError` if there is no such lidar."""
+        self._enqueue(self._publisher(self._lidars, "lidar", scan.name).pending(scan))
+
+    def camera_outputs_wanted(self, camera: str) -> CameraOutput:
+        """What subscribers need of the frames of one of ``cameras``; :class:`ValueError` if there is no such camera."""
+        return self._publisher(self._cameras, "camera", camera).wanted()
+
+    @property
+    def has_pending(self) -> bool:
+        """Whether any message waits to be sent or is being sent."""
+        with self._changed:
+            return bool(self._pending) or self._sending
+
+    def _publisher(self, kinds: Mapping[str, SensorPublisher], kind: str, name: str) -> SensorPublisher:
+        if name not in kinds:
+            raise ValueError(f"no {kind} {name!r} in this node; it was made with: {', '.join(kinds) or 'none'}")
+        return kinds[name]
+
+    def _enqueue(self, messages: Iterable[PendingMessage], *, always: bool = False) -> None:
+        with self._changed:
+            for topic, build in messages:
+                if topic.subscription_count or always:
+                    topic.dropped += topic in self._pending
+                    self._pending[topic] = build
+            self._changed.notify()
+
+    def _send(self) -> None:
+        """The sending thread: of the topics with a message the one that waits longest comes first."""
+        while True:
+            with self._changed:
+                self._sending = False
+                self._changed.wait_for(lambda: self._pending or self._closing.is_set())
+                if self._closing.is_set():
+                    return
+                self._sending = True
+                topic = next(iter(self._pending))
+                build = self._pending.pop(topic)
+            topic.build_and_send(build)

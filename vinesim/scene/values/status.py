@@ -1,0 +1,17 @@
+"""The state of one part of a client, as diagnostics show it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Literal
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ComponentStatus:
+    """Name and state of one part of a client, with its statistics."""
+
+    name: str
+    level: Literal["ok", "warning", "error"] = "ok"
+    message: str = "well"
+    values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
