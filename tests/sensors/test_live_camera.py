@@ -127,7 +127,7 @@ def test_actors_and_the_autumn_are_lit_alike(tmp_path) -> None:
 
 
 def test_shadows_drawn_in_part_are_those_drawn_anew() -> None:
-    """A board is carried through the scene and out of it: after each step the near map is as if drawn for the first time."""
+    """A board is carried through the scene and out of it: after each step the near map is as if drawn anew."""
     board = sensor_scenes.shape("box", 0.2, 0.15, 0.01)
     model, eye, forward = sensor_scenes.demo(), np.array([0.4, 1.2, 1.3]), np.array([1.0, 0.0, 0.0])
     at = [(1.0, 1.0, 1.5), (1.1, 1.0, 1.4), (2.5, -1.0, 1.2), (40.0, 0.0, 1.0), (2.6, 1.4, 1.9)]

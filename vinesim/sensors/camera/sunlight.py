@@ -97,7 +97,7 @@ class ShadowSquare:
         return [(0, side, side * i // count, side * (i + 1) // count) for i in range(count)]
 
     def _texels(self, ball: np.ndarray) -> np.ndarray:
-        """Columns and rows [ball, 4] (least and largest of each) that the shadow of some spheres [ball, 4] may touch."""
+        """Least and largest column and row [ball, 4] that the shadows of some spheres [ball, 4] may touch."""
         apart = ball[:, :3] - self.focus
         middle = np.stack([apart @ self.right, apart @ self.up], 1) / self.struct.texel + 0.5 * self.struct.side
         reach = ball[:, 3:] / self.struct.texel + float(shadow_maps.SHADOW_MARGIN) + 1.0
