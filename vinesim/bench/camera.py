@@ -162,7 +162,9 @@ def live_camera() -> Iterator[Measurement]:
 
     lens = pinhole(info, pose)
     frame = one.render(primitives, pose)
+    exact = frame.exact_depth
     assert spec.stereo is not None
+    assert exact is not None
     reach, rng = (spec.nearest.value, spec.farthest.value), np.random.default_rng(1)
     stereo = Stereo(spec.stereo, info, reach, second_from_first=True)
     cases: list[tuple[str, Callable[[], object], float]] = [
@@ -170,7 +172,7 @@ def live_camera() -> Iterator[Measurement]:
         ("visibility, light and tone", lambda: one.render_on_device(primitives, pose), 50.0),
         (
             "second view, matching, noise",
-            lambda: stereo.measure(primitives, lens, frame.exact_depth, frame.rgb, rng),
+            lambda: stereo.measure(primitives, lens, exact, frame.rgb, rng),
             20.0,
         ),
         ("whole frame, nothing moves", lambda: one.render(primitives, pose, outputs=wanted), 90.0),
