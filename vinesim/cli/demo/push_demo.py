@@ -53,8 +53,7 @@ def run_push(
     begin = time.time()
     find_device(device)
     plan = with_seed(load_scene(scene), seed)
-    if device == "cpu":
-        compile_kernels()
+    compile_kernels(device=device)
     description = load_description(robot)  # refused once, and before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
