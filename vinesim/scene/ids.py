@@ -1,4 +1,4 @@
-"""Names and numbers that stay the same on every client: organs, and ids of things.
+"""Names and numbers that stay the same on every client: organs, and ids of objects.
 
 The scene hash and these ids are all that clients share of the vineyard; tree 17 is tree 17 everywhere,
 because generation from (scene file, seed) is deterministic.
@@ -28,41 +28,41 @@ class Organ(enum.IntEnum):
 
 
 class ObjectKind(enum.IntEnum):
-    """What can be owned and moved by somebody, and is known to all clients by the same number."""
+    """Kinds of objects that an actor can own and move, with the same ids on all clients."""
 
     TREE = 0
     BUNCH = 1
-    """Once it has left its vine; while it hangs it is part of its tree."""
+    """A free bunch; while it hangs it is part of its tree."""
     BOX = 2
 
 
 OBJECT_STRIDE = 1 << 24
-"""A thing is numbered ``kind * THING_STRIDE + index``: trees come first, by their own numbers."""
+"""An object id is ``kind * OBJECT_STRIDE + index``: ids of trees equal their indices."""
 
 
 def object_id(kind: ObjectKind, index: int) -> int:
-    """The number of a tree, a loose bunch or a box among all things; index counts each kind from 0."""
+    """The id of a tree, a free bunch or a box; index counts each kind from 0."""
     return int(kind) * OBJECT_STRIDE + index
 
 
 def split_object_id(value: int) -> tuple[ObjectKind, int]:
-    """Kind and index of a thing; :class:`ValueError` for a number of no kind."""
+    """Kind and index of an object; :class:`ValueError` for a number of no kind."""
     return ObjectKind(value // OBJECT_STRIDE), value % OBJECT_STRIDE
 
 
 def is_tree(value: int) -> bool:
-    """Whether a thing is a tree; all others are rigid."""
+    """Whether an object is a tree; all others are rigid."""
     return value < OBJECT_STRIDE
 
 
 def object_name(value: int) -> str:
-    """A box or a loose bunch as links are named: ``box/3``."""
+    """Name of the link of a box or a free bunch: ``box/3``."""
     kind, index = split_object_id(value)
     return f"{kind.name.lower()}/{index}"
 
 
 def parse_object_name(name: str) -> int | None:
-    """The box or the loose bunch of a name like ``box/3``; None if it is no such name."""
+    """Id of the box or free bunch of a name like ``box/3``; None for other names."""
     kind, _, index = name.partition("/")
     rigid = {"bunch": ObjectKind.BUNCH, "box": ObjectKind.BOX}
     return object_id(rigid[kind], int(index)) if kind in rigid and index.isdecimal() else None
@@ -73,7 +73,7 @@ LABEL_STRIDE = 1 << 20
 
 
 def label(organ: Organ, index: int) -> int:
-    """The label of one thing in a label image; index counts bunches, boxes, trees or actors from 0."""
+    """The label of one object in a label image; index counts bunches, boxes, trees or actors from 0."""
     return int(organ) * LABEL_STRIDE + index
 
 

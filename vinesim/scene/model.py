@@ -28,7 +28,7 @@ _UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
 class Model(StructOfArrays):
     """Constants of a vineyard (units in the declarations; frames in the module's text)."""
 
-    # trees: the smallest thing that wakes, sleeps, is owned and is transmitted
+    # trees: the smallest unit that wakes, sleeps, is owned and is transmitted
     tree_first: np.ndarray = array("tree", unit="1", dtype=np.int32)
     """Index of the tree's root body."""
     tree_size: np.ndarray = array("tree", unit="1", dtype=np.int32)
@@ -98,7 +98,7 @@ class Model(StructOfArrays):
     tie_stiffness: np.ndarray = array("tie", unit="N/m")
     tie_damping: np.ndarray = array("tie", unit="N s/m")
 
-    # leaves ride on bodies; seen by sensors, felt as drag and mass only
+    # leaves are fixed to bodies; visible to sensors, in physics only as drag and mass
     leaf_body: np.ndarray = array("leaf", unit="1", dtype=np.int32)
     leaf_base: np.ndarray = array("leaf", 3, unit="m")
     """Where the petiole leaves the cane, in the body's frame."""

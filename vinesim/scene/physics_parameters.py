@@ -117,7 +117,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     # ------------------------------------------------------------------ free bunches
     bunch_rolling_arm: NotNegative = 0.004
     """[m] Arm of the rolling resistance of a free bunch. GUESSED: two berries on which it lies are 10 mm apart and give
-    way. Without it a bunch of spheres rolls on for ever."""
+    way. Without it a bunch of spheres keeps rolling."""
     bunch_contact_time: Positive = 0.02
     """[s] Time constant of a free bunch's contacts (MuJoCo's solref). TUNED: with a longer one it never comes to
     rest."""

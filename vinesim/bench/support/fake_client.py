@@ -57,11 +57,11 @@ def tree_row(count: int = 12, *, apart: float = 1.0) -> Model:
 
 
 SILENCE = 1.5
-"""Time without news of a tree after which the next message counts as a new contact [s]."""
+"""Time without an update of a tree after which the next one counts as a new contact [s]."""
 
 
 class FakeClient:
-    """The smallest client: it stands somewhere, swings its joints, touches objects, and takes over what it receives."""
+    """A minimal client: a robot with swinging joints that touches objects and applies the updates it receives."""
 
     def __init__(
         self,
@@ -129,8 +129,13 @@ class FakeClient:
         for object_id in inbox.objects:
             if object_id.object not in self.moved or not np.array_equal(self.moved[object_id.object], object_id.pose):
                 self.moved[object_id.object], self.heard[object_id.object] = object_id.pose, now
-        for fact, holds in inbox.records:
-            self.facts[fact.object] = {"parent": fact.parent, "moving": fact.moving, "holds": holds, "pose": fact.pose}
+        for record, holds in inbox.records:
+            self.facts[record.object] = {
+                "parent": record.parent,
+                "moving": record.moving,
+                "holds": holds,
+                "pose": record.pose,
+            }
         self.released += inbox.released
         self.robots = dict(inbox.robots)
         grabbed, self.grabbing = self.grabbing, set()

@@ -240,12 +240,12 @@ def _device(space: str, name: str, mine: str, other: str) -> int:
 
 def _forward(answers: IO[str]) -> None:
     """Make what the first request names, carry packets, answer requests; until standard input is closed."""
-    asking = b""
-    while not asking.endswith(b"\n"):  # by the byte: nothing of what select is to see may wait in a buffer
+    request = b""
+    while not request.endswith(b"\n"):  # by the byte: input that select must report may not wait in a buffer
         if not (more := os.read(0, 1)):
             return
-        asking += more
-    first = json.loads(asking)
+        request += more
+    first = json.loads(request)
     rng = random.Random(first["seed"])
     spaces: dict[str, str] = first["spaces"]
     try:

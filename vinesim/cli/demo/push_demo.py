@@ -37,6 +37,8 @@ class ListenedTopics:
     always: tuple[str, ...]
     once: tuple[str, ...]
     """Only until their first message."""
+    events: tuple[str, ...]
+    """Nobody waits for these: they may stay silent."""
     owners: Mapping[str, str]
     """Topic: the sensor that it comes from, in words."""
 
@@ -63,7 +65,7 @@ def run_push(
         console.print(f"ROS 2 is not usable here, the demo runs without it: {no_ros}")
     with process_group() as group:
         topics = listened_topics(description)
-        listener = None if no_ros else RosListener(group, topics.always, topics.once)
+        listener = None if no_ros else RosListener(group, topics.always, topics.once, topics.events)
         server, endpoint = group.start_server()
         bunch, poses = choose_poses(plan, generate(plan))
         console.print(
@@ -140,7 +142,7 @@ def listened_topics(robot: RobotDescription) -> ListenedTopics:
     """All topics of the picker; of the visitor its joints, its first picture and its first scan."""
     always = [
         "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment",
-        "/tf_environment_static", "/vine/contacts", "/mobile_base_controller/odom", "/diagnostics",
+        "/tf_environment_static", "/mobile_base_controller/odom", "/diagnostics",
         f"/{VISITOR}/joint_states",
     ]  # fmt: skip
     once, owners = [], {f"/{VISITOR}/joint_states": VISITOR}
@@ -158,4 +160,4 @@ def listened_topics(robot: RobotDescription) -> ListenedTopics:
     ):
         once.append(f"/{VISITOR}/{sensor.name}/{topic}")
         owners[once[-1]] = f"{sensor.name} of {VISITOR}"
-    return ListenedTopics(tuple(always), tuple(once), owners)
+    return ListenedTopics(tuple(always), tuple(once), ("/vine/contacts",), owners)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 from vinesim.client.processes.child_process import REPORT_TIMEOUT, START_TIMEOUT, Process, ProcessGroup
@@ -15,10 +15,12 @@ TopicReport = dict[str, dict[str, Any]]
 class RosListener:
     """Subscribes to named topics as they appear. Raises :class:`ProcessFailed` if its process ends."""
 
-    def __init__(self, group: ProcessGroup, topics: Iterable[str], once: Iterable[str] = ()) -> None:
-        """``once``: topics that it leaves after their first message."""
+    def __init__(
+        self, group: ProcessGroup, topics: Sequence[str], once: Sequence[str] = (), events: Sequence[str] = ()
+    ) -> None:
+        """``once``: topics that it leaves after their first message; ``events``: topics that may stay silent."""
         self.topics = (*topics, *once)
-        words = [word for topic in topics for word in ("--topic", topic)]
+        words = [word for topic in (*topics, *events) for word in ("--topic", topic)]
         words += [word for topic in once for word in ("--once", topic)]
         self._process: Process = group.start(
             "ROS listener", "-m", "vinesim.ros.tools.topic_monitor", "--announce", *words
@@ -39,7 +41,7 @@ class RosListener:
             self._read(json.loads(self._process.next_line(START_TIMEOUT)))
 
     def missing(self) -> list[str]:
-        """Topics without any message yet, in the order in which they were named."""
+        """Topics without any message yet, in the order in which they were named; those of events are left out."""
         for line in self._process.new_lines():
             self._read(json.loads(line))
         return [topic for topic in self.topics if topic not in self.first]

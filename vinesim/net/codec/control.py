@@ -190,18 +190,18 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
     return records
 
 
-def encode_time(asked: float, server: float = 0.0) -> bytes:
-    """Encode a clock query (own time ``asked`` [s]) or its reply, which repeats ``asked`` and adds the ``server``'s
+def encode_time(sent: float, server: float = 0.0) -> bytes:
+    """Encode a clock query (own time ``sent`` [s]) or its reply, which repeats ``sent`` and adds the ``server``'s
     time [s]."""
-    return _pack(MessageKind.CLOCK, (float(asked), float(server)))
+    return _pack(MessageKind.CLOCK, (float(sent), float(server)))
 
 
 def decode_time(payload: bytes) -> tuple[float, float]:
     """Own time of the query [s] and the server's time of the reply [s], both finite."""
-    asked, server = _unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
-    if not (math.isfinite(asked) and math.isfinite(server)):
-        raise MessageError(f"clock message ({asked}, {server}) that is not finite")
-    return asked, server
+    sent, server = _unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
+    if not (math.isfinite(sent) and math.isfinite(server)):
+        raise MessageError(f"clock message ({sent}, {server}) that is not finite")
+    return sent, server
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -52,7 +52,7 @@ HEADER = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
 
 
 class MessageError(ValueError):
-    """A message cannot be encoded or decoded; the text says why."""
+    """A message cannot be encoded or decoded; the text gives the reason."""
 
 
 class WrongVersion(MessageError):

@@ -39,7 +39,7 @@ class ObjectStates:
     time: float
     """Network time [s]."""
     object: np.ndarray
-    """[k] :func:`vinesim.scene.ids.thing`"""
+    """[k] :func:`vinesim.scene.ids.object_id`"""
     ownership: np.ndarray
     """[k] u16 sequences"""
     authority: np.ndarray

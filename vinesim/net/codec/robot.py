@@ -46,34 +46,34 @@ def encode_robot(update: RobotUpdate) -> bytes:
     or beyond 1e9, and a quaternion that is not of unit length.
     """
     pose, twist = update.base_q.tolist(), update.base_qd.tolist()
-    position, velocity = update.position.tolist(), update.velocity.tolist()
+    position, velocity = np.asarray(update.position, float), np.asarray(update.velocity, float)
     count = len(position)
     if count > MAX_JOINTS or len(velocity) != count or len(pose) != 7 or len(twist) != 6:
         raise MessageError(
             f"{update.actor!r}: pose of {len(pose)} numbers (7), velocity of {len(twist)} (6), {count} joint positions "
             f"and {len(velocity)} velocities (equal, at most {MAX_JOINTS})"
         )
-    if not all(-1e9 < number < 1e9 for number in (*pose, *twist, *position, *velocity)):
+    distance, speed = np.abs(position), np.abs(velocity)
+    if not (all(-1e9 < number < 1e9 for number in (*pose, *twist)) and (distance < 1e9).all() and (speed < 1e9).all()):
         raise MessageError(f"state of {update.actor!r} has a number that is not finite or beyond 1e9")
     x, y, z, w = pose[3:]
     sine = math.hypot(x, y, z)
     if not 0.95 < math.hypot(sine, w) < 1.05:
         raise MessageError(f"orientation {pose[3:]} of {update.actor!r} is no unit quaternion")
     factor = math.copysign(2.0 * math.atan2(sine, abs(w)) / sine, w) if sine > 1e-12 else 0.0
-    near = [abs(value) < JOINT_POSITION_LSB * 32767.5 for value in position]
-    steps = [
-        round(value / JOINT_POSITION_LSB) if fits else _OUT_OF_RANGE for value, fits in zip(position, near, strict=True)
-    ]
-    wide = [value for value, fits in zip(position, near, strict=True) if not fits]
-    scale = min(math.ceil(max(map(abs, velocity), default=0.0) / (127.0 * JOINT_RATE_LSB)), 65535)
+    near = distance < JOINT_POSITION_LSB * 32767.5
+    steps = np.where(near, np.rint(position / JOINT_POSITION_LSB), _OUT_OF_RANGE)
+    scale = min(math.ceil(float(speed.max(initial=0.0)) / (127.0 * JOINT_RATE_LSB)), 65535)
     unit = max(scale, 1) * JOINT_RATE_LSB
-    rates = [min(max(round(value / unit), -127), 127) for value in velocity]
+    rates = np.minimum(np.maximum(np.rint(velocity / unit), -127.0), 127.0)
     turn = _to_lsb([x * factor, y * factor, z * factor], TURN_LSB)
-    return (
-        pack_header(MessageKind.ROBOT, count, update.time)
-        + _BASE.pack(*pose[:3], *turn, *_to_lsb(twist, BASE_VELOCITY_LSB), scale)
-        + struct.pack(f"<{count}h{count}b{len(wide)}f", *steps, *rates, *wide)
-    )
+    return b"".join((
+        pack_header(MessageKind.ROBOT, count, update.time),
+        _BASE.pack(*pose[:3], *turn, *_to_lsb(twist, BASE_VELOCITY_LSB), scale),
+        steps.astype("<i2").tobytes(),
+        rates.astype("i1").tobytes(),
+        position[~near].astype("<f4").tobytes(),
+    ))  # fmt: skip
 
 
 def decode_robot(payload: bytes, actor: str) -> RobotUpdate:

@@ -24,7 +24,7 @@ MAX_RECORD_LENGTH = 1 << 26
 
 
 class InvalidRecording(ValueError):
-    """The file cannot be replayed; the text says why."""
+    """The file cannot be replayed; the text gives the reason."""
 
 
 class RecordedMessage(NamedTuple):

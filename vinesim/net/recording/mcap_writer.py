@@ -1,4 +1,4 @@
-"""Recordings are written: every network message of a world goes into an MCAP file that any MCAP reader opens.
+"""Writes recordings: every network message of a world, in an MCAP file that any MCAP reader opens.
 
 One channel for each key. A message is a JSON object (:mod:`~vinesim.net.recording.message_json`) that holds the decoded
 content and, in ``raw``, the bytes that crossed the network, for replays. Log time is the network time at which the
@@ -29,7 +29,7 @@ FLUSH_PERIOD = 0.5
 
 
 class RecordingStopped(RuntimeError):
-    """Nothing more can be written; the text says why, and what was kept."""
+    """Nothing more can be written; the text gives the reason and what was kept."""
 
     exit_code = 4
 

@@ -30,8 +30,8 @@ def _pose(pose: np.ndarray) -> dict[str, dict[str, float]]:
     return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
 
 
-def _named(thing: int) -> dict[str, Any]:
-    kind, index = split_object_id(thing)
+def _named(object_id: int) -> dict[str, Any]:
+    kind, index = split_object_id(object_id)
     return {"kind": kind.name.lower(), "index": index}
 
 
@@ -65,16 +65,16 @@ def _describe_trees(payload: bytes, _: str) -> dict[str, Any]:
 
 def _describe_objects(payload: bytes, key: str) -> dict[str, Any]:
     _, x, y, _ = key.split("/")
-    things = messages.decode_objects(payload, (int(x), int(y)))
+    objects = messages.decode_objects(payload, (int(x), int(y)))
     return {
-        "timestamp": _stamp(things.time),
+        "timestamp": _stamp(objects.time),
         "things": [
             {
                 **_named(update.object), "ownership": update.ownership, "authority": update.authority,
                 "touched": bool(flags & messages.TOUCHED), "pose": _pose(update.pose),
                 "velocity": update.velocity.tolist(),
             }
-            for update, flags in zip(things.updates(sender_of(key)), things.flags.tolist(), strict=True)
+            for update, flags in zip(objects.updates(sender_of(key)), objects.flags.tolist(), strict=True)
         ],
     }  # fmt: skip
 
@@ -83,10 +83,10 @@ def _describe_claims(payload: bytes, _: str) -> dict[str, Any]:
     return {
         "claims": [
             {
-                **_named(thing), "ownership": claim.ownership, "authority": claim.authority, "owner": claim.owner,
+                **_named(object_id), "ownership": claim.ownership, "authority": claim.authority, "owner": claim.owner,
                 "touched": touching,
             }
-            for thing, claim, touching in messages.decode_claims(payload)
+            for object_id, claim, touching in messages.decode_claims(payload)
         ]
     }  # fmt: skip
 
@@ -95,11 +95,11 @@ def _describe_records(payload: bytes, _: str) -> dict[str, Any]:
     return {
         "facts": [
             {
-                **_named(fact.object), "ownership": fact.ownership, "authority": fact.authority, "author": fact.author,
-                "moving": fact.moving, "pose": _pose(np.array(fact.pose)), "parent": fact.parent,
-                "cut": list(fact.cut),
+                **_named(record.object), "ownership": record.ownership, "authority": record.authority,
+                "author": record.author, "moving": record.moving, "pose": _pose(np.array(record.pose)),
+                "parent": record.parent, "cut": list(record.cut),
             }
-            for fact in messages.decode_records(payload)
+            for record in messages.decode_records(payload)
         ]
     }  # fmt: skip
 
@@ -135,7 +135,7 @@ def describe_message(key: str, payload: bytes) -> dict[str, Any]:
     if key.startswith("live/"):
         return {"actor": sender_of(key), "live": bool(payload), "raw": raw}
     try:
-        say = _DESCRIBE.get(messages.kind_of(payload))
-        return {"actor": sender_of(key), **(say(payload, key) if say is not None else {}), "raw": raw}
+        describe = _DESCRIBE.get(messages.kind_of(payload))
+        return {"actor": sender_of(key), **(describe(payload, key) if describe is not None else {}), "raw": raw}
     except ValueError as error:  # a key that names no cell among them
         return {"actor": sender_of(key), "error": str(error), "raw": raw}

@@ -53,11 +53,10 @@ def cell_window(middle: Cell) -> frozenset[Cell]:
 def move_window(middle: Cell | None, position: np.ndarray) -> Cell:
     """Middle cell of the window of an actor at ``position`` [m] whose middle cell was ``middle``, with hysteresis."""
     if middle is not None:
-        inside = all(
-            CELL_SIZE * middle[axis] - HYSTERESIS <= position[axis] <= CELL_SIZE * (middle[axis] + 1) + HYSTERESIS
-            for axis in (0, 1)
-        )
-        if inside:
+        x, y = position[:2].tolist()
+        low_x, low_y = CELL_SIZE * middle[0] - HYSTERESIS, CELL_SIZE * middle[1] - HYSTERESIS
+        width = CELL_SIZE + 2.0 * HYSTERESIS
+        if low_x <= x <= low_x + width and low_y <= y <= low_y + width:
             return middle
     return cell_of(position)
 

@@ -38,7 +38,7 @@ it comes to rest. GUESSED."""
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclasses.dataclass(slots=True)
 class LocalStep:
     """What the own simulation reports about one step; see
     :meth:`vinesim.net.replication.replicator.Replicator.send`."""

@@ -26,7 +26,7 @@ class SceneId(NamedTuple):
 
 
 class AdmissionControl:
-    """Decides about hellos. ``session`` tells two programs with the same name apart."""
+    """Decides about hellos. ``session`` distinguishes two programs with the same name."""
 
     def __init__(self, scene: SceneId | None = None, max_actors: int | None = None) -> None:
         """``scene``: the only one allowed, in every world. ``max_actors``: over all worlds. None: no such limit."""
@@ -36,7 +36,7 @@ class AdmissionControl:
         self._alive: dict[tuple[str, str], set[str]] = {}
         self._admitted: dict[tuple[str, str], tuple[str, float]] = {}
         self.joined = 0
-        """Actors that have ever come."""
+        """Number of joins since the start."""
         self.refused = 0
         """Hellos that were rejected."""
 
@@ -72,7 +72,7 @@ class AdmissionControl:
         self._forget(world)
 
     def decide(self, world: str, name: str, session: str, greeting: bytes, now: float) -> Welcome:
-        """Decide about an encoded hello under this name at ``now`` [s]; asking twice is harmless."""
+        """Decide about an encoded hello under this name at ``now`` [s]; repeated queries are allowed."""
         for actor, (admitted_session, since) in list(self._admitted.items()):
             if now - since > PROVISIONAL_TIMEOUT and admitted_session not in self._alive.get(actor, ()):
                 del self._admitted[actor]

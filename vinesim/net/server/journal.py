@@ -39,7 +39,7 @@ _CELL = struct.Struct("<ii")
 
 
 class JournalError(BusError):
-    """A journal cannot be used or written; the text says which file and what to do."""
+    """A journal cannot be used or written; the text names the file and the remedy."""
 
 
 class _Header(msgspec.Struct, frozen=True):

@@ -41,7 +41,7 @@ MAX_QUEUED = 10_000
 
 
 class Quota(NamedTuple):
-    """Sustained rate at which one actor may publish records; :data:`BURST_TIME` worth of it may come at once."""
+    """Sustained rate at which one actor may publish records; :data:`BURST_TIME` worth of it may arrive at once."""
 
     messages: float = 200.0
     """[1/s] An actor publishes all its records again to a restarted server, one message for each step and cell."""

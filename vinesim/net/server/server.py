@@ -138,7 +138,7 @@ class Server:
 
     @property
     def joined(self) -> int:
-        """Actors that have ever come."""
+        """Number of joins since the start."""
         return self._admission.joined
 
     @property

@@ -31,7 +31,7 @@ class Role(enum.StrEnum):
 
 
 class CertificateError(BusError):
-    """A certificate or key is missing or unusable; the text says which."""
+    """A certificate or key is missing or unusable; the text names it."""
 
 
 FAMILIES = ("c", "own", "fact", "voice")
@@ -77,14 +77,16 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         return name
 
     world = f"{root}/**"
-    hears = [
-        rule("hear", "egress", ["put", "delete", "reply", "liveliness_token"], world),
-        rule("listen", "ingress", ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], world),
-        rule("ask", "ingress", ["query"], f"{root}/hello/*", f"{root}/clock", f"{root}/snap/*/*"),
-        rule("be asked", "egress", ["query"], f"{root}/hello/*"),
-        # a publisher's matching: it learns who listens, or it would never send
-        rule("see questions answered", "egress", ["declare_queryable"], world),
-        rule("see listeners", "egress", ["declare_subscriber"], world),
+    receiving = [
+        rule("receive", "egress", ["put", "delete", "reply", "liveliness_token"], world),
+        rule(
+            "subscribe", "ingress", ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], world
+        ),
+        rule("query", "ingress", ["query"], f"{root}/hello/*", f"{root}/clock", f"{root}/snap/*/*"),
+        rule("be queried", "egress", ["query"], f"{root}/hello/*"),
+        # without the declarations of subscribers a publisher would never match and never send
+        rule("see queryables", "egress", ["declare_queryable"], world),
+        rule("see subscribers", "egress", ["declare_subscriber"], world),
     ]
     for name, role in sorted(actors.items()):
         if role == Role.SERVER:
@@ -100,7 +102,7 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         if role != Role.SPECTATOR:
             written += (f"{root}/force/*/{name}", *(f"{root}/{family}/*/*/{name}" for family in FAMILIES))
         own.append(rule(f"{name} writes", "ingress", ["put", "delete"], *written))
-        policies.append({"rules": hears + own, "subjects": [name]})
+        policies.append({"rules": receiving + own, "subjects": [name]})
     everything = [rule(f"servers {flow}", flow, _EVERYTHING, "**") for flow in ("ingress", "egress")]
     policies.append({"rules": everything, "subjects": [SERVER]})
     subjects = [{"id": name, "cert_common_names": [name]} for name in sorted({*actors, SERVER})]

@@ -24,7 +24,7 @@ KEEP_ALL = 10_000
 
 
 class BusError(RuntimeError):
-    """The network cannot be used as requested; the text says what, where and the remedy."""
+    """The network cannot be used as requested; the text gives the cause, the place and the remedy."""
 
     exit_code = 4
 

@@ -38,7 +38,7 @@ from vinesim.net.transport.zenoh_session import (
 log = logging.getLogger(__name__)
 
 ROOT = "vs/1"
-"""First chunks of every key: the version of the key layout; then comes the world."""
+"""First chunks of every key: the version of the key layout; the world follows."""
 
 WORLD = "vineyard"
 """Default name of a world."""

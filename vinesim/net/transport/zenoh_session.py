@@ -64,7 +64,7 @@ _closer: list[threading.Thread] = []
 
 
 def open_session(settings: zenoh.Config) -> zenoh.Session:
-    """Open a session and close it when the main thread ends, if nobody has closed it before.
+    """Open a session and close it when the main thread ends, unless it was closed before.
 
     Zenoh runs Python callbacks in threads that the interpreter joins at exit, so an open session would block the exit.
     """

@@ -83,7 +83,7 @@ class _Block:
         diagonal = d.qHDiagInv[self.dofs]
         if diagonal.all():
             H[self.row, self.column] = d.qH[self.entry]
-            np.fill_diagonal(H, 1.0)
+            H.ravel()[:: self.count + 1] = 1.0  # the diagonal
             H = H.T @ (H / diagonal[:, None])
         else:  # nothing is implicit in the whole world: MuJoCo leaves the factor unset, and M^ is M
             H[self.row, self.column] = H[self.column, self.row] = d.M[self.entry]

@@ -333,7 +333,7 @@ class ArticulationSolver:
             self._require_stepped(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
             self._loaded_bodies = np.array(bodies, np.int32)
-            touched = np.unique(self.model.body_tree[bodies])
+            touched = np.array(sorted(set(self.model.body_tree[bodies].tolist())), np.int32)
             self.list_subset(touched)
             launches.upload_wrenches(count)
             launches.apply_wrenches(len(touched))

@@ -60,12 +60,12 @@ class LevelOfDetail:
         fine = self.fine_trees
         if len(fine):
             self._wanted[wanted] = True
-            self._alone[fine] = np.where(self._wanted[fine], 0, self._alone[fine] + 1)
+            alone = self._alone[fine] = np.where(self._wanted[fine], 0, self._alone[fine] + 1)
             self._wanted[wanted] = False
-            self._still[fine] = np.where(self._rate(fine) < self.rest_rate, self._still[fine] + 1, 0)
-            done = fine[(self._alone[fine] > self.fine_steps) & (self._still[fine] >= self.rest_steps)]
-            if len(done):
-                plants.coarsen(done)
+            still = self._still[fine] = np.where(self._rate(fine) < self.rest_rate, self._still[fine] + 1, 0)
+            is_done = (alone > self.fine_steps) & (still >= self.rest_steps)
+            if is_done.any():
+                plants.coarsen(fine[is_done])
         fresh = wanted[~state.tree_fine[wanted]]
         if len(fresh):
             self._alone[fresh] = self._still[fresh] = 0

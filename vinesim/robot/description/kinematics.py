@@ -31,11 +31,13 @@ class MovingJoints:
     """[joint, 3] translation of the child in its parent per metre; zero for a joint that turns."""
     rotation: np.ndarray
     """[joint, 4] quaternion of the origin times (axis, 0); zero for a joint that slides."""
+    half_angle: np.ndarray
+    """[joint, 1] half of the angle per position: 1/2, or 0 for a joint that slides."""
 
     def poses(self, position: np.ndarray) -> np.ndarray:
         """Child in parent [joint, 7] for drive positions [drive] rad or m."""
         q = self.multiplier * position[self.drive_index] + self.offset
-        half = 0.5 * q[:, None] * self.rotation.any(axis=1, keepdims=True)
+        half = self.half_angle * q[:, None]
         poses = np.empty((len(q), 7))
         poses[:, :3] = self.origin[:, :3] + self.translation * q[:, None]
         poses[:, 3:] = self.origin[:, 3:] * np.cos(half) + self.rotation * np.sin(half)
@@ -84,6 +86,7 @@ def moving_joints(robot: Robot, driven: list[str]) -> MovingJoints:
         origin=origin,
         translation=np.where(sliding, frames.rotate(origin[:, 3:], axis), 0.0),
         rotation=np.where(sliding, 0.0, frames.multiply(origin[:, 3:], turn)),
+        half_angle=np.where(sliding, 0.0, 0.5),
     )
 
 

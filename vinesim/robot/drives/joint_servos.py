@@ -10,10 +10,14 @@ fast: it turns to where the spring gives what position, velocity, effort or impe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
+import warp as wp
 
+from vinesim.kernels import joint_servos
+from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.drives.commands import CommandInterface
 from vinesim.scene.values import Drive
@@ -32,12 +36,12 @@ class JointServos:
     def __init__(self, rigid: RigidWorld, name: str, drives: Sequence[Drive]) -> None:
         """``name``: the robot's in ``rigid``."""
         self._rigid, self._name, self._drives = rigid, name, tuple(drives)
-        self.lower_limit = np.array([drive.lower for drive in drives])
-        self.upper_limit = np.array([drive.upper for drive in drives])
+        self.lower_limit = np.array([drive.lower for drive in drives], float)
+        self.upper_limit = np.array([drive.upper for drive in drives], float)
         """[joint] limits of position [rad or m]"""
-        self.max_velocity = np.array([drive.velocity for drive in drives])
+        self.max_velocity = np.array([drive.velocity for drive in drives], float)
         """[joint] largest velocities [rad/s or m/s]"""
-        self.max_effort = np.array([drive.effort for drive in drives])
+        self.max_effort = np.array([drive.effort for drive in drives], float)
         """[joint] largest efforts [N m or N]"""
         self.series_stiffness = np.array(
             [drive.series_stiffness or drive.stiffness or drive.effort / RIGID_DEFLECTION for drive in drives]
@@ -53,17 +57,36 @@ class JointServos:
         self._effort_limit = self.max_effort.copy()
         self._finger_groups: dict[str, np.ndarray] = {}
         """Fingers that move together: a gripper that drifts with what it holds would be two fingers otherwise."""
+        joints = len(drives)
+        self.setpoint, self.interface = np.zeros(joints), np.zeros(joints, np.int64)
+        """[joint] position that the servos are asked for [rad or m], and :class:`CommandInterface` by which each was
+        commanded last; both are written in place."""
+        self._command, self._rate, self._target_velocity = np.zeros(joints), np.zeros(joints), np.zeros(joints)
+        self._position, self._middle, self._velocity_now, self._inertia = (np.zeros(joints) for _ in range(4))
+        self._max_tracking_error, self._max_impulse = np.zeros(joints), np.zeros(joints)
+        self._launch = self._bind_launch()
         self.hold()
+
+    def _bind_launch(self) -> Callable[..., None]:
+        """Bind the kernel of :meth:`_advance_setpoints` to the arrays of this robot."""
+        limits = SharedArrays(
+            joint_servos.ServoLimits, lower=self.lower_limit, upper=self.upper_limit, velocity=self.max_velocity,
+            tracking_error=self._max_tracking_error, impulse=self._max_impulse,
+        )  # fmt: skip
+        read = (self._command, self._position, self._middle, self._velocity_now, self._inertia)
+        written = (self.setpoint, self._rate, self._target_velocity)
+        return bind_launch(
+            joint_servos.advance_setpoints,
+            [self._rigid.dt, limits.struct, share(self.interface, wp.int64), *(share(a, wp.float64) for a in read)],
+            [share(a, wp.float64) for a in written],
+        )
 
     def hold(self) -> None:
         """Drop all commands: position control at the present positions. Gains and effort limits stay."""
-        self.setpoint = self._rigid.joint_measurements(self._name)[0].copy()
-        """[joint] position that the servos are asked for [rad or m]"""
-        self.interface = np.full(len(self.setpoint), CommandInterface.POSITION)
-        """[joint] :class:`CommandInterface` by which each was commanded last"""
-        self._command = self.setpoint.copy()
+        self.setpoint[:] = self._command[:] = self._rigid.joint_measurements(self._name)[0]
+        self.interface[:] = CommandInterface.POSITION
         self._velocity = np.zeros(len(self.setpoint))
-        self._rate = np.zeros(len(self.setpoint))
+        self._rate[:] = 0.0
         self._is_speed_limited = np.zeros(len(self.setpoint), bool)
         self._gains_changed = True
 
@@ -136,39 +159,22 @@ class JointServos:
         """Compute what changes only with the interfaces, gains and limits."""
         self._in_effort = self.interface == CommandInterface.EFFORT
         self._in_motor_position = self.interface == CommandInterface.MOTOR_POSITION
-        self._velocity_joints = np.flatnonzero(self.interface == CommandInterface.VELOCITY)
         self._gains_vary = bool(self._in_effort.any() or self._in_motor_position.any())
         """Whether gains depend on the state, so that they must be set in every step."""
         self._active_stiffness = np.where(self._in_motor_position, self.series_stiffness, self._stiffness)
-        self._max_tracking_error = (
+        self._max_tracking_error[:] = (
             self._effort_limit / np.maximum(self._active_stiffness, MIN_DIVISOR) + self.max_velocity * self._rigid.dt
         )
-        self._max_impulse = ACCELERATION_EFFORT_SHARE * self._rigid.dt * self._effort_limit
+        self._max_impulse[:] = ACCELERATION_EFFORT_SHARE * self._rigid.dt * self._effort_limit
 
     def _advance_setpoints(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """Advance the set-points by a step; returns their rates [joint] rad/s or m/s."""
-        dt = self._rigid.dt
-        # A saturated servo gives no more when its error grows, but would overshoot when released: bound the error.
-        middle = position
-        if self._finger_groups:
-            middle = position.copy()
-            for fingers in self._finger_groups.values():
-                middle[fingers] = position[fingers].sum() / len(fingers)
-        start = clip(self.setpoint, middle - self._max_tracking_error, middle + self._max_tracking_error)
-        wanted = (self._command - start) / dt
-        if len(self._velocity_joints):
-            wanted[self._velocity_joints] = self._command[self._velocity_joints]
-        # Nor may the set-point accelerate faster than the drive can: a saturated servo would exceed the velocity.
-        gain = self._max_impulse / np.maximum(self._rigid.joint_inertia(self._name), MIN_DIVISOR)
-        slowest = np.maximum(np.minimum(self._rate, 0.0) - gain, -self.max_velocity)
-        fastest = np.minimum(np.maximum(self._rate, 0.0) + gain, self.max_velocity)
-        rate = clip(wanted, slowest, fastest)
-        if self._gains_vary:
-            start, rate = np.where(self._in_effort, position, start), np.where(self._in_effort, 0.0, rate)
-        self.setpoint = clip(start + dt * rate, self.lower_limit, self.upper_limit)
-        rate = (self.setpoint - start) / dt
-        self._rate = np.where(self._in_effort, velocity, rate) if self._gains_vary else rate
-        return rate
+        self._position[:] = self._middle[:] = position
+        self._velocity_now[:], self._inertia[:] = velocity, self._rigid.joint_inertia(self._name)
+        for fingers in self._finger_groups.values():
+            self._middle[fingers] = position[fingers].sum() / len(fingers)
+        self._launch(len(position))
+        return self._target_velocity
 
     def _speed_limiters(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Joints whose commanded effort would exceed their largest velocity [joint] bool, and the damping [joint]

@@ -33,8 +33,8 @@ class HumanPose:
     """How far thumb, index, middle, ring and little finger are bent: 0 straight, 1 all the way. To be seen only."""
     right_fingers: tuple[float, ...] = (0.0,) * 5
     left_busy: bool = False
-    """The hand pushes a robot or holds something, says its own client: ``left`` is where the palm then is, not the
-    controller, and the copy goes there and touches nothing. Of no meaning where the person is at home."""
+    """The human's own client reports that the hand pushes a robot or holds an object: ``left`` is then the palm, not
+    the controller, and the remote copy is placed there without contacts. Unused on the human's own client."""
     right_busy: bool = False
 
     @property
@@ -86,13 +86,13 @@ class HandSample:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Haptic:
-    """One vibration that a person's controller is asked for."""
+    """One vibration command for a human's controller."""
 
     actor: str
     hand: str
     """``"left"`` or ``"right"``."""
     onset: bool
-    """A touch has just begun; otherwise it goes on."""
+    """The contact has just begun; otherwise it lasts."""
     amplitude: float
     """0 to 1, the share of the hand's greatest force; an onset is never weaker than can be felt."""
     duration: float

@@ -33,7 +33,7 @@ class HumanUpdate:
     time: float
     pose: HumanPose
     velocity: np.ndarray
-    """[7, 6] of all points, m/s and rad/s in world axes, to tell where they are a little later."""
+    """[7, 6] of all points, m/s and rad/s in world axes, for extrapolation."""
 
     @property
     def base_q(self) -> np.ndarray:
@@ -68,10 +68,10 @@ class TreeUpdate:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ObjectUpdate:
-    """State of one box or loose bunch that moves, as it crosses the network."""
+    """State of one moving box or free bunch, as sent over the network."""
 
     object: int
-    """:func:`vinesim.scene.ids.thing`"""
+    """:func:`vinesim.scene.ids.object_id`"""
     owner: str
     ownership: int
     authority: int

@@ -92,7 +92,7 @@ class ElasticSample:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Wrench:
-    """What a force-torque sensor measures: the pull of all that lies beyond it, weight and inertia included."""
+    """Reading of a force-torque sensor: the wrench of all bodies beyond it, with weight and inertia."""
 
     time: float
     name: str
@@ -120,7 +120,7 @@ class Imu:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RobotSample:
-    """What a robot knows of itself at one instant."""
+    """Proprioception of a robot at one instant."""
 
     actor: str
     joints: JointSample
@@ -129,7 +129,7 @@ class RobotSample:
     base_qd: np.ndarray
     """[6] its velocity, world axes."""
     odom_q: np.ndarray
-    """[7] base_footprint as odometry believes it, in ``odom``."""
+    """[7] base_footprint by odometry, in ``odom``."""
     transforms: tuple[tuple[str, str], ...]
     """(parent frame, child frame) of every moving joint, the same tuple object every tick."""
     transform_q: np.ndarray
