@@ -32,8 +32,9 @@ class StockNode:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
 
-    def spin(self) -> None:
-        self._executor.spin_once(timeout_sec=0.05)
+    def spin(self, timeout: float = 0.05) -> None:
+        """Take one message, or wait up to ``timeout`` [s] for one."""
+        self._executor.spin_once(timeout_sec=timeout)
 
     def __enter__(self) -> StockNode:
         return self

@@ -239,8 +239,11 @@ _RIDGE_ROWS = 180
 """Rows of the sky's table that ridges and trees can reach, up to 0.12 in the sine of elevation."""
 _RIDGE_TONES = np.array([0.36, 0.47, 0.62]), np.array([0.22, 0.32, 0.36])
 """Linear RGB of the far and the near ridge."""
+_SKY_BAND = 12
+"""Rows of the sky's table that are computed at once, so few that they stay in a core's cache; divides the ridge's."""
 
 
+@functools.cache
 def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
     """Sine of elevation and azimuth [rad] of the sky's table."""
     height = (np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2) * np.ones((1, SKY_COLUMNS))
@@ -254,20 +257,30 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
     Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
     hills in the haze.
     """
+    table = np.empty((SKY_ROWS, SKY_COLUMNS, 3), np.float32)
+    for first in range(0, SKY_ROWS, _SKY_BAND):
+        rows = slice(first, first + _SKY_BAND)
+        table[rows] = _sky_rows(rows, np.array(sun), np.array(colour_of_sun))
+    return table
+
+
+def _sky_rows(rows: slice, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
+    """Some rows of the sky's table [row, SKY_COLUMNS, 3]; they lie within or beyond :data:`_RIDGE_ROWS`."""
     (height, azimuth), layers = _sky_directions(), _sky_layers()
+    height, azimuth = height[rows], azimuth[rows]
     flat = np.sqrt(1.0 - height**2)
     x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
     horizon = np.exp(-5.5 * height)[..., None]
     colour = (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
     halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
-    colour = colour + halo[..., None] * np.array(colour_of_sun)
-    colour = _mix(colour, np.array([1.35, 1.33, 1.30]), layers["cloud"])
-    low = colour[:_RIDGE_ROWS]
-    for tone, share in zip(_RIDGE_TONES, layers["ridges"], strict=True):
-        low = _mix(low, tone, share)
-    colour[:_RIDGE_ROWS] = _mix(low, layers["trees"], layers["tree_share"])
-    return colour.astype(np.float32)
+    colour = colour + halo[..., None] * colour_of_sun
+    colour = _mix(colour, np.array([1.35, 1.33, 1.30]), layers["cloud"][rows])
+    if rows.start < _RIDGE_ROWS:
+        for tone, share in zip(_RIDGE_TONES, layers["ridges"], strict=True):
+            colour = _mix(colour, tone, share[rows])
+        colour = _mix(colour, layers["trees"][rows], layers["tree_share"][rows])
+    return colour
 
 
 def sample_noise(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:

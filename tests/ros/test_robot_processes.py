@@ -1,0 +1,179 @@
+"""The processes of one robot as a stock node sees them: every step's messages, restarts, diagnostics."""
+
+# ruff: noqa: E402 (messages are imported only where ROS is installed)
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+
+from vinesim.ros import middleware
+
+pytestmark = pytest.mark.ros
+if middleware.unavailable_reason() is not None:
+    pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Image, JointState, PointCloud2
+
+from tests.support.contact_scenes import cane
+from tests.support.stock_node import StockNode, wait_until
+from vinesim.client.client import Client
+from vinesim.client.rate_loop import RateLoop
+from vinesim.client.sensing.robot_processes import RobotProcesses
+from vinesim.client.sensing.step_record import MAX_CONTACTS, StepRecords
+from vinesim.client.status import Status
+from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.robot.description.loader import load_description
+from vinesim.scene.builder import assemble
+from vinesim.scene.spec import load_scene
+from vinesim.scene.values import Contact
+
+CAMERA = "head_front_camera"
+
+
+class Robot:
+    """A client with one vinebot far from a single cane, its processes, and a stock node that listens."""
+
+    def __init__(self, peer: StockNode) -> None:
+        self.peer = peer
+        scene, vinebot = load_scene("demo"), load_description("vinebot")
+        model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+        self.processes = RobotProcesses("robot", scene, model, vinebot, sensor_hz=5.0)
+        self.client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
+        self.loop = RateLoop(self.client.physics.dt)
+        self.status = Status(self.client, self.loop, self.processes.sent_messages, sensors=self.processes.status)
+
+    def subscribe(self, message: type, topic: str) -> list:
+        """Messages from now on, received with the default QoS of rclpy."""
+        received: list = []
+        self.peer.node.create_subscription(message, topic, received.append, 10)
+        return received
+
+    def step(self) -> None:
+        """One tick in real time, a status every hundred, and whatever the stock node has received."""
+        self.loop.begin()
+        self.client.tick()
+        self.loop.end()
+        if self.loop.ticks % 100 == 0:
+            self.processes.publish_diagnostics(self.status.current())
+        for _ in range(5):
+            self.peer.spin(0.0)
+
+    def run_until(self, condition: Callable[[], object]) -> None:
+        wait_until(condition, self.step)
+
+
+@pytest.fixture
+def robot(monkeypatch, tmp_path) -> Iterator[Robot]:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
+    with StockNode() as peer:
+        one = Robot(peer)
+        with one.processes:
+            one.processes.attach(one.client)
+            yield one
+
+
+def nanoseconds(message: Clock) -> int:
+    return message.clock.sec * 10**9 + message.clock.nanosec
+
+
+def test_every_step_is_published_once_and_in_order_or_counted_as_lost(robot):
+    clocks, joints = robot.subscribe(Clock, "/clock"), robot.subscribe(JointState, "/joint_states")
+    robot.run_until(lambda: len(clocks) >= 20 and joints)
+    first = nanoseconds(clocks[-1])
+    robot.run_until(lambda: nanoseconds(clocks[-1]) - first >= 3 * 10**9)
+    times = [t for t in map(nanoseconds, clocks) if t >= first]
+    steps = (times[-1] - first) // 10**7 + 1
+    assert times == sorted(set(times))
+    lost = robot.processes.dropped_messages().get("/clock", 0)
+    assert len(times) + lost >= steps
+    assert {t % 10**7 for t in times} == {0}
+
+
+def test_default_subscribers_receive_pictures_and_clouds(robot):
+    topics = {
+        f"/{CAMERA}/rgb/image_raw": Image, f"/{CAMERA}/depth/image_raw": Image, f"/{CAMERA}/depth/points": PointCloud2,
+        "/lidar/points": PointCloud2,
+    }  # fmt: skip
+    received = [robot.subscribe(message, topic) for topic, message in topics.items()]
+    robot.run_until(lambda: all(len(messages) >= 2 for messages in received))
+
+
+def test_killed_processes_come_back_and_diagnostics_say_so(robot):
+    pictures, joints = robot.subscribe(Image, f"/{CAMERA}/rgb/image_raw"), robot.subscribe(JointState, "/joint_states")
+    diagnostics = robot.subscribe(DiagnosticArray, "/diagnostics")
+
+    def level_of_sensors() -> bytes | None:
+        found = [s.level for array in diagnostics for s in array.status if s.name.endswith(": sensors")]
+        return found[-1] if found else None
+
+    robot.run_until(lambda: pictures and joints and level_of_sensors() == DiagnosticStatus.OK)
+    os.kill(robot.processes.sensors.worker.current().process.pid, signal.SIGKILL)
+    robot.run_until(lambda: level_of_sensors() == DiagnosticStatus.ERROR)
+    assert not robot.status.current()["sensors_ready"]
+    robot.run_until(lambda: level_of_sensors() == DiagnosticStatus.OK)
+    seen = len(pictures)
+    robot.run_until(lambda: len(pictures) > seen)
+    assert robot.status.current()["sensor_restarts"] == 1
+
+    os.kill(robot.processes.ros.worker.current().process.pid, signal.SIGKILL)
+    robot.run_until(lambda: robot.status.current()["ros_restarts"] == 1)
+    seen = len(joints), len(diagnostics)
+    robot.run_until(lambda: len(joints) > seen[0] + 20 and len(diagnostics) > seen[1])
+
+
+def test_of_a_process_that_stops_for_a_while_every_step_is_sent_or_counted_as_lost(robot):
+    wanted = []
+    robot.client.post_step.append(
+        lambda _: wanted.append(robot.processes.ros.worker.current().shared.wanted["steps"][0])
+    )
+    clocks = robot.subscribe(Clock, "/clock")
+    robot.run_until(lambda: len(clocks) >= 5)
+    process = robot.processes.ros.worker.current().process
+    os.kill(process.pid, signal.SIGSTOP)
+    begin = robot.loop.ticks
+    robot.run_until(lambda: lost_clocks(robot) >= 10)
+    assert robot.loop.ticks - begin < 150  # a second of steps waits, more are lost; the loop waits for nothing
+    os.kill(process.pid, signal.SIGCONT)
+    last = nanoseconds(clocks[-1])
+    robot.run_until(lambda: nanoseconds(clocks[-1]) > last + 2 * 10**9)
+    times = list(map(nanoseconds, clocks))
+    assert times == sorted(set(times))
+    steps = sum(wanted)  # one more or less: the subscription may be seen between the step and its count
+    wait_until(lambda: robot.processes.sent_messages()["/clock"] + lost_clocks(robot) >= steps - 1)
+    assert robot.processes.sent_messages()["/clock"] + lost_clocks(robot) <= steps + 1
+
+
+def lost_clocks(robot: Robot) -> int:
+    return robot.processes.dropped_messages().get("/clock", 0)
+
+
+def test_a_record_holds_a_sample_exactly(robot):
+    client = robot.client
+    client.tick()
+    contacts = [
+        Contact("robot", f"robot/{link}", i, np.full(3, i + 0.5), np.full(3, 2.0 * i), -0.001 * i)
+        for i, link in enumerate((*list(client.robot.description.link_anchors)[:3], "unknown"))
+    ]
+    sample = client.robot.sample(client.physics.time, contacts)
+    records = StepRecords("robot", client.robot.description)
+    row = np.zeros(1, records.dtype)[0]
+    assert records.write(row, client.physics.time, sample) == 0
+    copy = records.read(row)
+    for name in ("base_q", "base_qd", "odom_q", "transform_q"):
+        assert np.array_equal(getattr(copy, name), getattr(sample, name)), name
+    for name in ("position", "velocity", "effort", "contact"):
+        assert np.array_equal(getattr(copy.joints, name), getattr(sample.joints, name)), name
+    assert (copy.actor, copy.transforms, copy.joints.names) == (sample.actor, sample.transforms, sample.joints.names)
+    assert [c.link for c in copy.contacts] == [*[c.link for c in contacts[:3]], ""]
+    assert [c.force.tolist() for c in copy.contacts] == [c.force.tolist() for c in contacts]
+    many = client.robot.sample(client.physics.time, contacts[:1] * (MAX_CONTACTS + 5))
+    assert records.write(row, client.physics.time, many) == 5
