@@ -379,12 +379,26 @@ def test_springs_and_slip_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:
     assert found.base_limits.slip == (0.1, 0.2)
 
 
+def test_quality_size_and_rate_of_a_camera_come_from_the_sidecar(tmp_path: pathlib.Path) -> None:
+    file = write(tmp_path, robot())
+    file.with_suffix(".toml").write_text(
+        "[[cameras]]\nname = 'wrist'\nframe = 'arm'\ntype = 'd435'\nquality = 'full'\nsize = [320, 240]\nrate = 15.0\n"
+        "[[cameras]]\nname = 'chest'\nframe = 'arm'\ntype = 'd435'\n"
+    )
+    wrist, chest = load_description(file).cameras
+    assert (wrist.quality, wrist.size, wrist.rate) == ("full", (320, 240), 15.0)
+    assert (chest.quality, chest.size, chest.rate) == ("fast", None, None)
+
+
 @pytest.mark.parametrize(
     ("toml", "words"),
     [
         ("[groups.arm]\njoints = ['elbow']", "'elbow', which no drive moves"),
         ("[groups.arm]\njoints = ['shoulder_joint']\nhome = [0.0, 1.0]", "2 of home for 1 joints"),
         ("[[cameras]]\nname = 'c'\nframe = 'nose'", "sits in 'nose'"),
+        ("[[cameras]]\nname = 'c'\nframe = 'arm'\nquality = 'best'", "'best'"),
+        ("[[cameras]]\nname = 'c'\nframe = 'arm'\nsize = [640, 0]", "has the size [640, 0]"),
+        ("[[cameras]]\nname = 'c'\nframe = 'arm'\nrate = 0.0", "has the rate 0.0"),
         ("[base]\nspeed = 3", "speed"),
         ("[base]\nslip = [1.0, 0.0]", "slip of (1.0, 0.0)"),
         ("[groups.arm]\njoints = ['shoulder_joint']\nelastic = [1.0]", "only half of its springs"),

@@ -1,19 +1,23 @@
 """What makes a live picture cheap changes nothing: threads, outputs left out, a second view out of the first."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
 
 from tests.support import sensor_scenes
+from vinesim import frames
 from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.sensing import stereo_depth
 from vinesim.scene.values import CameraFrame, CameraOutput
 from vinesim.sensors.camera.camera import QUALITIES, Camera, CameraSpec
 from vinesim.sensors.camera.stereo import Stereo
+from vinesim.sensors.camera.sunlight import Sunlight
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import pinhole
 from vinesim.sensors.raster.primitive_arrays import LEAF
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.spec_file import noise_rng
 
 SPEC = CameraSpec.load("d435")
@@ -37,9 +41,9 @@ def _arrays(frame: CameraFrame) -> list[np.ndarray]:
 @pytest.mark.parametrize("quality", QUALITIES)
 @pytest.mark.parametrize("info", [INFO, ODD], ids=["320x240", "136x102"])
 def test_any_number_of_threads_gives_the_same_bits(primitives, quality: str, info) -> None:
-    frames = [Camera(SPEC, info, quality=quality, threads=n).render(primitives, ALONG_THE_ROW) for n in (1, 2, 3)]
-    for other in frames[1:]:
-        for mine, theirs in zip(_arrays(other), _arrays(frames[0]), strict=True):
+    made = [Camera(SPEC, info, quality=quality, threads=n).render(primitives, ALONG_THE_ROW) for n in (1, 2, 3)]
+    for other in made[1:]:
+        for mine, theirs in zip(_arrays(other), _arrays(made[0]), strict=True):
             assert np.array_equal(mine, theirs, equal_nan=mine.dtype == np.float32)
 
 
@@ -120,3 +124,29 @@ def test_actors_and_the_autumn_are_lit_alike(tmp_path) -> None:
     single._live_light = None
     mine, theirs = (camera.render(primitives, pose, outputs=CameraOutput.RGB).rgb for camera in (batched, single))
     assert np.abs(mine.astype(int) - theirs).mean() < 0.2
+
+
+def test_shadows_drawn_in_part_are_those_drawn_anew() -> None:
+    """A board is carried through the scene and out of it: after each step the near map is as if drawn anew."""
+    board = sensor_scenes.shape("box", 0.2, 0.15, 0.01)
+    model, eye, forward = sensor_scenes.demo(), np.array([0.4, 1.2, 1.3]), np.array([1.0, 0.0, 0.0])
+    at = [(1.0, 1.0, 1.5), (1.1, 1.0, 1.4), (2.5, -1.0, 1.2), (40.0, 0.0, 1.0), (2.6, 1.4, 1.9)]
+    links = (sensor_scenes.thing(board),)
+    poses = [np.array([[*place, *frames.from_yaw(0.3 * i)]]) for i, place in enumerate(at)]
+    primitives = Primitives(model, grass=3.0)
+    followed = Sunlight(taps=-1, period=0.0, workers=ThreadPool(2))
+    drawn = []
+    for i, pose in enumerate(poses):
+        snapshot = rest_snapshot(model, links, pose)
+        if i == 2:  # and a vine that sways
+            snapshot.body_q[: len(snapshot.body_q) // 8, 2] += 0.05
+            swaying = np.unique(model.body_tree[: len(snapshot.body_q) // 8])
+            snapshot = dataclasses.replace(snapshot, moved_trees=swaying)
+        primitives.update(snapshot)
+        followed.update(primitives, eye, forward, 0.1 * i)
+        fresh = Sunlight(taps=-1, period=0.0)
+        fresh.update(primitives, eye, forward, 0.0)
+        mine, theirs = (light.depth.numpy()[: light.depth.size // 2] for light in (followed, fresh))
+        assert np.array_equal(mine, theirs)
+        drawn.append(theirs.copy())
+    assert not np.array_equal(drawn[0], drawn[1])

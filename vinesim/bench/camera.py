@@ -7,6 +7,8 @@ matter who uses how many cores.
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -17,15 +19,18 @@ import numpy as np
 import trimesh
 
 from vinesim import frames
+from vinesim.bench.scenes import interleaved_medians
+from vinesim.kernels.launch import usable_cores
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import CameraInfo, Measurement
-from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.scene.values import CameraInfo, CameraOutput, Measurement
+from vinesim.sensors.camera.camera import MAX_THREADS, Camera, CameraSpec
+from vinesim.sensors.camera.stereo import Stereo
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF, SPHEROID
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 _ROUNDS = 7
 
@@ -128,6 +133,60 @@ def camera() -> Iterator[Measurement]:
         yield Measurement("camera", name, raster, "CPU ms")
     for quality, spent in zip(eyes, pictures, strict=True):
         yield Measurement("camera", f"picture 640x480, {quality}, cached shadows", spent, "CPU ms")
+    yield from live_camera()
+
+
+def live_camera() -> Iterator[Measurement]:
+    """What one live D435 picture with depth costs, part by part, each beside its budget."""
+    model = generate(load_scene("demo"))
+    primitives = Primitives(model)
+    spec = CameraSpec.load("d435")
+    info, pose = spec.info("optical"), look_at(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
+    one, all_cores = (Camera(spec, info, quality="fast", threads=threads) for threads in (1, None))
+    wanted = CameraOutput.RGB | CameraOutput.DEPTH
+    swaying = np.arange(0, len(model.body_mass) // 20)
+    snapshots = [
+        dataclasses.replace(rest_snapshot(model), moved_trees=np.unique(model.body_tree[swaying])) for _ in "ab"
+    ]
+    snapshots[1].body_q[swaying, 2] += 0.01
+    frames_made = itertools.count()
+
+    def part_of_shadows() -> None:
+        number = next(frames_made)
+        primitives.update(snapshots[number % 2])
+        one.update_shadows(primitives, pose, float(number))
+
+    def shadows() -> None:
+        primitives.layout_version += 1
+        one.update_shadows(primitives, pose, 0.0)
+
+    lens = pinhole(info, pose)
+    frame = one.render(primitives, pose)
+    exact = frame.exact_depth
+    assert spec.stereo is not None
+    assert exact is not None
+    reach, rng = (spec.nearest.value, spec.farthest.value), np.random.default_rng(1)
+    stereo = Stereo(spec.stereo, info, reach, second_from_first=True)
+    cases: list[tuple[str, Callable[[], object], float]] = [
+        ("visibility", lambda: one.rasterizer.draw(primitives, lens), 30.0),
+        ("visibility, light and tone", lambda: one.render_on_device(primitives, pose), 50.0),
+        (
+            "second view, matching, noise",
+            lambda: stereo.measure(primitives, lens, exact, frame.rgb, rng),
+            20.0,
+        ),
+        ("whole frame, nothing moves", lambda: one.render(primitives, pose, outputs=wanted), 90.0),
+        ("shadow maps, one vine in twenty moved", part_of_shadows, 15.0),
+        ("shadow maps, both drawn anew", shadows, 45.0),
+    ]
+    for (name, _, budget), spent in zip(cases, median_cpu_times(*(work for _, work, _ in cases)), strict=True):
+        yield Measurement("camera", f"live D435, {name}", spent, "CPU ms", "budget", budget, budget / spent)
+    by_one, by_all = interleaved_medians(
+        *(lambda camera=camera: camera.render(primitives, pose, outputs=wanted) for camera in (one, all_cores))
+    )
+    cores = min(usable_cores(), MAX_THREADS)
+    name = f"live D435, whole frame, {cores} threads"
+    yield Measurement("camera", name, 1e3 * by_all, "ms", "one thread", 1e3 * by_one, by_one / by_all)
 
 
 def _rays(info: CameraInfo, pose: np.ndarray) -> np.ndarray:

@@ -115,7 +115,7 @@ def keep_awake(physics: Physics, trees: np.ndarray) -> Physics:
     return physics
 
 
-def interleaved_medians(*works: Callable[[], None], rounds: int = 9) -> list[float]:
+def interleaved_medians(*works: Callable[[], object], rounds: int = 9) -> list[float]:
     """Median time [s] of each of some works, run in turns, so that changes of the machine's load meet all alike."""
     seconds = np.zeros((rounds, len(works)))
     for row in seconds:

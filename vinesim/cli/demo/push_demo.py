@@ -9,14 +9,13 @@ from collections.abc import Mapping
 
 from rich.console import Console
 
+from vinesim.cli.demo.options import check_device
 from vinesim.cli.demo.placement import APPROACH_DISTANCE, choose_poses
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, process_group
 from vinesim.client.processes.ros_listener import RosListener
-from vinesim.kernels.compilation import compile_kernels
-from vinesim.physics.plants.device_buffers import find_device
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
@@ -53,10 +52,8 @@ def run_push(
     """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``; the exit code."""
     console = Console(stderr=True)
     begin = time.time()
-    find_device(device)
+    check_device(device)
     plan = with_seed(load_scene(scene), seed)
-    if device == "cpu":
-        compile_kernels()
     description = load_description(robot)  # refused once, and before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         folder.mkdir(parents=True, exist_ok=True)
@@ -69,9 +66,7 @@ def run_push(
         listener = None if no_ros else RosListener(group, topics.always, topics.once, topics.events)
         server, endpoint = group.start_server()
         bunch, poses = choose_poses(plan, generate(plan))
-        console.print(
-            f"server on {endpoint}; {PICKER} will push bunch {bunch} for {seconds:.0f} s (a first run compiles kernels)"
-        )
+        console.print(f"server on {endpoint}; {PICKER} will push bunch {bunch} for {seconds:.0f} s")
         common = ["--connect", endpoint, "--scene", scene, "--robot", robot, "--device", device]
         common += [] if seed is None else ["--seed", str(seed)]
         clients = _start_clients(group, common, bunch, poses, out)

@@ -48,8 +48,14 @@ def wait_until_ready(
             waited = time.monotonic() - begin
             if waited > timeout:
                 raise ProcessFailed(f"not ready after {timeout:.0f} s: {', '.join(missing)}")
-            show(f"waiting for: {', '.join(missing)} ({waited:.0f} s)")
+            show(f"waiting for: {', '.join(missing)} ({waited:.0f} s){_newest_progress(clients)}")
             time.sleep(POLL_PERIOD)
+
+
+def _newest_progress(clients: Mapping[str, Process]) -> str:
+    """What a client that is not ready says of its progress, such as the kernel that it compiles."""
+    lines = [f"; {name}: {process.stderr_tail[-1]}" for name, process in clients.items() if process.stderr_tail]
+    return lines[0] if lines else ""
 
 
 @contextlib.contextmanager

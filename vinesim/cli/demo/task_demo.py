@@ -7,12 +7,12 @@ import pathlib
 
 from rich.console import Console
 
+from vinesim.cli.demo.options import check_device
 from vinesim.cli.demo.placement import visitor_pose
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, process_group
 from vinesim.client.tasks.task_registry import UnknownTask
-from vinesim.physics.plants.device_buffers import find_device
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
 from vinesim.scene.spec import load_scene, with_seed
@@ -31,7 +31,7 @@ def run_job(
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {' or '.join(JOBS)}")
     console = Console(stderr=True)
-    find_device(device)
+    check_device(device)
     default_robot, done_key = JOBS[job]
     robot, scene = robot or default_robot, scene or "harvest"
     plan = with_seed(load_scene(scene), seed)

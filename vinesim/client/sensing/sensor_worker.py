@@ -174,12 +174,11 @@ class SensorWorker:
         seed = zlib.crc32(config.name.encode())  # no two robots have the same noise
         for i, mount in enumerate(config.description.cameras):
             spec = CameraSpec.load(mount.type)
-            camera = Camera(
-                spec, spec.info(mount.frame), mount.name, config.sun, quality="fast", seed=seed, device=device
-            )
+            info = spec.info(mount.frame, size=mount.size)
+            camera = Camera(spec, info, mount.name, config.sun, quality=mount.quality, seed=seed, device=device)
             always = config.keep_pictures and i == 0
             wanted = self._camera_demand(mount.name, always)
-            sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, config.sensor_hz))
+            sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, config.sensor_hz or mount.rate))
         for mount in config.description.lidars:
             lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed, device=device)
             wanted = self._lidar_demand(mount.name)

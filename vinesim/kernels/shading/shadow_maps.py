@@ -23,6 +23,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SUN_DISTANCE = wp.constant(100.0)
 """Depths of a shadow map count from this far towards the sun of its corner [m]."""
+SHADOW_MARGIN = wp.constant(2.0)
+"""What is drawn may reach so far beyond the bound of its cluster [texel]."""
 SUN_RADIUS = wp.constant(0.0047)
 """Half of the sun's angle [rad]."""
 
@@ -85,12 +87,20 @@ def write_depth(m: ShadowMap, x: int, y: int, z: float, depth_out: wp.array(dtyp
 
 @wp.func
 def shadow_spheroid(
-    m: ShadowMap, r: float, x: float, y: float, z: float, part: int, slices: int, depth_out: wp.array(dtype=wp.float32)
+    m: ShadowMap,
+    r: float,
+    x: float,
+    y: float,
+    z: float,
+    part: int,
+    slices: int,
+    window: wp.vec4i,
+    depth_out: wp.array(dtype=wp.float32),
 ):
     """Draw a sphere of radius ``r`` [m] at texel (x, y) and depth ``z`` [m] from the sun; every ``slices``-th row."""
     rt = r / m.texel
-    for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
-        for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
+    for py in range(wp.max(int(y - rt), window[2]) + part, wp.min(int(y + rt) + 2, window[3]), slices):
+        for px in range(wp.max(int(x - rt), window[0]), wp.min(int(x + rt) + 2, window[1])):
             dx = float(px) - x
             dy = float(py) - y
             h = rt * rt - dx * dx - dy * dy
@@ -109,6 +119,7 @@ def shadow_cone(
     z: float,
     part: int,
     slices: int,
+    window: wp.vec4i,
     depth_out: wp.array(dtype=wp.float32),
 ):
     """Draw cone or cylinder ``i`` that begins at texel (x, y) and depth ``z`` [m], if it is thicker than ``smallest`` texels."""
@@ -123,8 +134,8 @@ def shadow_cone(
         ez = SUN_DISTANCE - wp.dot(q, m.sun) - z
         wide = wp.max(wp.max(r, rb) / m.texel, 0.55)
         per = 1.0 / wp.max(ex * ex + ey * ey, 1.0e-6)
-        y0 = wp.max(int(wp.min(y, y + ey) - wide), 0)
-        y1 = wp.min(int(wp.max(y, y + ey) + wide) + 2, m.side)
+        y0 = wp.max(int(wp.min(y, y + ey) - wide), window[2])
+        y1 = wp.min(int(wp.max(y, y + ey) + wide) + 2, window[3])
         for py in range(y0 + part, y1, slices):
             x0 = wp.min(x, x + ex) - wide
             x1 = wp.max(x, x + ex) + wide
@@ -133,7 +144,7 @@ def shadow_cone(
                 t = wp.clamp((float(py) + wide - y) / ey, 0.0, 1.0)
                 x0 = x + wp.min(ex * s, ex * t) - wide
                 x1 = x + wp.max(ex * s, ex * t) + wide
-            for px in range(wp.max(int(x0), 0), wp.min(int(x1) + 2, m.side)):
+            for px in range(wp.max(int(x0), window[0]), wp.min(int(x1) + 2, window[1])):
                 fx = float(px) - x
                 fy = float(py) - y
                 s = wp.clamp((fx * ex + fy * ey) * per, 0.0, 1.0)
@@ -203,6 +214,7 @@ def shadow_leaf(
     z: float,
     part: int,
     slices: int,
+    window: wp.vec4i,
     depth_out: wp.array(dtype=wp.float32),
 ):
     """Draw blade ``i`` whose petiole's end is at texel (x, y) and depth ``z`` [m]; edge-on blades are left out."""
@@ -231,10 +243,11 @@ def shadow_leaf(
         o = leaf_shadow(m, shapes, i, x, y, per_leaf)
         su = wp.dot(m.sun, across)
         sv = wp.dot(m.sun, rib)
-        for py in range(wp.max(int(o.xy[2]), 0) + part, wp.min(int(o.xy[3]) + 2, m.side), slices):
+        for py in range(wp.max(int(o.xy[2]), window[2]) + part, wp.min(int(o.xy[3]) + 2, window[3]), slices):
             row = float(py)
-            first_x = wp.max(int(wp.max(wp.max(o.xy[0], wp.max(o.sums[0] - row, o.sums[2] + row)), 0.0)), 0)
-            last_x = wp.min(int(wp.max(wp.min(o.xy[1], wp.min(o.sums[1] - row, o.sums[3] + row)) + 2.0, 0.0)), m.side)
+            first_x = wp.max(int(wp.max(wp.max(o.xy[0], wp.max(o.sums[0] - row, o.sums[2] + row)), 0.0)), window[0])
+            last_x = int(wp.max(wp.min(o.xy[1], wp.min(o.sums[1] - row, o.sums[3] + row)) + 2.0, 0.0))
+            last_x = wp.min(last_x, window[1])
             for start in range(first_x, last_x, BATCH):
                 run = wp.min(last_x - start, BATCH)
                 whole = (run + 7) // 8 * 8
@@ -259,7 +272,15 @@ def shadow_leaf(
 
 
 @wp.func
-def shadow_solid(m: ShadowMap, shapes: Shapes, i: int, part: int, slices: int, depth_out: wp.array(dtype=wp.float32)):
+def shadow_solid(
+    m: ShadowMap,
+    shapes: Shapes,
+    i: int,
+    part: int,
+    slices: int,
+    window: wp.vec4i,
+    depth_out: wp.array(dtype=wp.float32),
+):
     """Draw box, ellipsoid or triangle ``i``: one ray from the sun for each texel of its bounding sphere."""
     kind = shapes.kind[i]
     a4 = shapes.a[i]
@@ -279,8 +300,8 @@ def shadow_solid(m: ShadowMap, shapes: Shapes, i: int, part: int, slices: int, d
     x = wp.dot(p, m.right) / m.texel
     y = wp.dot(p, m.up) / m.texel
     rt = reach_i / m.texel
-    for py in range(wp.max(int(y - rt), 0) + part, wp.min(int(y + rt) + 2, m.side), slices):
-        for px in range(wp.max(int(x - rt), 0), wp.min(int(x + rt) + 2, m.side)):
+    for py in range(wp.max(int(y - rt), window[2]) + part, wp.min(int(y + rt) + 2, window[3]), slices):
+        for px in range(wp.max(int(x - rt), window[0]), wp.min(int(x + rt) + 2, window[1])):
             from_sun = m.corner + m.right * (float(px) * m.texel) + m.up * (float(py) * m.texel) + m.sun * SUN_DISTANCE
             t = FAR
             if kind == TRIANGLE:
@@ -305,6 +326,7 @@ def raster_shadow_map(
     which: wp.array(dtype=wp.int32),
     m: ShadowMap,
     smallest: float,
+    window: wp.vec4i,
     lanes: int,
     slices: int,
     # out
@@ -313,6 +335,7 @@ def raster_shadow_map(
     """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it.
 
     ball: [cluster] centre and radius [m]; which: [thread] clusters; smallest: thinner canes are left out [texel];
+    window: first and last + 1 column, first and last + 1 row that are drawn;
     depth: [side * side] from SUN_DISTANCE above the map's corner along the sunlight [m], the least is kept.
     """
     k, lane, part = wp.tid()
@@ -320,11 +343,14 @@ def raster_shadow_map(
     kind = clusters.kind[cluster]
     bound = ball[cluster]
     e = xyz(bound) - m.corner
-    reach = bound[3] / m.texel
+    reach = bound[3] / m.texel + SHADOW_MARGIN
     bx = wp.dot(e, m.right) / m.texel
     by = wp.dot(e, m.up) / m.texel
-    side = float(m.side)
-    if bound[3] > 0.0 and bx > -reach and by > -reach and bx < side + reach and by < side + reach:
+    left = float(window[0])
+    right = float(window[1])
+    low = float(window[2])
+    high = float(window[3])
+    if bound[3] > 0.0 and bx > left - reach and by > low - reach and bx < right + reach and by < high + reach:
         first = clusters.first[cluster]
         for i in range(first + lane, first + clusters.size[cluster], lanes):
             a4 = shapes.a[i]
@@ -332,14 +358,18 @@ def raster_shadow_map(
             x = wp.dot(p, m.right) / m.texel
             y = wp.dot(p, m.up) / m.texel
             z = SUN_DISTANCE - wp.dot(p, m.sun)
+            blade = 1.8 * a4[3] / m.texel + 2.0  # beyond that a leaf does not reach
+            beside = x < left - blade or y < low - blade or x > right + blade or y > high + blade
+            if kind == LEAF and beside:
+                continue
             if kind == SPHEROID:
-                shadow_spheroid(m, a4[3], x, y, z, part, slices, depth_out)
+                shadow_spheroid(m, a4[3], x, y, z, part, slices, window, depth_out)
             elif kind == CONE or kind == CYLINDER:
-                shadow_cone(m, shapes, i, smallest, x, y, z, part, slices, depth_out)
+                shadow_cone(m, shapes, i, smallest, x, y, z, part, slices, window, depth_out)
             elif kind == LEAF:
-                shadow_leaf(m, shapes, i, x, y, z, part, slices, depth_out)
+                shadow_leaf(m, shapes, i, x, y, z, part, slices, window, depth_out)
             else:
-                shadow_solid(m, shapes, i, part, slices, depth_out)
+                shadow_solid(m, shapes, i, part, slices, window, depth_out)
 
 
 @wp.func

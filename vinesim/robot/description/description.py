@@ -9,7 +9,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.robot.description.kinematics import MovingJoints
-from vinesim.robot.description.sidecar import BaseLimits, Cutter, JointGroup, SensorMount
+from vinesim.robot.description.sidecar import BaseLimits, CameraMount, Cutter, JointGroup, SensorMount
 from vinesim.scene.values import Drive, RobotSpec
 
 
@@ -36,7 +36,7 @@ class RobotDescription:
     """[fixed, 7] child in parent."""
     link_anchors: dict[str, tuple[str, np.ndarray]]
     """Of every link: the moving link (or the root) it is fixed to, and its pose [7] there."""
-    cameras: tuple[SensorMount, ...]
+    cameras: tuple[CameraMount, ...]
     lidars: tuple[SensorMount, ...]
     imus: tuple[SensorMount, ...]
     wrenches: tuple[SensorMount, ...]

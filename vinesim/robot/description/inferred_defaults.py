@@ -8,7 +8,7 @@ from collections.abc import Container
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
-from vinesim.robot.description.sidecar import JointGroup, SensorMount
+from vinesim.robot.description.sidecar import CameraMount, JointGroup, SensorMount
 
 
 def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGroup]:
@@ -29,7 +29,7 @@ def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGro
     return {name: JointGroup(joints=tuple(members), tool=tool(name)) for name, members in groups.items()}
 
 
-def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
+def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[CameraMount, ...]:
     """A D435 in the first optical frame (colour before others), else in the first link named a camera; adds to
     ``notes``.
 
@@ -53,7 +53,7 @@ def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[SensorMount, 
         etree.SubElement(joint, "parent", link=link)
         etree.SubElement(joint, "child", link=found)
         etree.SubElement(joint, "origin", xyz="0 0 0", rpy=f"{-math.pi / 2} 0 {-math.pi / 2}")
-    return (SensorMount(name, found, "d435"),)
+    return (CameraMount(name, found, "d435"),)
 
 
 def guess_lidars(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:

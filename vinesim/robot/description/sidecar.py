@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import pathlib
 from collections.abc import Container, Iterable
+from typing import Literal
 
 import msgspec
 
@@ -60,12 +61,26 @@ class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         }  # fmt: skip
 
 
+MIN_CAMERA_SIZE, MAX_CAMERA_SIZE = 16, 4096
+"""Bounds of the width and height of a camera's picture [px]."""
+
+
 class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A sensor: its name in topics, the frame it sits in, and the file in ``data/cameras`` or ``data/lidars``."""
 
     name: str
     frame: str
     type: str = ""
+
+
+class CameraMount(SensorMount, frozen=True, forbid_unknown_fields=True):
+    """A camera, and in which quality and how often it is rendered live."""
+
+    quality: Literal["fast", "full", "still"] = "fast"
+    size: tuple[int, int] | None = None
+    """Width and height [px] with the same angle of view; the camera's own unless given."""
+    rate: float | None = None
+    """Pictures a second [Hz]; the camera's own unless given."""
 
 
 class Cutter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -86,7 +101,7 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     base: BaseLimits = BaseLimits()
     groups: dict[str, JointGroup] = {}
-    cameras: tuple[SensorMount, ...] | None = None
+    cameras: tuple[CameraMount, ...] | None = None
     lidars: tuple[SensorMount, ...] | None = None
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
@@ -116,6 +131,12 @@ def check_sidecar(sidecar: Sidecar, driven: Container[str], links: Container[str
     for mount in mounts:
         if mount.frame not in links:
             raise description_error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
+    for camera in sidecar.cameras or ():
+        if camera.size is not None and not all(MIN_CAMERA_SIZE <= n <= MAX_CAMERA_SIZE for n in camera.size):
+            bounds = f"give width and height from {MIN_CAMERA_SIZE} to {MAX_CAMERA_SIZE} px"
+            raise description_error(file, f"{camera.name!r} has the size {list(camera.size)}", bounds)
+        if camera.rate is not None and not 0.01 <= camera.rate <= 1000.0:
+            raise description_error(file, f"{camera.name!r} has the rate {camera.rate}", "give 0.01 to 1000 Hz")
 
 
 def _check_group(

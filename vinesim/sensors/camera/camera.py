@@ -20,7 +20,7 @@ from vinesim.kernels.launch import ThreadPool, usable_cores
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.sensing import stereo_rows
-from vinesim.kernels.shading import deferred, light_plants, light_points, shadow_maps
+from vinesim.kernels.shading import deferred, light_plants, light_points, shadow_maps, tone_rows
 from vinesim.kernels.shading.shadow_maps import ShadowMap
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput
@@ -67,9 +67,15 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         near, far = number(self.nearest, value=0.0), number(self.farthest, value=1000.0)
         return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None)
 
-    def info(self, frame_id: str, scale: float = 1.0) -> CameraInfo:
-        """Intrinsics with the principal point in the middle; ``scale`` enlarges the picture."""
+    def info(self, frame_id: str, scale: float = 1.0, size: tuple[int, int] | None = None) -> CameraInfo:
+        """Intrinsics with the principal point in the middle.
+
+        ``scale`` enlarges the picture; ``size`` gives it this width and height [px], with the same horizontal angle.
+        """
         width, height = round(self.width.value * scale), round(self.height.value * scale)
+        if size is not None:
+            width, height = size
+            scale = width / self.width.value
         return CameraInfo(
             width,
             height,
@@ -111,7 +117,16 @@ QUALITIES = {
 @functools.cache
 def load_camera_kernels() -> None:
     """Compile the CPU kernels of cameras, or read them from the cache: threads must not do so at the same time."""
-    for module in (camera_raster, camera_raster_plants, deferred, shadow_maps, light_points, light_plants, stereo_rows):
+    for module in (
+        camera_raster,
+        camera_raster_plants,
+        deferred,
+        shadow_maps,
+        light_points,
+        light_plants,
+        tone_rows,
+        stereo_rows,
+    ):
         wp.load_module(module, device="cpu")
 
 
@@ -153,7 +168,12 @@ class Camera:
         if samples > 1:
             self._supersampled = CameraRasterizer(width * samples, height * samples, self.device, workers)
         self._sunlight = Sunlight(
-            self.sun, taps=quality.taps, period=period, fine=quality.shadow_texel_divisor, device=self.device
+            self.sun,
+            taps=quality.taps,
+            period=period,
+            fine=quality.shadow_texel_divisor,
+            device=self.device,
+            workers=workers,
         )
         self._exposure = Exposure(width, height, samples, self.exposure, self.device, workers)
         self._live_light = LiveLight(self.rasterizer) if quality.is_live and self.device == "cpu" else None
@@ -195,8 +215,8 @@ class Camera:
         if CameraOutput.DEPTH not in outputs:
             depth = np.zeros((0, 0), np.float32)
         elif self._stereo:
-            lens, dice = pinhole(self.info, pose), spec_file.noise_rng(self.seed, self.name, self.image_index)
-            depth = self._stereo.measure(primitives, lens, exact, rgb, dice)
+            dice = spec_file.noise_rng(self.seed, self.name, self.image_index)
+            depth = self._stereo.measure(primitives, pinhole(self.info, pose), exact, rgb, dice)
         else:
             too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
             depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
@@ -247,8 +267,7 @@ class Camera:
         if quality.samples > 1:
             lens = pinhole(supersampled(self.info, quality.samples), pose)
             seen.draw(primitives, lens)
-        forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
-        near, far = self._sunlight.update(primitives, pose[:3], forward, time)
+        near, far = self.update_shadows(primitives, pose, time)
         if self._live_light is not None:
             maps = shadow_maps_of(near, far, self._sunlight.depth)
             self._live_light.shade(primitives, self._sunlight.light, maps, lens, self._exposure.radiance)
@@ -257,6 +276,13 @@ class Camera:
             seen.workers.share([functools.partial(shade, band) for band in seen.bands(lens)])
         self._exposure.add_glare(primitives, seen.primitive)
         return self._exposure.tone_map(self._sunlight.balance, time, self._sunlight.brightness)
+
+    def update_shadows(
+        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0
+    ) -> tuple[ShadowMap, ShadowMap]:
+        """The near and the far shadow map, drawn anew where they no longer hold at ``time`` [s] for ``pose`` [7]."""
+        forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
+        return self._sunlight.update(primitives, pose[:3], forward, time)
 
     def _shade(self, primitives: Primitives, near: ShadowMap, far: ShadowMap, lens: Pinhole) -> None:
         """Light the rows that ``lens`` draws."""

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.launch import ThreadPool
-from vinesim.kernels.shading import deferred
+from vinesim.kernels.shading import deferred, tone_rows
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
 
@@ -48,6 +48,8 @@ class Exposure:
         self.width, self.height, self.samples, self.fixed, self.device = width, height, samples, fixed, device
         self._workers = workers or ThreadPool(1)
         self.radiance = wp.empty(width * height * samples * samples, dtype=wp.vec3, device=device)
+        self._numbers = self.radiance.view(float) if device == "cpu" else None
+        """The same light as plain numbers [sample, 3]."""
         self._rgb = wp.empty((width * height, 3), dtype=wp.uint8, device=device)
         self._sum = wp.zeros(2, dtype=wp.int64, device=device)
         self._exposure = wp.array([fixed or 0.0], dtype=float, device=device)
@@ -96,6 +98,15 @@ class Exposure:
 
     def _tone_map_rows(self, balance: wp.vec3, first: int, end: int) -> None:
         """Turn the light of some rows into colours."""
+        if self.device == "cpu" and self.samples == 1:
+            wp.launch(
+                tone_rows.tone_map_rows,
+                end - first,
+                inputs=[self._numbers, self.width, balance, self._exposure, self._tone, first],
+                outputs=[self._rgb],
+                device="cpu",
+            )
+            return
         run = self.width if self.device == "cpu" else 1
         inputs = [self.radiance, self.width, self.samples, balance, self._exposure, self._tone, first * self.width, run]
         wp.launch(

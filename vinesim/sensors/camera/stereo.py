@@ -119,22 +119,32 @@ class Stereo:
     ) -> np.ndarray:
         """Measured depth [height, width] m from exact ``depth`` [height, width] m and the picture ``rgb``."""
         second = self._second_pinhole(lens)
-        disparity = (np.float32(self._parameters.focal_baseline) / depth).ravel()
-        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel()
         if self.device != "cpu":
             self._second.draw(primitives, second)
-            self._disparity.assign(disparity)
-            self._grey.assign(grey)
+            self._disparity.assign((np.float32(self._parameters.focal_baseline) / depth).ravel())
+            self._grey.assign(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel())
             self._noise.assign(self._correlated_noise(rng))
             self._measure_on_gpu(lens, second)
         else:
             if not self._second_from_first:
                 self._second.draw(primitives, second)
-            self._disparity.numpy()[:] = disparity
-            self._grey.numpy()[:] = grey
-            self._noise.numpy()[:] = self._correlated_noise(rng)
+            self._workers.share(
+                [
+                    functools.partial(self._draw_noise, rng),
+                    functools.partial(self._set_picture, depth, rgb),
+                ]
+            )
             self._measure_on_cpu(lens, second)
         return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
+
+    def _set_picture(self, depth: np.ndarray, rgb: np.ndarray) -> None:
+        """Disparity and grey levels of a picture for the kernels of a CPU."""
+        disparity = self._disparity.numpy().reshape(depth.shape)
+        np.divide(np.float32(self._parameters.focal_baseline), depth, out=disparity)
+        cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY, dst=self._grey.numpy().reshape(depth.shape))
+
+    def _draw_noise(self, rng: np.random.Generator) -> None:
+        self._noise.numpy()[:] = self._correlated_noise(rng)
 
     def _measure_on_gpu(self, lens: Pinhole, second: Pinhole) -> None:
         _, rows, columns = self._noise.shape

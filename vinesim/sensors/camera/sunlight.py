@@ -6,11 +6,13 @@ anew only when the camera has left its middle, or when something inside it has m
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
+from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
@@ -19,6 +21,12 @@ DEFAULT_SUN = (-0.41, -0.52, 0.75)
 """Towards the sun: south-west, half-way up."""
 
 
+Window = tuple[int, int, int, int]
+"""First and last + 1 column, first and last + 1 row of a shadow map."""
+_TILES = 8
+"""A map is drawn anew in tiles, this many across and down."""
+_NOTHING = 1.0e9
+"""Depth where nothing casts a shadow [m]."""
 _GPU_THREADS = (8, 16)
 """Threads that share the primitives of a cluster, and the rows of each of them, on a GPU."""
 
@@ -31,19 +39,29 @@ def _pairs(x: np.ndarray, y: np.ndarray, device: str) -> wp.array:
     return wp.array(np.stack([x, y], 1).astype(np.float32), dtype=wp.vec2, device=device)
 
 
-class _ShadowMap:
+class ShadowSquare:
     """One square of depths seen from the sun, around a focus that moves in steps."""
 
     def __init__(
-        self, texel: float, side: int, ahead: float, slack: float, rigid: bool, depth: wp.array, device: str
+        self,
+        texel: float,
+        side: int,
+        ahead: float,
+        slack: float,
+        rigid: bool,
+        depth: wp.array,
+        device: str,
+        workers: ThreadPool,
     ) -> None:
         """``depth`` [side * side] holds the map."""
-        self.ahead, self.slack, self.rigid, self.device = ahead, slack, rigid, device
+        self.ahead, self.slack, self.rigid, self.device, self._workers = ahead, slack, rigid, device, workers
         self._every, self._known = wp.empty(0, dtype=wp.int32, device=device), -1
         self.struct = shadow_maps.ShadowMap()
         self.struct.depth = depth
         self.struct.texel, self.struct.side = float(texel), side
         self.half = 0.5 * texel * side
+        self._drawn_balls = np.zeros((0, 4), np.float32)
+        """Bounding spheres of all clusters when the map was drawn last."""
 
     def set_sun(self, sun: np.ndarray) -> None:
         """Turn to the sun, a unit vector towards it; nothing that was drawn holds any more."""
@@ -55,25 +73,61 @@ class _ShadowMap:
         self.struct.right, self.struct.up, self.struct.sun = _vector(self.right), _vector(self.up), _vector(sun)
 
     def follow(self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float, period: float) -> None:
-        """Draw the map anew if it no longer holds for this camera at ``time``."""
+        """Draw the map anew, or the part of it that changed, if it no longer holds for this camera at ``time``."""
         wanted = eye + self.ahead * forward
         strayed = not np.linalg.norm(wanted - self.focus) <= self.slack
         other = self.built != primitives.layout_version
-        if not (strayed or other):
+        if strayed or other:
+            if strayed:
+                self.focus = wanted
+            windows = self._whole()
+        else:
             due = self.rigid and not 0.0 <= time - self.time < period
-            if not due or not (primitives.cluster_version[self._casters_inside(primitives)] > self.version).any():
+            windows = self._changed_windows(primitives) if due else []
+            if not windows:
                 return
-        if strayed:
-            self.focus = wanted
+            if self.device != "cpu":
+                windows = self._whole()
         self.time, self.version, self.built = time, primitives.pose_version, primitives.layout_version
-        self._draw(primitives)
+        self._draw(primitives, windows)
 
-    def _casters_inside(self, primitives: Primitives) -> np.ndarray:
-        """Clusters whose shadows may fall into the square."""
-        ball = primitives.ball.numpy()
+    def _whole(self) -> list[Window]:
+        """Windows that cover the map, one for each thread."""
+        side, count = self.struct.side, self._workers.size
+        return [(0, side, side * i // count, side * (i + 1) // count) for i in range(count)]
+
+    def _texels(self, ball: np.ndarray) -> np.ndarray:
+        """Least and largest column and row [ball, 4] that the shadows of some spheres [ball, 4] may touch."""
         apart = ball[:, :3] - self.focus
-        reach = self.half + ball[:, 3]
-        inside = (ball[:, 3] > 0.0) & (np.abs(apart @ self.right) < reach) & (np.abs(apart @ self.up) < reach)
+        middle = np.stack([apart @ self.right, apart @ self.up], 1) / self.struct.texel + 0.5 * self.struct.side
+        reach = ball[:, 3:] / self.struct.texel + float(shadow_maps.SHADOW_MARGIN) + 1.0
+        return np.stack([middle - reach, middle + reach], 2).reshape(-1, 4)
+
+    def _changed_windows(self, primitives: Primitives) -> list[Window]:
+        """Windows that hold all shadows that moved since the map was drawn, as they were and as they are."""
+        moved = primitives.cluster_version > self.version
+        balls = np.concatenate([self._drawn_balls[moved], primitives.ball.numpy()[moved]])
+        side = self.struct.side
+        texels = self._texels(balls[balls[:, 3] > 0.0])
+        texels = texels[(texels[:, ::2] < side).all(1) & (texels[:, 1::2] > 0.0).all(1)]
+        tile = np.clip(texels, 0.0, side - 1.0).astype(int) * _TILES // side
+        dirty = np.zeros((_TILES + 1, _TILES + 1), int)  # +1 and -1 at the corners of each box; summed up below
+        for row, column, value in ((2, 0, 1), (2, 1, -1), (3, 0, -1), (3, 1, 1)):
+            np.add.at(dirty, (tile[:, row] + (row == 3), tile[:, column] + (column == 1)), value)
+        dirty = dirty.cumsum(0).cumsum(1)[:-1] > 0
+        windows = []
+        for row in range(_TILES):
+            steps = np.flatnonzero(np.diff(dirty[row].astype(int), prepend=0))
+            for first, end in steps.reshape(-1, 2):
+                windows.append(tuple(side * n // _TILES for n in (first, end, row, row + 1)))
+        return windows
+
+    def _casters_inside(self, primitives: Primitives, window: Window) -> np.ndarray:
+        """Clusters whose shadows may fall into a window [k]."""
+        ball = primitives.ball.numpy()
+        texels = self._texels(ball)
+        inside = (ball[:, 3] > 0.0) & (texels[:, 0] < window[1]) & (texels[:, 1] > window[0])
+        inside &= (texels[:, 2] < window[3]) & (texels[:, 3] > window[2])
         if not self.rigid:
             inside[primitives.rigid_clusters] = False
         return np.flatnonzero(inside)
@@ -86,27 +140,27 @@ class _ShadowMap:
             self._every, self._known = wp.array(mine, device=self.device), primitives.layout_version
         return self._every
 
-    def _draw(self, primitives: Primitives) -> None:
+    def _draw(self, primitives: Primitives, windows: list[Window]) -> None:
         self.struct.corner = _vector(self.focus - self.half * (self.right + self.up))
-        self.struct.depth.fill_(1.0e9)
+        self._drawn_balls = primitives.ball.numpy().copy()
+        self._workers.share([functools.partial(self._draw_window, primitives, window) for window in windows])
+
+    def _draw_window(self, primitives: Primitives, window: Window) -> None:
+        """Clear and draw some columns and rows of the map."""
         if self.device == "cpu":
-            which, lanes, slices = wp.array(self._casters_inside(primitives).astype(np.int32), device="cpu"), 1, 1
+            which = wp.array(self._casters_inside(primitives, window).astype(np.int32), device="cpu")
+            lanes, slices = 1, 1
+            square = self.struct.depth.numpy().reshape(self.struct.side, self.struct.side)
+            square[window[2] : window[3], window[0] : window[1]] = _NOTHING
         else:  # a GPU culls faster than it can be told what to draw, and wants a thread for every row
             which, (lanes, slices) = self._casters(primitives), _GPU_THREADS
+            self.struct.depth.fill_(_NOTHING)
         if len(which):
+            scene = [primitives.shapes, primitives.clusters, primitives.ball, which, self.struct]
             wp.launch(
                 shadow_maps.raster_shadow_map,
                 (len(which), lanes, slices),
-                inputs=[
-                    primitives.shapes,
-                    primitives.clusters,
-                    primitives.ball,
-                    which,
-                    self.struct,
-                    0.25,
-                    lanes,
-                    slices,
-                ],
+                inputs=[*scene, 0.25, wp.vec4i(*map(int, window)), lanes, slices],
                 outputs=[self.struct.depth],
                 device=self.device,
             )
@@ -154,6 +208,7 @@ class Sunlight:
         period: float = 0.2,
         fine: int = 1,
         device: str = "cpu",
+        workers: ThreadPool | None = None,
     ) -> None:
         """``sun`` points towards the sun, or says where it is when.
 
@@ -175,12 +230,13 @@ class Sunlight:
         turn = np.arange(64) * (2.0 * np.pi / 64)
         light.sample_rotations = _pairs(np.cos(turn), np.sin(turn), device)
         self.light = light
+        workers = workers or ThreadPool(1)
         side = 1024 * fine
         self.depth = wp.empty(side * side + 1024 * 1024, dtype=float, device=device)
         """Depths of both shadow maps [texel]: the near one, then the far one."""
         near, far = self.depth[: side * side], self.depth[side * side :]
-        self._near = _ShadowMap(0.007 / fine, side, 2.5, 0.8, True, near, device)
-        self._far = _ShadowMap(0.035, 1024, 12.0, 4.0, False, far, device)
+        self._near = ShadowSquare(0.007 / fine, side, 2.5, 0.8, True, near, device, workers)
+        self._far = ShadowSquare(0.035, 1024, 12.0, 4.0, False, far, device, workers)
 
     def _update_light(self, time: float) -> None:
         """Take the light from where the sun is now, if it has moved."""

@@ -66,11 +66,7 @@ def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> Camera
             f"size is {width}x{height}; give WxH from {MIN_IMAGE_SIZE}x{MIN_IMAGE_SIZE} to "
             f"{MAX_IMAGE_SIZE}x{MAX_IMAGE_SIZE}"
         )
-    if size is None:
-        return spec.info("camera_optical_frame")
-    scale = width / spec.width.value
-    focal = spec.fx.value * scale, spec.fy.value * scale
-    return CameraInfo(width, height, *focal, 0.5 * (width - 1), 0.5 * (height - 1), "camera_optical_frame")
+    return spec.info("camera_optical_frame", size=size)
 
 
 class SnapshotSource(Protocol):
@@ -150,7 +146,7 @@ class VineyardRenderer:
         seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
         truths = ground_truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
         camera = Camera(
-            self.spec, self.info, "camera", sun, quality="still", seed=self.plan.seed, image_index=image,
+            self.spec, self.info, "camera", sun, quality="still", threads=1, seed=self.plan.seed, image_index=image,
             device=self.plan.device,
         )  # fmt: skip
         frame = camera.render(self.primitives, seen.pose)
