@@ -43,6 +43,12 @@ def _asleep() -> Iterator[Measurement]:
     return sleeping_measurements(load_description("vinebot").to_spec("robot"))
 
 
+def _start() -> Iterator[Measurement]:
+    from vinesim.bench.start import start_measurements
+
+    return start_measurements()
+
+
 def _camera() -> Iterator[Measurement]:
     from vinesim.bench.camera import camera
 
@@ -110,6 +116,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "contact": _contact,
     "tick": _tick,
     "asleep": _asleep,
+    "start": _start,
     "camera": _camera,
     "lidar": _lidar,
     "sensors": _sensors,

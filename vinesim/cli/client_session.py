@@ -23,6 +23,7 @@ from vinesim.client.tasks.start_poses import with_start_pose
 from vinesim.kernels.compilation import compile_kernels
 from vinesim.net.transport.bus import Bus
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.physics.plants.device_buffers import DeviceLost, device_fault
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
@@ -118,7 +119,13 @@ class ClientSession:
         self._stack.callback(reporter.join)
         self._stack.callback(self._stop.set)
         is_done = (lambda: False) if task is None else (lambda: task.is_done)
-        run_loop(self._stop, client.tick, loop, self.options.seconds, client.physics.dt, is_done)
+        try:
+            run_loop(self._stop, client.tick, loop, self.options.seconds, client.physics.dt, is_done)
+        except RuntimeError as failure:
+            device = self.options.device
+            if device == "cpu" or (fault := device_fault(device)) is None:
+                raise
+            raise DeviceLost(f"{device} failed after {client.physics.time:.1f} s: {fault}") from failure
         if self.options.tick_log is not None:
             loop.log().save(self.options.tick_log)
         return status

@@ -87,8 +87,7 @@ def run(
     plan, staged = with_seed(load_scene(scene), seed), parse_composition(robots, people, crates)
     if hour is not None:
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
-    if device == "cpu":
-        compile_kernels(SENSOR_PACKAGES)
+    compile_kernels(SENSOR_PACKAGES, device)
     model = generate(plan)
     view = staged.compose(model)
     primitives = Primitives(model, renderer=renderer, device=device)

@@ -29,6 +29,12 @@ class DeviceUnavailable(ValueError):
     exit_code = 3
 
 
+class DeviceLost(RuntimeError):
+    """A device failed while it computed; the text says which, how, and what to do."""
+
+    exit_code = 3
+
+
 def find_device(name: str) -> wp.Device:
     """The Warp device called ``cpu``, ``cuda`` or ``cuda:N``; :class:`DeviceUnavailable` in words if there is none."""
     if name != "cpu" and name.partition(":")[0] != "cuda":

@@ -38,6 +38,9 @@ SHOULDER_DROP = 0.10
 """[m] The lift brings the shoulder this far below the working height. GUESSED"""
 MIN_SINGULAR_VALUE = 0.06
 """[m/rad] Smaller singular values are damped, which bounds joint rates near singular postures. GUESSED"""
+LIMIT_MARGIN = 0.005
+"""[rad or m] Joints stop this far before their limits, where each would press on an end stop, a constraint for the
+physics to solve. GUESSED"""
 RATE_RAMP_TIME = 0.15
 """[s] Shortest time in which a joint reaches its largest velocity. GUESSED"""
 
@@ -65,7 +68,9 @@ class CartesianController:
         self._tip_offset = tip_offset
         self._joints = robot.joint_indices([*lifts, *arm.joints])
         self._lifts = len(lifts)
-        self._lower, self._upper = robot.lower_limit[self._joints], robot.upper_limit[self._joints]
+        lower, upper = robot.lower_limit[self._joints], robot.upper_limit[self._joints]
+        margin = np.minimum(LIMIT_MARGIN, 0.25 * (upper - lower))
+        self._lower, self._upper = lower + margin, upper - margin
         self._fastest = robot.max_velocity[self._joints]
         self._largest_change = self._fastest * robot.rigid.dt / RATE_RAMP_TIME
         """[joint] Largest change of a rate in one step [rad/s or m/s]."""

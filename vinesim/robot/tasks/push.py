@@ -27,6 +27,8 @@ FINGER_LENGTH = 0.027
 """[m] Distance of vinebot's fingertips from its grasping frame."""
 PUSH_ELEVATION = 0.35
 """[rad] Fingers point up by this angle, so that forearm and wrist stay below the leaves. GUESSED"""
+CLOSED_OPENING = 0.002
+"""[m] Between closed fingers, which then do not press on their end stops. GUESSED"""
 POSITION_TOLERANCE = 0.003
 """[m] Fingertips this near to the goal of a phase have reached it. GUESSED"""
 
@@ -138,7 +140,7 @@ class PushBunch:
         self._height = center[2]
         self.arm.reset()
         if self.arm.gripper:
-            self.robot.command_gripper(self.arm.gripper, 0.0)
+            self.robot.command_gripper(self.arm.gripper, CLOSED_OPENING)
 
     def _begin(self, phase: Phase, time: float) -> None:
         self.phase, self._started = phase, time
