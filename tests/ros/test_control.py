@@ -59,20 +59,22 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
         peer.node.create_subscription(JointState, "/joint_states", received.append, 10)
         arm = peer.node.create_publisher(JointTrajectory, "/head_controller/joint_trajectory", 10)
         wheels = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 10)
-        wait_until(lambda: arm.get_subscription_count() and wheels.get_subscription_count(), peer.spin)
-        wait_until(lambda: node.has_subscribers("joint_states"), peer.spin)
+        wait_until(lambda: arm.get_subscription_count() and wheels.get_subscription_count(), peer.spin, "subscribers")
+        wait_until(lambda: node.has_subscribers("joint_states"), peer.spin, "joint_states")
 
         def step() -> None:
             client.tick()
             peer.spin()
 
-        wait_until(lambda: received, step)
+        wait_until(lambda: received, step, "the first joint state")
         assert abs(head_of(received[-1])) < 0.05
         point = JointTrajectoryPoint(positions=[GOAL])
         point.time_from_start.sec = 1
         arm.publish(JointTrajectory(joint_names=["head_1_joint"], points=[point]))
-        wait_until(lambda: abs(robot.rigid.joint_measurements("robot")[0][head] - GOAL) < 0.02, step)
-        wait_until(lambda: abs(head_of(received[-1]) - GOAL) < 0.02, step)
+        wait_until(
+            lambda: abs(robot.rigid.joint_measurements("robot")[0][head] - GOAL) < 0.02, step, "the joint at its goal"
+        )
+        wait_until(lambda: abs(head_of(received[-1]) - GOAL) < 0.02, step, "its joint state")
 
         start = robot.rigid.base_state("robot")[0][:2].copy()
         forward = TwistStamped()
@@ -83,4 +85,6 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
             step()
             time.sleep(0.01)
 
-        wait_until(lambda: np.linalg.norm(robot.rigid.base_state("robot")[0][:2] - start) > 0.1, drive)
+        wait_until(
+            lambda: np.linalg.norm(robot.rigid.base_state("robot")[0][:2] - start) > 0.1, drive, "the base on its way"
+        )

@@ -82,11 +82,11 @@ def lidar_scan(t: float, count: int) -> LidarScan:
 
 
 @contextlib.contextmanager
-def topic_monitor(*topics: str) -> Iterator[Callable[[], dict]]:
+def topic_monitor(*topics: str, queue: int = 10) -> Iterator[Callable[[], dict]]:
     """A peer in a second process; call what is yielded to have its report."""
     asked = [word for topic in topics for word in ("--topic", topic)]
     process = subprocess.Popen(
-        [sys.executable, "-m", "vinesim.ros.tools.topic_monitor", *asked],
+        [sys.executable, "-m", "vinesim.ros.tools.topic_monitor", "--queue", str(queue), *asked],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -114,7 +114,8 @@ def test_large_messages_reach_another_process():
     with (
         RobotNode("vinebot", URDF, static_transforms=static) as robot,
         SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,
-        topic_monitor(*small, *large, *latched) as report,
+        # a second of messages may wait: on a busy machine the other process gets its turn late
+        topic_monitor(*small, *large, *latched, queue=100) as report,
     ):
         own = [name if name == "/clock" else name[1:] for name in (*small, *latched)]
         wait_until(lambda: all(robot.has_subscribers(name) for name in own))

@@ -14,11 +14,13 @@ TIMEOUT = 120.0
 """Longest wait for anything [s]; reached only by a failure, also on a busy machine."""
 
 
-def wait_until(condition: Callable[[], object], meanwhile: Callable[[], object] = lambda: time.sleep(0.01)) -> None:
-    """Call ``meanwhile`` until ``condition`` holds, at most :data:`TIMEOUT`."""
+def wait_until(
+    condition: Callable[[], object], meanwhile: Callable[[], object] = lambda: time.sleep(0.01), name: str = "condition"
+) -> None:
+    """Call ``meanwhile`` until ``condition`` holds, at most :data:`TIMEOUT`; a failure shows the ``name``."""
     deadline = time.monotonic() + TIMEOUT
     while not condition():
-        assert time.monotonic() < deadline, f"waited {TIMEOUT} s in vain"
+        assert time.monotonic() < deadline, f"waited {TIMEOUT} s in vain for: {name}"
         meanwhile()
 
 

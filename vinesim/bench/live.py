@@ -89,7 +89,7 @@ def measure_lidar() -> Iterator[Measurement]:
 def measure_cold() -> Iterator[Measurement]:
     """A client on a machine that has run none before: kernels are compiled, caches are empty."""
     with tempfile.TemporaryDirectory() as cache:
-        run = run_client((), (RGB, DEPTH), 1.0, WARP_CACHE_PATH=cache, XDG_CACHE_HOME=cache)
+        run = run_client((), (RGB, DEPTH), 1.0, WARP_CACHE_PATH=cache, VINESIM_CACHE=cache)
     yield at_most("client: from start to first picture, cold", max(run.first[RGB], run.first[DEPTH]), "s", 30.0)
 
 
@@ -117,7 +117,7 @@ def measure_generation() -> Iterator[Measurement]:
     for scene, fresh, cached in (("demo", 0.3, 0.1), ("tendone", 2.0, 0.5)):
         with tempfile.TemporaryDirectory() as cache:
             for case, budget in (("generate", fresh), ("generate, cached", cached)):
-                with own_processes(XDG_CACHE_HOME=cache) as group:
+                with own_processes(VINESIM_CACHE=cache) as group:
                     process = group.start("generate", "-c", GENERATE, scene)
                     took = float(process.next_line(COMMAND_TIMEOUT))
                 yield at_most(f"{case} {scene}", took, "s", budget)

@@ -121,7 +121,8 @@ class TopicStats:
     def report(self, until: float | None = None) -> dict[str, Any]:
         """The statistics until a wall time [s] as plain values; ``lost`` is None if several publishers number their
         messages apart."""
-        span = (time.time() if until is None else until) - (self.since or 0.0)
+        now = time.time_ns() * 1e-9 if until is None else until
+        span = 0.0 if self.since is None else now - self.since
         return {
             "type": self.type_name,
             "type_hash": self.type_hash,
@@ -141,10 +142,11 @@ class TopicMonitor:
     """Subscribes to topics as they appear."""
 
     def __init__(
-        self, topics: Sequence[str] = (), once: Sequence[str] = (), announce: Callable[[str, float], None] | None = None
-    ) -> None:
+        self, topics: Sequence[str] = (), once: Sequence[str] = (),
+        announce: Callable[[str, float], None] | None = None, queue_depth: int = QUEUE_DEPTH,
+    ) -> None:  # fmt: skip
         """``topics`` and ``once`` name the topics, all if both are empty; ``announce`` is called with each topic and
-        the wall time of its first message [s]."""
+        the wall time of its first message [s]; ``queue_depth``: messages of one topic that may wait for this node."""
         from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
@@ -152,6 +154,7 @@ class TopicMonitor:
         self.stats: dict[str, TopicStats] = {}
         self._topics, self._once = {*topics, *once}, set(once)
         self._announce = announce
+        self._queue_depth = queue_depth
         self._unannounced: set[str] = set()
         self._clock = SimulationClock()
         self._context = Context()
@@ -213,7 +216,7 @@ class TopicMonitor:
         reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in offered)
         latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in offered)
         qos = QoSProfile(
-            depth=QUEUE_DEPTH,
+            depth=self._queue_depth,
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
@@ -264,6 +267,7 @@ class Arguments:
     topics: list[str]
     once: list[str]
     announce: bool
+    queue: int
     seconds: float | None
     out: pathlib.Path | None
 
@@ -276,10 +280,11 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
     parser.add_argument("--topic", action="append", default=[], help="monitor this one only (may be repeated)")
     parser.add_argument("--once", action="append", default=[], help="only until its first message (may be repeated)")
     parser.add_argument("--announce", action="store_true", help="print a JSON line for each topic's first message")
+    parser.add_argument("--queue", type=int, default=QUEUE_DEPTH, help="messages of a topic that may wait for it")
     parser.add_argument("--seconds", type=float, help="from the first message on; default: until stdin is closed")
     parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
     given = parser.parse_args(arguments)
-    return Arguments(given.topic, given.once, given.announce, given.seconds, given.out)
+    return Arguments(given.topic, given.once, given.announce, given.queue, given.seconds, given.out)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -294,7 +299,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     requests: queue.SimpleQueue[str] = queue.SimpleQueue()
     if given.seconds is None:
         threading.Thread(target=_read_requests, args=(requests,), daemon=True).start()
-    monitor = TopicMonitor(given.topics, given.once, _print_first if given.announce else None)
+    monitor = TopicMonitor(given.topics, given.once, _print_first if given.announce else None, given.queue)
     if given.announce:
         _print_line({"listening": time.time()})
     with contextlib.suppress(KeyboardInterrupt):

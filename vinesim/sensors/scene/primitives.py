@@ -95,7 +95,7 @@ class Primitives:
             for table in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
         )
         if ripeness is None:
-            baked = disk_cache.load_or_make("primitives", _digest(model, grass), lambda: self._bake(grass))
+            baked = disk_cache.load_or_make("primitives", _digest(model, grass, device), lambda: self._bake(grass))
         else:
             baked = self._bake(grass)
         self._open(baked)
@@ -358,13 +358,14 @@ def _ground_step(low: np.ndarray, high: np.ndarray) -> float:
     return max(0.2, float((high - low).max()) / 500.0)
 
 
-def _digest(model: Model, grass: float) -> str:
-    """Of all that the plants' primitives follow from."""
+def _digest(model: Model, grass: float, device: str) -> str:
+    """Of all that the plants' primitives follow from; a GPU rounds their light in its own way."""
     package = pathlib.Path(__file__).parents[2]
     code = [package / part for part in ("scene", "sensors/scene", "sensors/raster", "kernels/raster", "frames.py")]
     shading = package / "kernels" / "shading"
     code += [shading / "materials.py", shading / "shadow_maps.py"]
-    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r}")
+    where = device.partition(":")[0]
+    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r}", where)
 
 
 def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:
