@@ -26,9 +26,11 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import msgspec
 import numpy as np
 import warp as wp
 
+from vinesim.cli.client_session import SWITCH_INTERVAL, run_loop
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
@@ -38,7 +40,6 @@ from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose, s
 from vinesim.kernels.compilation import compile_kernels
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.description.sidecar import SensorMount
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
@@ -85,9 +86,8 @@ def running_client(device: str, plants: str) -> Iterator[tuple[Client, sensor_pr
     """A client whose robot pushes a bunch again and again; its sensors on ``device``, its plants on ``plants``."""
     scene = load_scene("demo")
     model, robot = generate(scene), load_description("vinebot")
-    frame = robot.cameras[0].frame
-    cameras = tuple(SensorMount(f"camera_{i}", frame, "d435") for i in range(CAMERAS))
-    lidars = (SensorMount("lidar", robot.lidars[0].frame, "os1_64"),)
+    cameras = tuple(msgspec.structs.replace(robot.cameras[0], name=f"camera_{i}") for i in range(CAMERAS))
+    lidars = (msgspec.structs.replace(robot.lidars[0], type="os1_64"),)
     robot = dataclasses.replace(robot, cameras=cameras, lidars=lidars)
     sensor_process.run_sensor_worker = render_all
     with contextlib.ExitStack() as stack:
@@ -113,7 +113,6 @@ def measure_client(report: Report, device: str, plants: str, seconds: float) -> 
     """Rates of all sensors and the tick beside them, in real time."""
     with running_client(device, plants) as (client, sensors):
         loop, marks = RateLoop(client.physics.dt), []
-        steps = round((WARM_UP + seconds) / loop.dt)
         stop = threading.Event()
 
         def watch() -> None:
@@ -123,10 +122,8 @@ def measure_client(report: Report, device: str, plants: str, seconds: float) -> 
 
         watcher = threading.Thread(target=watch)
         watcher.start()
-        for _ in range(steps):
-            loop.begin()
-            client.tick()
-            loop.end()
+        sys.setswitchinterval(SWITCH_INTERVAL)
+        run_loop(stop, client.tick, loop, WARM_UP + seconds, loop.dt)
         stop.set()
         watcher.join()
     log = loop.log()

@@ -169,7 +169,11 @@ def measure(say: Report, model: Model, device: str) -> None:
         spent = milliseconds(lambda c=camera, at=lens: c.rasterizer.draw(primitives, at), device)
         say(f"{name}: visibility alone, {about}", spent, "ms")
         for reach, one in (("near", camera._sunlight._near), ("far", camera._sunlight._far)):
-            say(f"{name}: {reach} shadows drawn anew", milliseconds(lambda m=one: m._draw(primitives), device), "ms")
+            say(
+                f"{name}: {reach} shadows drawn anew",
+                milliseconds(lambda m=one: m._draw(primitives, m._whole()), device),
+                "ms",
+            )
     poses = [look_at(np.array([-0.6 + 1e-4 * n, 1.0, 1.45]), np.array([8.0, 1.35, 1.45])) for n in range(400)]
     for quality in ("fast", "full"):
         camera = Camera(spec, info, quality=quality, device=device)

@@ -42,7 +42,7 @@ def test_of_processes_that_start_together_one_compiles(tmp_path: pathlib.Path) -
     lines = next(words for count, words in results if count)
     for number in range(1, counts[1] + 1):
         assert sum(f"({number} of {counts[1]})" in line for line in lines) == 1
-    assert all(line.startswith("compiling kernels: sensing.") for line in lines)
+    assert all(line.startswith("compiling kernels for cpu: sensing.") for line in lines)
 
     assert compiled(start(tmp_path)) == (0, [])
     lost = next((tmp_path / "warp").glob("*/wp_vinesim.kernels.sensing.lidar*"))
@@ -50,3 +50,14 @@ def test_of_processes_that_start_together_one_compiles(tmp_path: pathlib.Path) -
     count, lines = compiled(start(tmp_path))
     assert count == 1
     assert "lidar" in lines[0]
+
+
+@pytest.mark.slow
+def test_a_cache_that_cannot_be_made_is_replaced_for_this_time(tmp_path: pathlib.Path) -> None:
+    (tmp_path / "warp").write_text("not a folder")
+    environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "warp"), "TMPDIR": str(tmp_path)}
+    program = PROGRAM.replace(f"({PACKAGE!r},)", "('human_kinematics',)")
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert "compiled 1" in done.stdout
+    assert (done.stdout + done.stderr).count("set WARP_CACHE_PATH") == 1
+    assert list(tmp_path.glob("vinesim-kernels-*/*/wp_vinesim.kernels.human_kinematics*"))

@@ -40,7 +40,7 @@ class Camera:
         Args:
             kind: name or path of a camera file; :class:`~vinesim.sensors.spec_file.SensorError` if it cannot be used.
             size: width and height [px] with the same angle of view; the camera's own unless given.
-            quality: ``"fast"``, ``"full"`` or ``"still"``: what a picture may cost. Depth and labels are the same.
+            quality: ``"fast"``, ``"full"`` or ``"still"``: what a picture may cost, not exact depth and labels.
             name: with ``seed`` it decides the noise of the measured depth.
             seed: see ``name``.
         """

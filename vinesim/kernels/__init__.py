@@ -1,9 +1,22 @@
 """Warp kernels: plain arrays in, plain arrays out; one thread does one thing, and its docstring says what."""
 
+import logging
 import os
 import tempfile
 
 import warp as wp
+
+
+def use_temporary_cache(reason: object) -> None:
+    """Keep compiled kernels in a temporary folder, for this process and those that it starts; one warning."""
+    folder = tempfile.mkdtemp(prefix="vinesim-kernels-")
+    logging.getLogger(__name__).warning(
+        "compiled kernels are kept in %s for this time, as Warp's cache cannot be written (set WARP_CACHE_PATH): %s",
+        folder, reason,
+    )  # fmt: skip
+    os.environ["WARP_CACHE_PATH"] = folder
+    wp.config.kernel_cache_dir = os.path.join(folder, wp.config.version)
+    os.makedirs(wp.config.kernel_cache_dir)
 
 
 def _start_warp() -> None:
@@ -15,7 +28,12 @@ def _start_warp() -> None:
         standard_error = os.dup(2)
         os.dup2(words.fileno(), 2)
         try:
-            wp.init()
+            try:
+                wp.init()
+            except OSError as error:  # its cache cannot be made
+                use_temporary_cache(error)
+                wp.config.kernel_cache_dir = None  # as the environment has it, in all processes alike
+                wp.init()
         finally:
             os.dup2(standard_error, 2)
             os.close(standard_error)

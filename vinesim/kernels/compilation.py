@@ -5,11 +5,13 @@ compile the same modules, in silence and one after the other. :func:`compile_ker
 """
 
 import concurrent.futures
+import contextlib
 import hashlib
 import importlib
 import os
 import pathlib
 import pkgutil
+import sys
 import types
 
 import warp as wp
@@ -39,11 +41,14 @@ def compile_kernels(packages: tuple[str, ...] = (), device: str = "cpu") -> int:
     with disk_cache.exclusive("kernels", TIMEOUT, waiting_for="another process that compiles kernels"):
         if _is_valid(stamp):
             return 0
+        if not os.access(wp.config.kernel_cache_dir, os.W_OK):
+            vinesim.kernels.use_temporary_cache(f"{wp.config.kernel_cache_dir} is read-only")
         modules = _modules(packages)
         folders = [os.path.join(wp.config.kernel_cache_dir, m.get_module_identifier(1)) for m in modules]
         missing = [m for m, folder in zip(modules, folders, strict=True) if not os.path.isdir(folder)]
         _compile(missing, "cpu")
-        stamp.write_text("\n".join(folders))
+        with contextlib.suppress(OSError):  # then the next start looks again
+            _stamp(packages).write_text("\n".join(folders))
     return len(missing)
 
 
@@ -61,7 +66,7 @@ def _compile(modules: list[wp.Module], device: str) -> None:
 
 
 def _modules(packages: tuple[str, ...], without: tuple[str, ...] = _CUDA_ONLY) -> list[wp.Module]:
-    """All Warp modules of the packages that have kernels, by name."""
+    """All Warp modules of the packages that have kernels, long ones first."""
     found = []
     for info in pkgutil.walk_packages(vinesim.kernels.__path__, "vinesim.kernels."):
         part = info.name.split(".")[2]
@@ -71,7 +76,8 @@ def _modules(packages: tuple[str, ...], without: tuple[str, ...] = _CUDA_ONLY) -
         module = wp.get_module(python.__name__)
         if module.kernels:
             found.append(module)
-    return found
+    # those that take longest first, by and large, so that no core waits for the last one
+    return sorted(found, key=lambda module: -os.path.getsize(sys.modules[module.name].__file__ or ""))
 
 
 def _stamp(packages: tuple[str, ...]) -> pathlib.Path:

@@ -89,7 +89,7 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """How much a picture may cost. Depth and labels are the same in all."""
+    """How much a picture may cost. Exact depth and labels are the same in all."""
 
     taps: int
     """Shadow samples a pixel; 0: a smooth filter of two widths; -1: of one."""

@@ -61,7 +61,7 @@ class ShadowSquare:
         self.struct.texel, self.struct.side = float(texel), side
         self.half = 0.5 * texel * side
         self._drawn_balls = np.zeros((0, 4), np.float32)
-        """Bounding spheres of all clusters when the map was drawn last."""
+        """Bounding spheres of all clusters when the map was drawn last; a GPU draws the whole map and keeps none."""
 
     def set_sun(self, sun: np.ndarray) -> None:
         """Turn to the sun, a unit vector towards it; nothing that was drawn holds any more."""
@@ -106,7 +106,9 @@ class ShadowSquare:
     def _changed_windows(self, primitives: Primitives) -> list[Window]:
         """Windows that hold all shadows that moved since the map was drawn, as they were and as they are."""
         moved = primitives.cluster_version > self.version
-        balls = np.concatenate([self._drawn_balls[moved], primitives.ball.numpy()[moved]])
+        balls = primitives.ball.numpy()[moved]
+        if self.device == "cpu":
+            balls = np.concatenate([balls, self._drawn_balls[moved]])
         side = self.struct.side
         texels = self._texels(balls[balls[:, 3] > 0.0])
         texels = texels[(texels[:, ::2] < side).all(1) & (texels[:, 1::2] > 0.0).all(1)]
@@ -142,7 +144,8 @@ class ShadowSquare:
 
     def _draw(self, primitives: Primitives, windows: list[Window]) -> None:
         self.struct.corner = _vector(self.focus - self.half * (self.right + self.up))
-        self._drawn_balls = primitives.ball.numpy().copy()
+        if self.device == "cpu":
+            self._drawn_balls = primitives.ball.numpy().copy()
         self._workers.share([functools.partial(self._draw_window, primitives, window) for window in windows])
 
     def _draw_window(self, primitives: Primitives, window: Window) -> None:

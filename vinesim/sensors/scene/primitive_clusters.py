@@ -79,6 +79,19 @@ def lay_out(fixed: Sequence[Batch], moving: Sequence[Batch], static_carrier: int
     return ClusterLayout(**joined)
 
 
+def join_rigid(layouts: Sequence[ClusterLayout], carriers: Sequence[int], first_row: int) -> ClusterLayout:
+    """Layouts of rigid bodies, one after the other from the primitive ``first_row`` on, each on its own carrier."""
+    joined = {
+        field.name: np.concatenate([getattr(one, field.name) for one in layouts])
+        for field in dataclasses.fields(ClusterLayout)
+    }
+    rows = [len(one.label) for one in layouts]
+    starts = first_row + np.cumsum(rows) - rows
+    joined["carrier"] = np.repeat(carriers, rows).astype(np.int32)
+    joined["first"] += np.repeat(starts, [len(one.first) for one in layouts]).astype(np.int32)
+    return ClusterLayout(**joined)
+
+
 def _runs(group: np.ndarray, bunch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """First index and size [cluster] of runs of equal group and bunch, cut after :data:`MAX_CLUSTER` primitives."""
     starts = np.flatnonzero(np.r_[True, (group[1:] != group[:-1]) | (bunch[1:] != bunch[:-1])])

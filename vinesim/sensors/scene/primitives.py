@@ -21,7 +21,7 @@ from vinesim.scene import berries
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import RigidVisual, Snapshot
+from vinesim.scene.values import RigidVisual, Shape, Snapshot
 from vinesim.sensors.raster import renderer_selection
 from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
 from vinesim.sensors.scene import textures
@@ -29,7 +29,7 @@ from vinesim.sensors.scene.bunch_primitives import Ripeness, bunch_batches, bunc
 from vinesim.sensors.scene.leaf_area_density import LeafDensity
 from vinesim.sensors.scene.plant_primitives import cane_batch, leaf_batches
 from vinesim.sensors.scene.primitive_batches import Batch, placeholder_batch
-from vinesim.sensors.scene.primitive_clusters import ClusterLayout, lay_out
+from vinesim.sensors.scene.primitive_clusters import ClusterLayout, join_rigid, lay_out
 from vinesim.sensors.scene.rigid_primitives import rigid_batches
 from vinesim.sensors.scene.static_primitives import grass_batch, litter_batch, row_layout, trellis_batch
 
@@ -77,6 +77,8 @@ class Primitives:
         self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
+        self._rigid: dict[tuple[Organ, int, int], tuple[tuple[Shape, ...], ClusterLayout | None]] = {}
+        """Shapes and clusters of the rigid bodies by organ, index and identity of the shapes."""
         self._moved = np.zeros(0, np.int64)
         outline, hull = textures.leaf_outlines()
         self._outline, self._hull = wp.array(outline, device=device), wp.array(hull, dtype=wp.vec2, device=device)
@@ -185,15 +187,12 @@ class Primitives:
 
     def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
         """Lay out the primitives of rigid bodies behind those of the plants, which stay as they are."""
-        plants, empty = self._plants, not visuals
-        moving = rigid_batches(
-            self.model, visuals, self._static_carrier + 1, 0, self._picked_bunch_shapes(visuals), self._ripeness
-        )
-        rigid = plants if empty or not moving else lay_out([], moving, self._static_carrier)
-        empty = rigid is plants
+        plants = self._plants
         rows, clusters = len(plants.label), len(plants.first)
+        bodies = self._lay_out_rigid(visuals)
+        empty = not bodies
+        rigid = plants if empty else join_rigid([one for _, one in bodies], [carrier for carrier, _ in bodies], rows)
         if not empty:
-            rigid = dataclasses.replace(rigid, first=rigid.first + rows)
             if rows + len(rigid.label) > len(self._columns["label"]) or clusters + len(rigid.first) > len(
                 self._columns["first"]
             ):
@@ -225,6 +224,21 @@ class Primitives:
         """[carrier, 7]; on a CPU the kernels read this very memory."""
         self._visuals = visuals
         self.layout_version += 1
+
+    def _lay_out_rigid(self, visuals: tuple[RigidVisual, ...]) -> list[tuple[int, ClusterLayout]]:
+        """Carrier and clusters of each rigid body that has a shape; one that was there before is not laid out anew."""
+        picked, known, found = self._picked_bunch_shapes(visuals), {}, []
+        for number, visual in enumerate(visuals):
+            key = visual.organ, visual.index, id(visual.shapes)
+            if key not in self._rigid:
+                batches = rigid_batches(self.model, (visual,), 0, 0, picked, self._ripeness)
+                layout = lay_out([], batches, -1) if batches else None
+                self._rigid[key] = visual.shapes, layout
+            known[key] = self._rigid[key]
+            if (layout := known[key][1]) is not None:
+                found.append((self._static_carrier + 1 + number, layout))
+        self._rigid = known
+        return found
 
     def _reserve(self, plants: ClusterLayout, rigid: int) -> None:
         """Device memory for the plants and twice as many rigid primitives as given; that of the plants is kept."""
