@@ -32,6 +32,7 @@ def _start_warp() -> None:
                 wp.init()
             except OSError as error:  # its cache cannot be made
                 use_temporary_cache(error)
+                wp.config.kernel_cache_dir = None  # as the environment has it, in all processes alike
                 wp.init()
         finally:
             os.dup2(standard_error, 2)
