@@ -103,13 +103,11 @@ def measure_tendone() -> Iterator[Measurement]:
         yield at_least(f"tendone: {topic}", _hz(run.topics, topic), "Hz", 8.0)
 
 
-def measure_render() -> Iterator[Measurement]:
-    """``vinesim render``, warm."""
-    view = ("render", "demo", "--at", "0.4,1.2,1.3", "--look", "3,1,1.7")
-    with tempfile.TemporaryDirectory() as folder:
-        run_command(*view, "--out", folder)
-        took = run_command(*view, "--out", folder)
-    yield at_most("render demo: one picture", took, "s", 2.0)
+def measure_start() -> Iterator[Measurement]:
+    """``vinesim render`` with and without ``--path``, and the parts of a start, warm."""
+    from vinesim.bench.start import start_measurements
+
+    return start_measurements()
 
 
 def measure_generation() -> Iterator[Measurement]:
@@ -142,7 +140,7 @@ ROWS = {
     "camera": Row("client alone, camera: start to first picture, rate, age, tick", 35.0, measure_camera),
     "lidar": Row("client alone, camera and lidar", 35.0, measure_lidar),
     "tendone": Row("client alone in tendone", 45.0, measure_tendone),
-    "render": Row("vinesim render demo", 10.0, measure_render),
+    "start": Row("vinesim render with and without --path, parts of a start", 90.0, measure_start),
     "generate": Row("demo and tendone generated, then read from the cache", 20.0, measure_generation),
     "tick": Row("whole ticks back to back, of one robot and of ten", 60.0, measure_tick),
     "link": Row("touch to motion as another client sees it, over an emulated LAN (root)", 60.0, measure_link),

@@ -13,7 +13,7 @@ def bench(
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
     row: Annotated[
         list[str] | None,
-        typer.Option(help="Of live: demo, camera, lidar, tendone, render, generate, tick, link, cold; may repeat."),
+        typer.Option(help="Of live: demo, camera, lidar, tendone, start, generate, tick, link, cold; may repeat."),
     ] = None,
     plot: Annotated[
         pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
