@@ -85,7 +85,7 @@ def test_the_number_of_actors_is_limited():
     admission = AdmissionControl(max_actors=2)
     assert not join(admission, "ada").refused
     assert not join(admission, "bob", world="another").refused
-    assert "room for 2" in join(admission, "eve").refused
+    assert "admits 2 actors" in join(admission, "eve").refused
     assert not join(admission, "ada").refused
     admission.on_leave("another", "bob", "bob")
     assert not join(admission, "eve").refused

@@ -122,7 +122,7 @@ def test_scene_protocol_and_actor_limit_of_the_server_are_enforced():
         with pytest.raises(JoinRejected, match=f"version {messages.PROTOCOL + 1}, the server version"):
             ada.join(bytes(other))
         ada.join(hello("ada"))
-        with pytest.raises(JoinRejected, match="room for 1 actors"):
+        with pytest.raises(JoinRejected, match="admits 1 actors"):
             bob.join(hello("bob"))
         with pytest.raises(JoinRejected, match="cannot be read"):
             bob.join(b"junk")
