@@ -25,7 +25,7 @@ from vinesim.scene.spec import load_scene, with_seed
 CAMERA_TOPICS = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info")
 COSTLY_TOPICS = ("depth/points", "labels")
 """Topics of a camera that the listener leaves after the first message: nobody looks at so much all the time."""
-VISITOR_SENSOR_HZ = "2"
+VISITOR_SENSOR_HZ = "1"
 """The visitor has come to see a bunch move; its own sensors only have to be there."""
 
 
