@@ -196,7 +196,7 @@ def measure(say: Report, model: Model, device: str) -> None:
 
         say(f"{lasers} lasers, {len(d)} rays at once", len(d) / milliseconds(cast, device) / 1e6, "G rays/s")
     trees = np.unique(model.body_tree[model.bunch_body])[:20]
-    awake = dataclasses.replace(view, moved=trees)
+    awake = dataclasses.replace(view, moved_trees=trees)
 
     def follow(n: int) -> None:
         primitives.update(awake)

@@ -63,3 +63,24 @@ def test_rows_may_be_sub_rays_of_a_beam(scene) -> None:
     sweep = LidarRasterizer(elevation, azimuth, 0.01, 629)
     _, primitive = sweep.cast(scene, pose)
     assert (primitive == _oracle(sweep, scene, pose, 500.0)[1]).mean() >= 0.999
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_solids_around_the_head_as_a_robot_body_is(seed: int) -> None:
+    """Boxes and cylinders beside, above, below and around a lidar, at any angle: the same rays meet them."""
+    rng = np.random.default_rng(seed)
+    pose = np.array([0.3, -0.2, 1.1, *frames.exp(rng.normal(size=3))])
+    parts = []
+    for k in range(12):
+        at = pose[:3] + rng.normal(size=3) * rng.choice([0.0, 0.1, 0.5, 1.0])
+        turn = frames.exp(2.0 * rng.normal(size=3))
+        half = rng.uniform(0.02, 0.25, 3)
+        kind, size = ("box", half) if k % 2 else ("cylinder", half[:2])
+        parts.append(sensor_scenes.shape(kind, *size, at=at, turn=turn))
+    primitives, _ = sensor_scenes.world(sensor_scenes.thing(*parts))
+    elevation = np.radians(np.linspace(-90.0, 90.0, 61))
+    sweep = LidarRasterizer(elevation, np.zeros(61), 0.02, 315)
+    _, primitive = sweep.cast(primitives, pose)
+    ids = _oracle(sweep, primitives, pose, 500.0)[1]
+    assert len(np.unique(ids[ids >= 0])) >= 3
+    assert (primitive == ids).mean() >= 0.999

@@ -29,6 +29,7 @@ from vinesim.kernels.raster.primitives import (
     TRIANGLE,
     Clusters,
     Shapes,
+    as_quat,
     scale_along,
     xyz,
 )
@@ -194,6 +195,89 @@ def bounding_balls(shapes: Shapes, i: int, kind: int, head: LidarHead) -> BallCh
 
 
 @wp.struct
+class AngularBound:
+    """Azimuths and elevations, in the head's frame, that hold a solid."""
+
+    azimuth: float
+    """[rad] Its middle."""
+    half: float
+    """[rad] How far it reaches to either side; pi for all around."""
+    low: float
+    high: float
+    """Tangents of the elevations."""
+    is_around_eye: int
+    """1 if the head is inside: no ray meets a solid from inside."""
+
+
+@wp.func
+def angular_bound(shapes: Shapes, i: int, kind: int, head: LidarHead) -> AngularBound:
+    """Bound of a box or cylinder by the corners of its box. A robot's own body around its lidar is why: the ball
+    around a link next to the head holds the head, and would be tested against every ray."""
+    a4 = shapes.a[i]
+    b4 = shapes.b[i]
+    centre = head.rotation * (xyz(a4) - head.eye)
+    x = wp.vec3(0.0, 0.0, 0.0)
+    y = wp.vec3(0.0, 0.0, 0.0)
+    z = wp.vec3(0.0, 0.0, 0.0)
+    if kind == BOX:
+        q = as_quat(b4)
+        x = head.rotation * wp.quat_rotate(q, wp.vec3(a4[3], 0.0, 0.0))
+        y = head.rotation * wp.quat_rotate(q, wp.vec3(0.0, shapes.c[i][0], 0.0))
+        z = head.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, shapes.c[i][1]))
+    else:
+        z = 0.5 * (head.rotation * (xyz(b4) - xyz(a4)))
+        centre += z
+        axis = z / wp.max(wp.length(z), 1.0e-9)
+        other = wp.where(wp.abs(axis[2]) < 0.7, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
+        x = wp.normalize(wp.cross(axis, other)) * a4[3]
+        y = wp.cross(axis, x)
+    o = AngularBound()
+    o.azimuth = wp.atan2(centre[1], centre[0])
+    o.half = 3.1416
+    left = float(-4.0)
+    right = float(4.0)
+    top = float(-1.0e9)
+    bottom = float(1.0e9)
+    far = float(0.0)
+    for k in range(8):
+        p = centre
+        p += x * wp.where((k & 1) == 0, 1.0, -1.0)
+        p += y * wp.where((k & 2) == 0, 1.0, -1.0)
+        p += z * wp.where((k & 4) == 0, 1.0, -1.0)
+        turn = wp.atan2(p[1] * centre[0] - p[0] * centre[1], p[0] * centre[0] + p[1] * centre[1])
+        left = wp.max(left, turn)
+        right = wp.min(right, turn)
+        top = wp.max(top, p[2])
+        bottom = wp.min(bottom, p[2])
+        far = wp.max(far, wp.sqrt(p[0] * p[0] + p[1] * p[1]))
+    near = float(0.0)
+    if left - right < 3.1:  # else the head's vertical axis may pass through it
+        o.half = 0.5 * (left - right) + 1.0e-4
+        o.azimuth += 0.5 * (left + right)
+        cosine = wp.cos(o.azimuth)
+        sine = wp.sin(o.azimuth)
+        # all of it lies at least as far along the middle azimuth as its nearest corner
+        reach = wp.abs(x[0] * cosine + x[1] * sine) + wp.abs(y[0] * cosine + y[1] * sine)
+        reach += wp.abs(z[0] * cosine + z[1] * sine)
+        near = wp.max(centre[0] * cosine + centre[1] * sine - reach, 0.0)
+    margin = 1.0e-5 * (far + wp.abs(top) + wp.abs(bottom))
+    top += margin
+    bottom -= margin
+    o.high = wp.where(top > 0.0, top / wp.max(near, 1.0e-9), top / (far + margin))
+    o.low = wp.where(bottom < 0.0, bottom / wp.max(near, 1.0e-9), bottom / (far + margin))
+    inside = wp.where(kind == BOX, 1.0, 0.999999)
+    u = wp.abs(wp.dot(centre, x)) < inside * wp.dot(x, x)
+    v = wp.abs(wp.dot(centre, y)) < inside * wp.dot(y, y)
+    w = wp.abs(wp.dot(centre, z)) < inside * wp.dot(z, z)
+    if kind == CYLINDER:
+        off = centre - z * (wp.dot(centre, z) / wp.max(wp.dot(z, z), 1.0e-12))
+        u = wp.dot(off, off) < inside * a4[3] * a4[3]
+        v = u
+    o.is_around_eye = wp.where(u and v and w, 1, 0)
+    return o
+
+
+@wp.struct
 class LeafFrame:
     """A blade's axes, over its size, in the head's frame, and where the head is in the blade's frame and unit."""
 
@@ -288,17 +372,29 @@ def raster_clusters(
         b = balls.b
         r = balls.r
         pieces = balls.count
+        solid = AngularBound()
+        is_solid = kind == BOX or (kind == CYLINDER and pieces == 1)
+        if is_solid:
+            solid = angular_bound(shapes, i, kind, head)
+            if solid.is_around_eye == 1:
+                continue
         for piece in range(pieces):
             p = a + (b - a) * ((float(piece) + 0.5) / float(pieces))
             around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
             span = circle_tangents(p[2], around, r)
+            if is_solid:
+                span = wp.vec2(wp.max(span[0], solid.low), wp.min(span[1], solid.high))
             row = first_row(head, span[0]) - 1
             more = row + 1 < rows
             if more:
                 more = head.tangent[row + 1] <= span[1]
             if more:
                 azimuth = wp.atan2(p[1], p[0])
-                half = wp.min((half_angle(r, around) + 1.0e-5) / wp.abs(head.step), 0.5 * period)
+                half = half_angle(r, around) + 1.0e-5
+                if is_solid and solid.half < half:
+                    azimuth = solid.azimuth
+                    half = solid.half
+                half = wp.min(half / wp.abs(head.step), 0.5 * period)
                 nearest = wp.int64(int(wp.max(wp.length(p) - r, 0.0) * 1.0e6)) << wp.int64(32)
                 column = wp.int32(0)
                 last = wp.int32(0)
