@@ -110,7 +110,8 @@ def test_snapshots_are_of_one_piece_and_the_last_arrives(context):
 
     received = read_in_another_process(context, forward_snapshots, snapshot, write)
     assert received[-1] == -1
-    assert received[:-1] == sorted(set(received[:-1]))
+    # in order; one may come twice, if it was read between its end and its signal
+    assert received[:-1] == sorted(received[:-1])
 
 
 def test_the_writer_of_a_snapshot_never_waits_for_the_reader(context):

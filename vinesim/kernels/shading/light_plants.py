@@ -149,7 +149,7 @@ def blade_light(
     points: Points,
     slot: int,
 ) -> wp.vec3:
-    """Light of one point of a leaf or a blade of grass; see ``leaf_surface`` and ``shade_surface``."""
+    """Light of a point of a leaf; reason: one body for eight lanes. See ``leaf_surface`` and ``shade_surface``."""
     i = points.primitive[slot]
     ray = point_ray(lens, back, points.u[slot], points.v[slot])
     z = points.z[slot]
