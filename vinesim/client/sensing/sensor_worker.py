@@ -40,7 +40,7 @@ POLL_PERIOD = 0.02
 """Longest time without a look at requests and subscribers [s]."""
 SWITCH_INTERVAL = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
-NICE = 3
+NICE = 10
 """Niceness where cores are scarce: the client's loop and its ROS process come first, but a renderer that is much nicer
 starves beside other programs (docs/decisions/sensor-process.md)."""
 POSE_HISTORY = 128
