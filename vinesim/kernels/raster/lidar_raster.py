@@ -335,15 +335,17 @@ def raster_clusters(
     visible: wp.array(dtype=wp.int32),
     head: LidarHead,
     lanes: int,
+    slices: int,
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """Enter every ``lanes``-th primitive of one cluster into the keys, a thread each; reason: batches stay in registers.
+    """A thread enters every ``lanes``-th primitive of a cluster into every ``slices``-th row of the keys; reason: batches
+    stay in registers.
 
     lower, upper: [primitive, 3] m; visible: [thread] clusters; keys: [column * row] as in
     :mod:`vinesim.kernels.raster.pinhole`, range [um] above.
     """
-    k, lane = wp.tid()
+    k, lane, part = wp.tid()
     cluster = visible[k]
     kind = clusters.kind[cluster]
     first = clusters.first[cluster]
@@ -384,10 +386,11 @@ def raster_clusters(
             span = circle_tangents(p[2], around, r)
             if is_solid:
                 span = wp.vec2(wp.max(span[0], solid.low), wp.min(span[1], solid.high))
-            row = first_row(head, span[0]) - 1
-            more = row + 1 < rows
+            row = first_row(head, span[0])
+            row += (part - row % slices + slices) % slices - slices
+            more = row + slices < rows
             if more:
-                more = head.tangent[row + 1] <= span[1]
+                more = head.tangent[row + slices] <= span[1]
             if more:
                 azimuth = wp.atan2(p[1], p[0])
                 half = half_angle(r, around) + 1.0e-5
@@ -412,7 +415,7 @@ def raster_clusters(
                             # the same row one turn further, or the next row
                             begin += period
                             if begin >= float(head.end_column):
-                                row += 1
+                                row += slices
                                 more = row < rows
                                 if more:
                                     more = head.tangent[row] <= span[1]

@@ -98,10 +98,10 @@ class LidarRasterizer:
         distance = self._cluster_distance.numpy()
         seen = np.flatnonzero(distance < float(shapes.FAR))
         seen = seen[np.argsort(distance[seen], kind="stable")].astype(np.int32)
-        lanes = 1 if self.device == "cpu" else 24
+        lanes, slices = (1, 1) if self.device == "cpu" else (24, min(self.rows, 16))  # what is near meets every row
         wp.launch(
             lidar_raster.raster_clusters,
-            (len(seen), lanes),
+            (len(seen), lanes, slices),
             inputs=[
                 primitives.shapes,
                 primitives.clusters,
@@ -110,6 +110,7 @@ class LidarRasterizer:
                 wp.array(seen, device=self.device),
                 head,
                 lanes,
+                slices,
             ],
             outputs=[self._keys],
             device=self.device,
