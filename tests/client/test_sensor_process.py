@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -139,3 +140,22 @@ def test_the_kept_picture_is_written(robot, tmp_path):
     robot.run_for_pictures(1)
     robot.sensors.save_picture(tmp_path)
     assert cv2.imread(str(tmp_path / "rgb.png")).std() > 10.0
+
+
+def test_a_list_of_bodies_that_comes_after_its_snapshot_does_not_stop_the_start(monkeypatch: pytest.MonkeyPatch):
+    """The first snapshot is then skipped; a client that wrote no other would wait for ever."""
+    send, delayed = worker_process.Run.send, []
+
+    def send_late(run: worker_process.Run, kind: str, value: object = None) -> None:
+        if kind == "visuals" and not delayed:
+            delayed.append(threading.Timer(8.0, send, (run, kind, value)))
+            delayed[0].start()
+        else:
+            send(run, kind, value)
+
+    monkeypatch.setattr(worker_process.Run, "send", send_late)
+    one = Robot()
+    with one.sensors:
+        one.sensors.attach(one.client)
+        one.run_for_pictures(1)
+        assert one.sensors.report()["frames_skipped"] > 0
