@@ -9,7 +9,6 @@ import collections
 import logging
 import pathlib
 import threading
-import time
 import types
 from typing import Any, Self
 
@@ -29,8 +28,6 @@ log = logging.getLogger(__name__)
 
 SNAPSHOT_PERIOD = 2
 """Ticks between two snapshots: 50 Hz, faster than any camera here."""
-FIRST_SNAPSHOT_PERIOD = 0.2
-"""Time between two snapshots while the process starts [s]."""
 START_TIMEOUT = 300.0
 """How long the process may take to start; a first run compiles kernels [s]."""
 SAVE_TIMEOUT = 60.0
@@ -95,11 +92,8 @@ class SensorProcess:
         Waits until the process has rendered a first picture of every sensor; :class:`WorkerError` if it fails.
         """
         self.client, self.robot = client, robot or client.robot
-        deadline = time.monotonic() + START_TIMEOUT
         self._write(client)
-        while not self.worker.has_started(FIRST_SNAPSHOT_PERIOD) and time.monotonic() < deadline:
-            self._write(client)  # the last one is skipped if it was read before its list of bodies had arrived
-        self.worker.wait_until_ready(0.0)
+        self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
 
     # ------------------------------------------------------------------ in the loop

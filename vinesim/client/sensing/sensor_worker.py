@@ -136,6 +136,8 @@ class SensorWorker:
         """Snapshots that could not be shown as their list of bodies had not arrived."""
         self._state = State.at_rest(config.model)
         self._visuals = VisualListReceiver()
+        self._missing_version: int | None = None
+        """Version of the list of bodies that the newest snapshot belongs to, if that has not arrived."""
         self._last_number = 0
         self._pose_count = 0
         self._best_frame: CameraFrame | None = None
@@ -216,7 +218,7 @@ class SensorWorker:
         is_ready = False
         self._awaits("snapshot of the world")
         while self._take_requests():
-            if self.channel.snapshot.wait(POLL_PERIOD) and (world := self._read()) is not None:
+            if self._wait_for_snapshot() and (world := self._read()) is not None:
                 snapshot, earlier = world
                 poses = earlier.pop()[1]
                 if is_ready:
@@ -231,6 +233,10 @@ class SensorWorker:
             if time.monotonic() >= self._next_statistics:
                 self._next_statistics = time.monotonic() + STATISTICS_PERIOD
                 self.pipe.send(("statistics", self._statistics()))
+
+    def _wait_for_snapshot(self) -> bool:
+        """Whether there is a snapshot to read: a new one, or one that was skipped and whose list arrived since."""
+        return self.channel.snapshot.wait(POLL_PERIOD) or self._visuals.version == self._missing_version
 
     def _take_requests(self) -> bool:
         """Do what the client asks for; False after a "stop"."""
@@ -251,10 +257,12 @@ class SensorWorker:
         None, and counted, if the list of bodies that it belongs to has not arrived.
         """
         with self.channel.snapshot.reading() as shared:
-            memory = self._visuals.memory
-            if memory is None or shared["visuals_version"][0] != self._visuals.version:
+            memory, version = self._visuals.memory, int(shared["visuals_version"][0])
+            if memory is None or version != self._visuals.version:
                 self.frames_skipped += 1
+                self._missing_version = version
                 return None
+            self._missing_version = None
             visual_q = memory["visual_q"][: int(shared["visual_count"][0])].copy()
             has_moved = shared["tree_number"] > self._last_number
             bodies = np.flatnonzero(has_moved[self.config.model.body_tree])

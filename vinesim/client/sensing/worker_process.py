@@ -117,10 +117,6 @@ class WorkerProcess(Generic[S]):
 
     # ------------------------------------------------------------------ outside the loop
 
-    def has_started(self, timeout: float) -> bool:
-        """Whether the first run is ready or has failed within ``timeout`` [s]."""
-        return self._first_result.wait(timeout)
-
     def wait_until_ready(self, timeout: float) -> None:
         """Wait for the first run to be ready; :class:`WorkerError` if it fails, or after ``timeout`` [s]."""
         if not self._first_result.wait(timeout):
