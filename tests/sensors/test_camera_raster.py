@@ -237,6 +237,24 @@ def test_a_camera_inside_a_housing_looks_out(tmp_path) -> None:
     assert np.abs(depth - 1.5).max() < 2e-6
 
 
+@pytest.mark.parametrize("kind", ["cylinder", "box", "ellipsoid"])
+def test_solids_all_around_the_pinhole_are_seen(kind: str) -> None:
+    """Long and flat ones of any attitude, touching the eye or around it, beside, behind and in front of it."""
+    rng = np.random.default_rng(11)
+    seen = 0
+    for _ in range(60):
+        size = rng.uniform(0.005, 0.12, 3) * rng.choice([0.2, 1.0, 3.0], 3)
+        at = np.array([0.0, 0.0, 1.0]) + rng.normal(size=3) * rng.choice([0.02, 0.08, 0.3])
+        turn = frames.normalize(rng.normal(size=4))
+        parts = sensor_scenes.shape(kind, *size[: 2 if kind == "cylinder" else 3], at=at, turn=turn)
+        primitives, _ = sensor_scenes.world(sensor_scenes.thing(parts))
+        _, primitive = sensor_scenes.raster(primitives, sensor_scenes.AHEAD)
+        _, ids = sensor_scenes.oracle(primitives, sensor_scenes.AHEAD)
+        assert (primitive == ids).mean() >= 0.999
+        seen += (ids >= 0).sum() > 20
+    assert 8 <= seen <= 55
+
+
 def test_nothing_in_the_world_is_ground_and_sky() -> None:
     primitives, _ = sensor_scenes.world()
     depth, primitive = sensor_scenes.raster(primitives, sensor_scenes.AHEAD)

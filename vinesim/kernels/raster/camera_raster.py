@@ -46,6 +46,73 @@ def cull_clusters(
     distance_out[i] = wp.where(seen, wp.max(distance, 0.0), FAR)
 
 
+@wp.struct
+class OrientedBox:
+    """A box around a solid, in the optical frame: its centre and its half axes [m]."""
+
+    centre: wp.vec3
+    x: wp.vec3
+    y: wp.vec3
+    z: wp.vec3
+
+
+@wp.func
+def oriented_box(lens: Pinhole, a: wp.vec4, b: wp.vec4, c: wp.vec4, kind: int) -> OrientedBox:
+    """The box around a box, ellipsoid or cylinder."""
+    o = OrientedBox()
+    o.centre = lens.rotation * (xyz(a) - lens.eye)
+    if kind == CYLINDER:
+        o.z = lens.rotation * (xyz(b) - xyz(a)) * 0.5
+        o.centre += o.z
+        axis = wp.normalize(o.z)
+        other = wp.where(wp.abs(axis[2]) < 0.7, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
+        o.x = wp.normalize(wp.cross(axis, other)) * a[3]
+        o.y = wp.cross(axis, o.x)
+    else:
+        q = as_quat(b)
+        o.x = lens.rotation * wp.quat_rotate(q, wp.vec3(a[3], 0.0, 0.0))
+        o.y = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, c[0], 0.0))
+        o.z = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, c[1]))
+    return o
+
+
+@wp.func
+def tangent(across: float, ahead: float, behind: float) -> float:
+    """Across over ahead, or ``behind`` for a direction that is not ahead."""
+    return wp.where(ahead > 0.0, across / wp.max(ahead, 1.0e-9), behind)
+
+
+@wp.func
+def hull_tangents(box: OrientedBox, k: int) -> wp.vec2:
+    """Least and greatest tangent of the directions to a box, across (``k`` 0) or down (1) over ahead.
+
+    A bounding sphere would hold the eye for what is mounted beside it, as its own housing is.
+    """
+    across = box.centre[k]
+    ahead = box.centre[2]
+    low = float(UNBOUND)
+    high = float(-UNBOUND)
+    least = float(1.0)
+    for n in range(8):
+        corner = box.centre + box.x * (float(n & 1) * 2.0 - 1.0) + box.y * (float(n & 2) - 1.0)
+        corner += box.z * (float(n & 4) * 0.5 - 1.0)
+        along = across * corner[k] + ahead * corner[2]
+        turn = (ahead * corner[k] - across * corner[2]) / wp.max(along, 1.0e-9)  # tangent of the angle to the centre
+        low = wp.min(low, turn)
+        high = wp.max(high, turn)
+        least = wp.min(least, along)
+    out = wp.vec2(-UNBOUND, UNBOUND)
+    if least > 1.0e-9:  # the box subtends less than 180 degrees
+        low_ahead = ahead - low * across
+        high_ahead = ahead - high * across
+        if low_ahead <= 0.0 and high_ahead <= 0.0:
+            out = wp.vec2(UNBOUND, -UNBOUND)  # all of it is behind
+        else:
+            out[0] = tangent(across + low * ahead, low_ahead, -UNBOUND)
+            out[1] = tangent(across + high * ahead, high_ahead, UNBOUND)
+    return out
+
+
 @wp.kernel
 def raster_solids(
     # model
@@ -71,62 +138,43 @@ def raster_solids(
         a4 = shapes.a[i]
         b4 = shapes.b[i]
         c4 = shapes.c[i]
-        p = lens.rotation * (xyz(a4) - lens.eye)
+        hull = oriented_box(lens, a4, b4, c4, kind)
+        h = hull_tangents(hull, 0)
+        v = hull_tangents(hull, 1)
+        bound = wp.vec4(
+            h[0] * lens.fx + lens.cx, h[1] * lens.fx + lens.cx, v[0] * lens.fy + lens.cy, v[1] * lens.fy + lens.cy
+        )
+        box = clip_to_image(lens, bound)
         half = wp.vec3(a4[3], c4[0], c4[1])
         q = as_quat(b4)
-        end = p
-        centre = p
-        r = wp.length(half)
-        if kind == ELLIPSOID:
-            r = wp.max(wp.max(half[0], half[1]), half[2])
-        if kind == CYLINDER:
+        eye = wp.vec3(0.0, 0.0, 0.0)
+        if kind != CYLINDER:
+            eye = wp.quat_rotate_inv(q, lens.eye - xyz(a4))
+        if kind == BOX and wp.max(wp.cw_div(wp.abs(eye), half)) < 1.0:
+            continue  # from inside nothing is seen of it
+        if box[0] < box[1] and box[2] < box[3]:
+            p = lens.rotation * (xyz(a4) - lens.eye)
             end = lens.rotation * (xyz(b4) - lens.eye)
-            centre = (p + end) * 0.5
-            r = wp.length(wp.vec2(wp.length(end - p) * 0.5, a4[3]))
-        if centre[2] > -r:
-            bound = sphere_bounds(lens, centre, r)
-            if kind == BOX and centre[2] - r > NEAR_DEPTH:
-                ex = lens.rotation * wp.quat_rotate(q, wp.vec3(half[0], 0.0, 0.0))
-                ey = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, half[1], 0.0))
-                ez = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, half[2]))
-                bound = wp.vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND)
-                for n in range(8):
-                    corner = (
-                        centre
-                        + ex * (float(n & 1) * 2.0 - 1.0)
-                        + ey * (float(n & 2) - 1.0)
-                        + ez * (float(n & 4) * 0.5 - 1.0)
-                    )
-                    x = corner[0] / corner[2] * lens.fx + lens.cx
-                    y = corner[1] / corner[2] * lens.fy + lens.cy
-                    bound = wp.vec4(wp.min(bound[0], x), wp.max(bound[1], x), wp.min(bound[2], y), wp.max(bound[3], y))
-            box = clip_to_image(lens, bound)
-            if box[0] < box[1] and box[2] < box[3]:
-                back = wp.transpose(lens.rotation)
-                eye = wp.vec3(0.0, 0.0, 0.0)
-                ax = eye
-                ay = eye
-                az = eye
-                if kind != CYLINDER:
-                    eye = wp.quat_rotate_inv(q, lens.eye - xyz(a4))
-                    ax = wp.quat_rotate_inv(q, back * wp.vec3(1.0, 0.0, 0.0))
-                    ay = wp.quat_rotate_inv(q, back * wp.vec3(0.0, 1.0, 0.0))
-                    az = wp.quat_rotate_inv(q, back * wp.vec3(0.0, 0.0, 1.0))
-                nearest = wp.int64(int(wp.max(centre[2] - r, 0.0) * 1.0e6)) << wp.int64(32)
-                for py in range(box[2], box[3]):
-                    for px in range(box[0], box[1]):
-                        at = py * lens.width + px
-                        if keys_out[at] > nearest:
-                            d = pixel_ray(lens, px, py)
-                            ray = ax * d[0] + ay * d[1] + az
-                            t = FAR
-                            if kind == BOX:
-                                t = hit_box(eye, ray, half)
-                            elif kind == ELLIPSOID:
-                                t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
-                            else:
-                                t = hit_cylinder(p, end, a4[3], d)
-                            depth_test(at, t, i, lens.max_depth, keys_out)
+            back = wp.transpose(lens.rotation)
+            ax = wp.quat_rotate_inv(q, back * wp.vec3(1.0, 0.0, 0.0))
+            ay = wp.quat_rotate_inv(q, back * wp.vec3(0.0, 1.0, 0.0))
+            az = wp.quat_rotate_inv(q, back * wp.vec3(0.0, 0.0, 1.0))
+            reach = wp.abs(hull.x[2]) + wp.abs(hull.y[2]) + wp.abs(hull.z[2])
+            nearest = wp.int64(int(wp.max(hull.centre[2] - reach, 0.0) * 1.0e6)) << wp.int64(32)
+            for py in range(box[2], box[3]):
+                for px in range(box[0], box[1]):
+                    at = py * lens.width + px
+                    if keys_out[at] > nearest:
+                        d = pixel_ray(lens, px, py)
+                        ray = ax * d[0] + ay * d[1] + az
+                        t = FAR
+                        if kind == BOX:
+                            t = hit_box(eye, ray, half)
+                        elif kind == ELLIPSOID:
+                            t = hit_sphere(-wp.cw_div(eye, half), 1.0, wp.cw_div(ray, half))
+                        else:
+                            t = hit_cylinder(p, end, a4[3], d)
+                        depth_test(at, t, i, lens.max_depth, keys_out)
 
 
 @wp.kernel
