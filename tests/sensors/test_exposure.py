@@ -1,5 +1,6 @@
 """From light to pixels: what is metered, how fast exposure follows, and the halo of a lamp."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ class _Lamps:
     """Primitives of which number 7 shines."""
 
     lamp_primitives = np.array([7])
+    count = 9
 
 
 def _exposed(of: Exposure) -> float:
@@ -91,3 +93,18 @@ def test_a_lamp_has_glare_and_nothing_else_has() -> None:
     assert around[80, 90] == pytest.approx(around[90, 80], rel=1e-4)
     assert around.sum() == pytest.approx(50.0 * sum(strength for _, strength in exposure._GLARE), rel=0.02)
     assert (light[..., 0] == 0.0).sum() == 161 * 161 - 1
+
+
+def test_glare_is_a_gaussian_blur_of_the_lamps() -> None:
+    """Of several lamps of several pixels, as OpenCV blurs the whole picture; beyond the border there is no light."""
+    rng = np.random.default_rng(2)
+    light = rng.uniform(0.0, 1.0, (120, 200, 3)).astype(np.float32)
+    lit = np.zeros((120, 200), bool)
+    lit[50:53, 60:64] = lit[70, 130] = lit[75:77, 140] = True
+    light[lit] *= 40.0
+    wanted = light.copy()
+    for width, strength in exposure._GLARE:
+        padded = np.pad(light * lit[..., None], ((60, 60), (60, 60), (0, 0)))
+        wanted += strength * cv2.GaussianBlur(padded, (0, 0), width * 1.2)[60:-60, 60:-60]
+    exposure.glare(light, lit)
+    assert np.allclose(light, wanted, rtol=1e-3, atol=1e-3)

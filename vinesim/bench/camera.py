@@ -20,12 +20,12 @@ import trimesh
 
 from vinesim import frames
 from vinesim.bench.scenes import interleaved_medians
-from vinesim.kernels.launch import usable_cores
+from vinesim.kernels.launch import MAX_THREADS, usable_cores
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, CameraOutput, Measurement
-from vinesim.sensors.camera.camera import MAX_THREADS, Camera, CameraSpec
+from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.camera.stereo import Stereo
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole

@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.launch import ThreadPool, usable_cores
+from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.sensing import stereo_rows
@@ -104,8 +104,6 @@ class Quality:
     of a stereo camera out of the first one instead of rendering it."""
 
 
-MAX_THREADS = 4
-"""A picture is not shared by more threads than this: the gain is used up."""
 QUALITIES = {
     "fast": Quality(taps=-1, block=2, samples=1, shadow_texel_divisor=1, is_live=True),
     "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1, is_live=False),

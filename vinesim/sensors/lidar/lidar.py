@@ -17,6 +17,7 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
+from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.sensing import lidar_echoes
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.plant_parameters import Number
@@ -148,11 +149,14 @@ class Lidar:
         device: str = "cpu",
         *,
         seed: int = 0,
-        grid: Callable[[np.ndarray, np.ndarray, float, int, str], RayGrid] = LidarRasterizer,
+        threads: int | None = None,
+        grid: Callable[[np.ndarray, np.ndarray, float, int, str, ThreadPool], RayGrid] = LidarRasterizer,
     ) -> None:
         """Noise follows from (``seed``, ``name``, number of the revolution).
 
-        ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits: see :class:`LidarRasterizer`.
+        ``threads`` of the CPU find hits: the cores that this process may use, up to four, unless given.
+        ``grid(elevation, azimuth, step, columns, device, workers)`` makes what finds hits: see
+        :class:`LidarRasterizer`.
         """
         self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
         self.revolution = 0
@@ -178,6 +182,7 @@ class Lidar:
             -2.0 * np.pi * spec.rate.value * spec.firing_period.value,
             self.firings,
             device,
+            ThreadPool((threads or min(usable_cores(), MAX_THREADS)) if device == "cpu" else 1),
         )
         """Finds what rays meet: a column for each firing, in it the rays of each laser's shot."""
         self._receiver = self._receiver_parameters()
