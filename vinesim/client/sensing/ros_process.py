@@ -76,7 +76,7 @@ class RosProcess:
         wanted = channel.wanted["steps"]
         if wanted.any():
             has_state = wanted[1:].any()
-            sample = self.robot.sample(physics.time, physics.contacts) if has_state else None
+            sample = self.robot.sample(physics.time, physics.contacts, body_sensors=False) if has_state else None
             with channel.steps.put() as record:
                 if record is None:
                     self._lost += wanted
@@ -104,10 +104,11 @@ class RosProcess:
         if kind == "commands":
             self._commands.extend(value)
         elif kind == "statistics":
-            if any(value["sent"].get(topic, 0) < count for topic, count in self._sent.items()):  # a new run
-                self._sent_before.update(self._sent)
-                self._dropped_before.update(self._dropped)
             self._sent, self._dropped = value["sent"], value["dropped"]
+        elif kind == "restarted":
+            self._sent_before.update(self._sent)
+            self._dropped_before.update(self._dropped)
+            self._sent, self._dropped = dict.fromkeys(self._sent, 0), {}
 
     def sent_messages(self) -> dict[str, int]:
         """Messages sent so far, by topic."""

@@ -7,10 +7,6 @@ the rate of the topics of every step whatever the sensors do.
 from __future__ import annotations
 
 import dataclasses
-import logging
-import os
-import signal
-import sys
 import time
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -21,9 +17,8 @@ import numpy as np
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
+from vinesim.client.sensing.worker_process import serve
 from vinesim.ros.names import ros_name
-
-log = logging.getLogger(__name__)
 
 STEP_TOPICS = ("/clock", "joint_states", "tf", "mobile_base_controller/odom", "vine/contacts")
 """Topics with a message for every step."""
@@ -77,22 +72,8 @@ class RosChannel:
 
 
 def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
-    """Entry of the process: publish until told to stop, or until the client's process has ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    code = 0
-    try:
-        RosWorker(config, channel, pipe).run()
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the client is gone
-    except Exception as error:
-        log.exception("the ROS process failed")
-        pipe.send(("failed", f"{type(error).__name__}: {error}"))
-        code = 1
-    # Taking the interpreter down in order would only delay the client, which waits.
-    logging.shutdown()
-    sys.stdout.flush()
-    os._exit(code)
+    """Entry of the process: publish until told to stop."""
+    serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run())
 
 
 class RosWorker:

@@ -152,10 +152,11 @@ class SensorProcess:
             if value:
                 log.info("the sensors of %s are not ready, awaited: %s", self.name, ", ".join(value))
         elif kind == "statistics":
-            if any(value["frames"][name] < count for name, count in self._counts.get("frames", {}).items()):
-                for what, counts in self._counts.items():  # a new run
-                    self._counts_before.setdefault(what, collections.Counter()).update(counts)
             self._counts = value
+        elif kind == "restarted":
+            for what, counts in self._counts.items():
+                self._counts_before.setdefault(what, collections.Counter()).update(counts)
+            self._counts = {what: dict.fromkeys(counts, 0) for what, counts in self._counts.items()}
         elif kind == "device":
             self._device = value
         elif kind == "saved":

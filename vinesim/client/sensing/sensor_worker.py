@@ -7,7 +7,6 @@ import dataclasses
 import logging
 import os
 import pathlib
-import signal
 import sys
 import time
 import zlib
@@ -20,6 +19,7 @@ import numpy as np
 
 from vinesim.client.sensing.rigid_visual_list import VisualListMessage, VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
+from vinesim.client.sensing.worker_process import serve
 from vinesim.physics.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
@@ -102,26 +102,16 @@ class SensorChannel:
 
 
 def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connection) -> None:
-    """Entry of the process: render and publish until told to stop, or until the client's process has ended."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    """Entry of the process: render and publish until told to stop."""
     sys.setswitchinterval(SWITCH_INTERVAL)
     if hasattr(os, "nice"):
         os.nice(NICE)
-    code = 0
-    try:
+
+    def work() -> None:
         with contextlib.ExitStack() as stack:
             SensorWorker(config, channel, pipe, stack).run()
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the client is gone
-    except Exception as error:
-        log.exception("the sensor process failed")
-        with contextlib.suppress(OSError):
-            pipe.send(("failed", f"{type(error).__name__}: {error}"))
-        code = 1
-    # All is closed. Taking the interpreter down in order would only delay the client, which waits.
-    logging.shutdown()
-    os._exit(code)
+
+    serve("sensor process", pipe, work)
 
 
 class SensorWorker:

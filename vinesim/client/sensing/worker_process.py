@@ -9,13 +9,17 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
+import os
 import queue
+import signal
+import sys
 import threading
 import time
 from collections.abc import Callable
 from multiprocessing import connection
+from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +35,29 @@ class WorkerError(RuntimeError):
     """A process of the client could not start; the text says why."""
 
     exit_code = 3
+
+
+def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
+    """The whole life of a process: ``work``, until it returns, fails, or the client's process has ended.
+
+    ``title`` names the process in its log: "sensor process".
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    code = 0
+    try:
+        work()
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass  # the client is gone
+    except Exception as error:
+        log.exception("the %s failed", title)
+        with contextlib.suppress(OSError):
+            pipe.send(("failed", f"{type(error).__name__}: {error}"))
+        code = 1
+    # All is closed. Taking the interpreter down in order would only delay the client, which waits.
+    logging.shutdown()
+    sys.stdout.flush()
+    os._exit(code)
 
 
 class Shared(Protocol):
@@ -81,7 +108,8 @@ class WorkerProcess(Generic[S]):
 
     ``target(config, shared, pipe)`` runs in the process; it sends ("ready", None) when it is, ("failed", text) before
     it ends with an error, and ends at ("stop", None) or when the pipe is closed. ``share(context)`` makes what is
-    shared with one run. ``receive(kind, value)`` takes all other messages, in a thread.
+    shared with one run. ``receive(kind, value)`` takes all other messages, and ("restarted", None) before those of a
+    further run, in a thread.
     """
 
     def __init__(
@@ -169,6 +197,7 @@ class WorkerProcess(Generic[S]):
             if self._closing.wait(pause):
                 return
             self.restarts += 1
+            self._receive("restarted", None)
             self._newest = self._start()
 
     def _log_failure(self, failures: int, reason: str) -> None:

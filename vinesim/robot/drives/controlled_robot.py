@@ -198,9 +198,11 @@ class Robot(RobotInstance):
         self._base_velocity = linear, angular
         self.rigid.command_base(self.name, (linear, 0.0, angular))
 
-    def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
-        """State of the robot at ``time`` [s], wrenches, IMUs and series elastic elements included."""
+    def sample(self, time: float, contacts: Sequence[Contact] = (), *, body_sensors: bool = True) -> RobotSample:
+        """State of the robot at ``time`` [s], with wrenches, IMUs and series elastic elements if ``body_sensors``."""
         sample = super().sample(time, contacts)
+        if not body_sensors:
+            return sample
         return dataclasses.replace(
             sample,
             elements=elastic_sample(sample.joints, self.series_stiffness),
