@@ -95,6 +95,17 @@ def test_a_body_that_joins_while_a_list_is_on_its_way_does_not_end_the_pictures(
     assert robot.sensors.report()["sensor_restarts"] == 0
 
 
+def test_a_snapshot_that_is_announced_twice_is_read_once(robot):
+    """A snapshot may be written between the signal for the one before and its reading, and has its own signal then."""
+    robot.run_for_pictures(1)
+    signals = robot.sensors.worker.current().shared.snapshot._written
+    for _ in range(3):
+        signals.release()
+        wait(lambda: signals.get_value() == 0, "the process to take the signal")
+    robot.run_for_pictures(2)
+    assert robot.sensors.report()["sensor_restarts"] == 0
+
+
 def test_a_killed_process_is_started_again(robot, caplog):
     caplog.set_level(logging.WARNING)
     robot.run_for_pictures(1)

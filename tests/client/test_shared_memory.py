@@ -68,6 +68,7 @@ def test_a_queue_loses_nothing_but_what_it_counts(context):
         with queue.put() as record:
             if record is not None:
                 record["number"], record["values"] = number, number
+        queue.wake()
         return record is not None
 
     def write() -> None:
@@ -92,6 +93,25 @@ def test_a_full_queue_never_waits_and_a_failed_record_takes_no_room(context):
     queue.close()
 
 
+def test_a_reader_is_woken_when_the_writer_says_so(context):
+    """Not in the middle of a step: several records and the newest snapshot are there at once."""
+    queue, snapshot = SharedQueue(RECORD, 4, context), SharedSnapshot(LAYOUT, context)
+    for number in range(2):
+        with queue.put() as record, snapshot.writing() as arrays:
+            record["number"] = arrays["number"][0] = number
+    assert queue.take(0.0) is None
+    assert not snapshot.wait(0.0)
+    queue.wake()
+    snapshot.wake()
+    assert queue._filled.acquire(block=False)
+    assert queue._filled.acquire(block=False)
+    assert not queue._filled.acquire(block=False)
+    assert snapshot.wait(0.0)
+    assert not snapshot.wait(0.0)
+    queue.close()
+    snapshot.close()
+
+
 def test_snapshots_are_of_one_piece_and_the_last_arrives(context):
     snapshot = SharedSnapshot(LAYOUT, context)
 
@@ -100,6 +120,7 @@ def test_snapshots_are_of_one_piece_and_the_last_arrives(context):
             if arrays is not None:
                 arrays["number"][0] = number
                 arrays["values"][:] = number
+        snapshot.wake()
         return arrays is not None
 
     def write() -> None:
@@ -122,6 +143,7 @@ def test_the_writer_of_a_snapshot_never_waits_for_the_reader(context):
     assert snapshot.missed_writes == 1
     with snapshot.writing() as arrays:
         assert arrays is not None
+    snapshot.wake()
     assert snapshot.wait(0.0)
     assert not snapshot.wait(0.0)
     snapshot.close()

@@ -100,6 +100,8 @@ class Client:
         """Called before every step with the simulation time [s]: tasks and commands of robots."""
         self.post_step: list[Callable[[Client], None]] = []
         """Called after every step: sensors, ROS, recorders."""
+        self.wake_readers: list[Callable[[], None]] = []
+        """Called last in a tick: they wake the processes that take its results, which may get this core at once."""
         self.frame_score: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
         """How much there is to see now; the picture with the highest score is kept."""
         self.trace: Trace | None = None
@@ -161,8 +163,10 @@ class Client:
         self.physics.step()
         self.sense()
         self.send(now)
+        for callback in self.wake_readers:
+            callback()
 
-    # ------------------------------------------------------------------ the five parts of a tick
+    # ------------------------------------------------------------------ the parts of a tick
 
     def receive(self, now: float) -> None:
         """Add and remove remote actors, move their copies, and apply the states of trees and objects that they own."""

@@ -66,6 +66,7 @@ class RosProcess:
         self.client, self.robot = client, robot or client.robot
         self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
+        client.wake_readers.append(self._wake)
         client.pre_step.insert(0, RosCommandHandler(self.robot, self._take_commands))
 
     # ------------------------------------------------------------------ in the loop
@@ -93,6 +94,11 @@ class RosProcess:
                     truth["time"][0] = physics.time
                     truth["attached"][:] = physics.state.bunch_attached
                     truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
+
+    def _wake(self) -> None:
+        channel = self.worker.current().shared
+        channel.steps.wake()
+        channel.truth.wake()
 
     def _take_commands(self) -> list[Command]:
         return [self._commands.popleft() for _ in range(len(self._commands))]

@@ -23,6 +23,8 @@ from vinesim.ros.names import ros_name
 STEP_TOPICS = ("/clock", "joint_states", "tf", "mobile_base_controller/odom", "vine/contacts")
 """Topics with a message for every step."""
 TRUTH_TOPIC = "tf_environment"
+NICENESS = 5
+"""Behind the client's loop, before the renderer."""
 QUEUE_CAPACITY = 100
 """Steps that may wait for the process, a second of them; later ones are lost, and counted."""
 STATISTICS_PERIOD = 0.2
@@ -73,7 +75,7 @@ class RosChannel:
 
 def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
     """Entry of the process: publish until told to stop."""
-    serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run())
+    serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run(), NICENESS)
 
 
 class RosWorker:

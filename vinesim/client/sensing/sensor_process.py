@@ -93,8 +93,10 @@ class SensorProcess:
         """
         self.client, self.robot = client, robot or client.robot
         self._write(client)
+        self._wake()
         self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
+        client.wake_readers.append(self._wake)
 
     # ------------------------------------------------------------------ in the loop
 
@@ -142,6 +144,9 @@ class SensorProcess:
                 pose[:] = self.robot.frame_pose(frame)
             self._pose_count += 1
             shared["pose_count"][0] = self._pose_count
+
+    def _wake(self) -> None:
+        self.worker.current().shared.snapshot.wake()
 
     # ------------------------------------------------------------------ outside the loop
 

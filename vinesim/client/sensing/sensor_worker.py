@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-import os
 import pathlib
 import sys
 import time
@@ -40,9 +39,9 @@ POLL_PERIOD = 0.02
 """Longest time without a look at requests and subscribers [s]."""
 SWITCH_INTERVAL = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
-NICE = 10
-"""Niceness where cores are scarce: the client's loop and its ROS process come first, but a renderer that is much nicer
-starves beside other programs (docs/decisions/sensor-process.md)."""
+NICENESS = 10
+"""The client's loop and its ROS process come first, but a renderer that is much nicer starves beside other programs
+(docs/decisions/sensor-process.md)."""
 POSE_HISTORY = 128
 """Poses of the sensors that are kept for lidars: of 2.5 s."""
 
@@ -104,14 +103,12 @@ class SensorChannel:
 def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connection) -> None:
     """Entry of the process: render and publish until told to stop."""
     sys.setswitchinterval(SWITCH_INTERVAL)
-    if hasattr(os, "nice"):
-        os.nice(NICE)
 
     def work() -> None:
         with contextlib.ExitStack() as stack:
             SensorWorker(config, channel, pipe, stack).run()
 
-    serve("sensor process", pipe, work)
+    serve("sensor process", pipe, work, NICENESS)
 
 
 class SensorWorker:
@@ -244,9 +241,12 @@ class SensorWorker:
     def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
         """The newest snapshot, and sensor poses with their times [s] since the last one; the last are of its time.
 
-        None, and counted, if the list of bodies that it belongs to has not arrived.
+        None if it was read before: it was written between the signal for the last one and its reading. None, and
+        counted, if the list of bodies that it belongs to has not arrived.
         """
         with self.channel.snapshot.reading() as shared:
+            if shared["number"][0] == self._last_number:
+                return None
             memory, version = self._visuals.memory, int(shared["visuals_version"][0])
             if memory is None or version != self._visuals.version:
                 self.frames_skipped += 1

@@ -75,13 +75,15 @@ class SharedSnapshot:
     """Arrays that one process writes and another reads as a whole. The writer never waits; the reader has the newest.
 
     Both hold a lock while they copy. A writer that finds it taken leaves the snapshot as it is and counts that; it
-    should write the next time, with all that has changed since.
+    should write the next time, with all that has changed since. The reader is woken by :meth:`wake`, not by writing.
     """
 
     def __init__(self, layout: Layout, context: BaseContext) -> None:
         self.arrays = SharedArrays(layout)
         self.missed_writes = 0
         """Snapshots that were not written because the reader was just reading."""
+        self._is_new = False
+        """Whether something was written since the reader was woken last."""
         self._lock = context.Lock()
         self._written = context.Semaphore(0)
 
@@ -96,10 +98,16 @@ class SharedSnapshot:
             yield self.arrays
         finally:
             self._lock.release()
+            self._is_new = True
+
+    def wake(self) -> None:
+        """Let the reader know of what was written."""
+        if self._is_new:
+            self._is_new = False
             self._written.release()
 
     def wait(self, timeout: float) -> bool:
-        """Wait up to ``timeout`` [s] until something was written since the last call; whether it was."""
+        """Wait up to ``timeout`` [s] until the writer has woken it since the last call; whether it has."""
         if not self._written.acquire(timeout=timeout):
             return False
         while self._written.acquire(block=False):

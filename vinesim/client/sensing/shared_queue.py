@@ -1,4 +1,8 @@
-"""A queue of records in shared memory, from one process to another: none is replaced, each lost one is counted."""
+"""A queue of records in shared memory, from one process to another: none is replaced, each lost one is counted.
+
+Putting a record does not wake the reader, :meth:`SharedQueue.wake` does: where all cores are busy the kernel often runs
+the process that was woken at once and on the same core, in the middle of the writer's work.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +27,12 @@ class SharedQueue:
         self._free = context.Semaphore(capacity)
         self._filled = context.Semaphore(0)
         self._next = 0
+        self._unannounced = 0
+        """Records that were put since the reader was woken last."""
 
     @contextlib.contextmanager
     def put(self) -> Iterator[Any | None]:
-        """The record to fill, which is sent when the block is left; None if there is no room, which is counted."""
+        """The record to fill, put when the block is left; None if there is no room, which is counted."""
         if not self._free.acquire(block=False):
             self.lost += 1
             yield None
@@ -37,7 +43,13 @@ class SharedQueue:
             self._free.release()
             raise
         self._next = (self._next + 1) % self._capacity
-        self._filled.release()
+        self._unannounced += 1
+
+    def wake(self) -> None:
+        """Let the reader take what was put."""
+        while self._unannounced:
+            self._unannounced -= 1
+            self._filled.release()
 
     def take(self, timeout: float) -> Any | None:
         """The oldest record, a copy; waits up to ``timeout`` [s] for one, then None."""

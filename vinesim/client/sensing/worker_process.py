@@ -37,13 +37,18 @@ class WorkerError(RuntimeError):
     exit_code = 3
 
 
-def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
+def serve(title: str, pipe: Connection, work: Callable[[], None], niceness: int) -> NoReturn:
     """The whole life of a process: ``work``, until it returns, fails, or the client's process has ended.
 
-    ``title`` names the process in its log: "sensor process".
+    ``title`` names the process in its log: "sensor process". With its ``niceness`` and class it does not take the core
+    of the loop that wakes it (docs/decisions/sensor-process.md).
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+    if hasattr(os, "SCHED_BATCH"):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     code = 0
     try:
         work()
