@@ -311,3 +311,17 @@ def test_absurd_values_are_refused_in_one_line(tmp_path, old: str, new: str, say
     with pytest.raises(SensorError, match=says) as caught:
         LidarSpec.load(str(file))
     assert "\n" not in str(caught.value)
+
+
+def test_any_number_of_threads_gives_the_same_scan() -> None:
+    """In one revolution and in sectors, with noise."""
+    primitives, spec = _two_walls(0.3), LidarSpec.load("vlp16")
+    whole = Lidar(spec, threads=1).scan(primitives, AT)
+    for threads in (2, 3):
+        lidar = Lidar(spec, threads=threads)
+        lidar.begin_revolution()
+        for first in range(0, lidar.firings, 300):
+            lidar.fire(primitives, first, np.repeat(AT[None], min(300, lidar.firings - first), 0))
+        parts = lidar.finish_revolution(AT, 0.0)
+        assert np.array_equal(whole.xyz, parts.xyz)
+        assert np.array_equal(whole.labels, parts.labels)

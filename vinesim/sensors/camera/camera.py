@@ -202,7 +202,8 @@ class Camera:
         shape = (self.info.height, self.info.width)
         # a stereo camera matches by the texture of the picture
         is_lit = CameraOutput.RGB in outputs or (CameraOutput.DEPTH in outputs and self._stereo is not None)
-        picture = self.render_on_device(primitives, pose, time, is_lit=is_lit)
+        measures = self._stereo is not None and CameraOutput.DEPTH in outputs
+        picture = self.render_on_device(primitives, pose, time, is_lit=is_lit, measures=measures)
         wanted = [
             picture if is_lit else None,
             self.rasterizer.depth if outputs & (CameraOutput.DEPTH | CameraOutput.EXACT_DEPTH) else None,
@@ -213,8 +214,7 @@ class Camera:
         if CameraOutput.DEPTH not in outputs:
             depth = np.zeros((0, 0), np.float32)
         elif self._stereo:
-            dice = spec_file.noise_rng(self.seed, self.name, self.image_index)
-            depth = self._stereo.measure(primitives, pinhole(self.info, pose), exact, rgb, dice)
+            depth = self._stereo.measure(primitives, pinhole(self.info, pose), exact, rgb, None)
         else:
             too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
             depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
@@ -247,18 +247,29 @@ class Camera:
         return copies
 
     def render_on_device(
-        self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, is_lit: bool = True
+        self,
+        primitives: Primitives,
+        pose: np.ndarray,
+        time: float = 0.0,
+        *,
+        is_lit: bool = True,
+        measures: bool = False,
     ) -> wp.array | None:
         """The colours [pixel, 3] of the frame, where they were made: on a GPU, nothing is waited for.
 
-        None, and depth and labels alone, unless ``is_lit``.
+        None, and depth and labels alone, unless ``is_lit``. ``measures``: the noise of a stereo measurement is drawn
+        meanwhile.
         """
         if self.device == "cpu":
             load_camera_kernels()
         pose = np.array(pose, float)
         lens = pinhole(self.info, pose)
+        beside = []
+        if measures and self._stereo:
+            rng = spec_file.noise_rng(self.seed, self.name, self.image_index)
+            beside = [functools.partial(self._stereo.draw_noise, rng)]
         seen = self.rasterizer
-        seen.draw(primitives, lens)
+        seen.draw(primitives, lens, beside=beside)
         if not is_lit:
             return None
         seen, quality = self._supersampled, self._quality

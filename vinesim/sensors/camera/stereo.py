@@ -115,25 +115,24 @@ class Stereo:
         lens: Pinhole,
         depth: np.ndarray,
         rgb: np.ndarray,
-        rng: np.random.Generator,
+        rng: np.random.Generator | None,
     ) -> np.ndarray:
-        """Measured depth [height, width] m from exact ``depth`` [height, width] m and the picture ``rgb``."""
+        """Measured depth [height, width] m from exact ``depth`` [height, width] m and the picture ``rgb``.
+
+        ``rng`` None: with the noise of the last :meth:`draw_noise`.
+        """
+        if rng is not None:
+            self.draw_noise(rng)
         second = self._second_pinhole(lens)
         if self.device != "cpu":
             self._second.draw(primitives, second)
             self._disparity.assign((np.float32(self._parameters.focal_baseline) / depth).ravel())
             self._grey.assign(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel())
-            self._noise.assign(self._correlated_noise(rng))
             self._measure_on_gpu(lens, second)
         else:
             if not self._second_from_first:
                 self._second.draw(primitives, second)
-            self._workers.share(
-                [
-                    functools.partial(self._draw_noise, rng),
-                    functools.partial(self._set_picture, depth, rgb),
-                ]
-            )
+            self._set_picture(depth, rgb)
             self._measure_on_cpu(lens, second)
         return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
 
@@ -143,8 +142,9 @@ class Stereo:
         np.divide(np.float32(self._parameters.focal_baseline), depth, out=disparity)
         cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY, dst=self._grey.numpy().reshape(depth.shape))
 
-    def _draw_noise(self, rng: np.random.Generator) -> None:
-        self._noise.numpy()[:] = self._correlated_noise(rng)
+    def draw_noise(self, rng: np.random.Generator) -> None:
+        """Draw the noise of the next measurement; it does not depend on the picture."""
+        self._noise.assign(self._correlated_noise(rng))
 
     def _measure_on_gpu(self, lens: Pinhole, second: Pinhole) -> None:
         _, rows, columns = self._noise.shape

@@ -9,6 +9,8 @@ Two halves, so that either can be exchanged: a :class:`RayGrid` tells what rays 
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Callable
 from typing import Annotated, Literal, Protocol
 
@@ -36,6 +38,10 @@ MAX_SHARED_TRANSLATION, MAX_SHARED_ROTATION = 4e-3, 3.5e-3
 
 That is at most half a step of the head aside, and saves the finding of what is near for every few firings.
 """
+_BANDS_PER_THREAD = 2
+"""Bands of firings that one thread takes on average: what meets more gets more time from whichever is free."""
+_MIN_BAND = 32
+"""Firings of a band, at least: each band looks through all that is near."""
 _RETURNS = {"strongest": 0, "last": 1, "dual": 2}
 
 
@@ -134,7 +140,10 @@ class RayGrid(Protocol):
     """[column * row], -2 the ground, -1 nothing."""
 
     def cast(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
-        """Fill distances and primitives of ``count`` columns from ``first`` on, with the head at ``pose`` [7]."""
+        """Fill distances and primitives of ``count`` columns from ``first`` on, with the head at ``pose`` [7].
+
+        Threads call it for different columns at the same time.
+        """
         ...
 
 
@@ -150,13 +159,13 @@ class Lidar:
         *,
         seed: int = 0,
         threads: int | None = None,
-        grid: Callable[[np.ndarray, np.ndarray, float, int, str, ThreadPool], RayGrid] = LidarRasterizer,
+        grid: Callable[[np.ndarray, np.ndarray, float, int, str], RayGrid] = LidarRasterizer,
     ) -> None:
         """Noise follows from (``seed``, ``name``, number of the revolution).
 
-        ``threads`` of the CPU find hits: the cores that this process may use, up to four, unless given.
-        ``grid(elevation, azimuth, step, columns, device, workers)`` makes what finds hits: see
-        :class:`LidarRasterizer`.
+        ``threads`` of the CPU share the shots: the cores that this process may use, up to four, unless given. Every
+        number of them gives the same bits. ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits:
+        see :class:`LidarRasterizer`.
         """
         self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
         self.revolution = 0
@@ -182,9 +191,10 @@ class Lidar:
             -2.0 * np.pi * spec.rate.value * spec.firing_period.value,
             self.firings,
             device,
-            ThreadPool((threads or min(usable_cores(), MAX_THREADS)) if device == "cpu" else 1),
         )
         """Finds what rays meet: a column for each firing, in it the rays of each laser's shot."""
+        self._workers = ThreadPool((threads or min(usable_cores(), MAX_THREADS)) if device == "cpu" else 1)
+        wp.load_module(lidar_echoes, device=device)  # threads must not do so at the same time
         self._receiver = self._receiver_parameters()
         kept = 2 if spec.returns == "dual" else 1
         self._noise = wp.zeros((len(self.offset), 3), dtype=float, device=device)
@@ -255,6 +265,15 @@ class Lidar:
         return max(int(1.0 / max(way, turn, 1e-6)), 1)
 
     def _fire(self, primitives: Primitives, first: int, count: int, pose: np.ndarray) -> None:
+        """Firings from one ``pose`` [7], in bands that threads take one after the other."""
+        size = self._workers.size
+        bands = max(min(_BANDS_PER_THREAD * size, count // _MIN_BAND), 1) if size > 1 else 1
+        ends = [first + count * i // bands for i in range(bands + 1)]
+        fire_band = functools.partial(self._fire_band, primitives, pose)
+        self._workers.share([functools.partial(fire_band, i, j - i) for i, j in itertools.pairwise(ends)])
+
+    def _fire_band(self, primitives: Primitives, pose: np.ndarray, first: int, count: int) -> None:
+        """``count`` firings from ``first`` on."""
         grid = self.ray_grid
         grid.cast(primitives, pose, first, count, self.spec.farthest.value)
         wp.launch(

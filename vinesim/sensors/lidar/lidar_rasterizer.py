@@ -7,22 +7,15 @@ to start from, as lasers that fire in turn have, or the sub-rays of one beam. Th
 
 from __future__ import annotations
 
-import functools
-import itertools
-
 import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.raster import lidar_raster
 from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.raster.pinhole import EMPTY_KEY
 from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 from vinesim.sensors.scene.primitives import Primitives
-
-_MIN_BAND = 32
-"""Fewer columns than this are not shared among threads."""
 
 
 def _as_floats(vectors: wp.array) -> wp.array:
@@ -34,20 +27,11 @@ class LidarRasterizer:
     """The rays of one revolution, and their latest hits."""
 
     def __init__(
-        self,
-        elevation: np.ndarray,
-        azimuth: np.ndarray,
-        step: float,
-        columns: int,
-        device: str = "cpu",
-        workers: ThreadPool | None = None,
+        self, elevation: np.ndarray, azimuth: np.ndarray, step: float, columns: int, device: str = "cpu"
     ) -> None:
         """Ray (column k, row r) leaves at ``elevation[r]`` and ``azimuth[r] + k * step`` [rad], in the head's frame:
         x forward, z up, azimuth counter-clockwise seen from above.
-
-        ``workers`` cast bands of columns at once; every number of them gives the same bits.
         """
-        self.workers = workers or ThreadPool(1)
         wp.load_module(lidar_raster, device=device)  # threads must not do so at the same time
         elevation, azimuth = np.asarray(elevation, float), np.asarray(azimuth, float)
         self.rows, self.columns, self.step, self.device = len(elevation), columns, float(step), device
@@ -85,37 +69,15 @@ class LidarRasterizer:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Fire ``count`` columns from ``first`` on (all that follow), with the head at ``pose`` [7] in the world.
 
-        Fills that part of :attr:`distance` and :attr:`primitive`, and returns it [count, row].
+        Fills that part of :attr:`distance` and :attr:`primitive`, and returns it [count, row]. Threads may do so for
+        different columns at the same time.
         """
         count = self.columns - first if count is None else count
-        parts = min(self.workers.size, max(count // _MIN_BAND, 1))
-        ends = [first + count * i // parts for i in range(parts + 1)]
-        cast_band = functools.partial(self._cast_band, primitives, pose, reach)
-        self.workers.share([functools.partial(cast_band, *pair) for pair in itertools.pairwise(ends)])
-        part, shape = slice(first * self.rows, (first + count) * self.rows), (count, self.rows)
-        return self.distance[part].numpy().reshape(shape), self.primitive[part].numpy().reshape(shape)
-
-    def _head_at(self, pose: np.ndarray, reach: float, first: int, end: int) -> lidar_raster.LidarHead:
-        """The head at ``pose`` [7], firing the columns from ``first`` to before ``end``."""
-        head = lidar_raster.LidarHead()
-        for name in lidar_raster.LidarHead.vars:
-            setattr(head, name, getattr(self._head, name))
-        head.eye = wp.vec3(*map(float, pose[:3]))
-        head.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
-        head.first_column, head.end_column, head.max_range = first, end, float(reach)
-        low, high = self._azimuth_range
-        turn = 0.5 * (low + high) + 0.5 * (first + end - 1) * self.step
-        reaches = 0.5 * (high - low + abs(self.step) * (end - first)) + 1e-4
-        head.azimuth_middle = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
-        head.azimuth_half_range = (
-            wp.vec2(float(np.cos(reaches)), float(np.sin(reaches))) if reaches < 1.5 else wp.vec2(-1.0, 0.0)
+        head, part = (
+            self._head_at(pose, reach, first, first + count),
+            slice(first * self.rows, (first + count) * self.rows),
         )
-        return head
-
-    def _cast_band(self, primitives: Primitives, pose: np.ndarray, reach: float, first: int, end: int) -> None:
-        """Fill the columns from ``first`` to before ``end``."""
-        head = self._head_at(pose, reach, first, end)
-        self._keys[first * self.rows : end * self.rows].fill_(int(EMPTY_KEY))
+        self._keys[part].fill_(int(EMPTY_KEY))
         bound = wp.empty(len(primitives.cluster_first), dtype=float, device=self.device)
         wp.launch(
             lidar_raster.cull_clusters,
@@ -147,8 +109,27 @@ class LidarRasterizer:
         run = self.rows if self.device == "cpu" else 1
         wp.launch(
             lidar_raster.resolve_keys,
-            (end - first) * self.rows // run,
+            count * self.rows // run,
             inputs=[self._keys, head, run],
             outputs=[self.distance, self.primitive],
             device=self.device,
         )
+        shape = (count, self.rows)
+        return self.distance[part].numpy().reshape(shape), self.primitive[part].numpy().reshape(shape)
+
+    def _head_at(self, pose: np.ndarray, reach: float, first: int, end: int) -> lidar_raster.LidarHead:
+        """The head at ``pose`` [7], firing the columns from ``first`` to before ``end``."""
+        head = lidar_raster.LidarHead()
+        for name in lidar_raster.LidarHead.vars:
+            setattr(head, name, getattr(self._head, name))
+        head.eye = wp.vec3(*map(float, pose[:3]))
+        head.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
+        head.first_column, head.end_column, head.max_range = first, end, float(reach)
+        low, high = self._azimuth_range
+        turn = 0.5 * (low + high) + 0.5 * (first + end - 1) * self.step
+        reaches = 0.5 * (high - low + abs(self.step) * (end - first)) + 1e-4
+        head.azimuth_middle = wp.vec2(float(np.cos(turn)), float(np.sin(turn)))
+        head.azimuth_half_range = (
+            wp.vec2(float(np.cos(reaches)), float(np.sin(reaches))) if reaches < 1.5 else wp.vec2(-1.0, 0.0)
+        )
+        return head

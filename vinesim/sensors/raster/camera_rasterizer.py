@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
@@ -113,11 +114,16 @@ class CameraRasterizer:
         lens: Pinhole,
         nearest: float = 0.0,
         farthest: float = MAX_DEPTH,
+        beside: Sequence[Callable[[], None]] = (),
     ) -> None:
-        """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels."""
+        """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels.
+
+        ``beside`` is other work for the same threads, done when this returns.
+        """
         if primitives.rasterizer is not None:
             primitives.rasterizer.rasterize(primitives, lens, None, self.keys)
             self._resolve(primitives, lens, nearest, farthest)
+            self.workers.share(beside)
             return
 
         def draw_band(band: Pinhole) -> None:
@@ -126,7 +132,7 @@ class CameraRasterizer:
             self._rasterize(primitives, band, seen[np.argsort(distance[seen], kind="stable")])
             self._resolve(primitives, band, nearest, farthest)
 
-        self.workers.share([functools.partial(draw_band, band) for band in self.bands(lens)])
+        self.workers.share([*beside, *(functools.partial(draw_band, band) for band in self.bands(lens))])
 
     def bands(self, lens: Pinhole) -> list[Pinhole]:
         """The bands of rows that :attr:`workers` take one after the other."""
