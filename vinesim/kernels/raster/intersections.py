@@ -77,7 +77,7 @@ def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
 
 @wp.func
 def hit_cylinder(a: wp.vec3, b: wp.vec3, r: float, d: wp.vec3) -> float:
-    """First hit of a ray from the origin with a solid cylinder with flat ends."""
+    """First hit of a ray from the origin with a solid cylinder with flat ends, without a branch."""
     ba = b - a
     length2 = wp.dot(ba, ba)
     m = wp.dot(ba, d)
@@ -88,19 +88,15 @@ def hit_cylinder(a: wp.vec3, b: wp.vec3, r: float, d: wp.vec3) -> float:
     k1 = length2 * wp.dot(oa, d) - n * m
     k0 = length2 * wp.dot(oa, oa) - n * n - r * r * length2
     h = k1 * k1 - k2 * k0
-    best = FAR
-    if k2 > 1.0e-12 * length2 and h >= 0.0:
-        t = (-k1 - wp.sqrt(h)) / k2
-        y = n + t * m
-        if t + shift > 0.0 and y > 0.0 and y < length2:
-            best = t + shift
-    if m != 0.0:
-        end = wp.where(m > 0.0, 0.0, length2)  # the end that faces the ray
-        t = (end - n) / m
-        p = oa + d * t - ba * (end / length2)
-        if t + shift > 0.0 and t + shift < best and wp.dot(p, p) <= r * r:
-            best = t + shift
-    return best
+    meets = k2 > 1.0e-12 * length2 and h >= 0.0  # not along the axis
+    t = (-k1 - wp.sqrt(wp.max(h, 0.0))) / wp.where(meets, k2, 1.0)
+    y = n + t * m
+    best = wp.where(meets and t + shift > 0.0 and y > 0.0 and y < length2, t + shift, FAR)
+    end = wp.where(m > 0.0, 0.0, length2)  # the end that faces the ray
+    t = (end - n) / wp.where(m != 0.0, m, 1.0)
+    p = oa + d * t - ba * (end / length2)
+    within = m != 0.0 and wp.dot(p, p) <= r * r
+    return wp.where(within and t + shift > 0.0 and t + shift < best, t + shift, best)
 
 
 @wp.func

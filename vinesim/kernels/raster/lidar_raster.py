@@ -7,7 +7,7 @@ camera's pixels are (:mod:`vinesim.kernels.raster.camera_raster`).
 
 import warp as wp
 
-from vinesim.kernels.raster.intersections import hit_cone, hit_primitive, hit_sphere
+from vinesim.kernels.raster.intersections import hit_box, hit_cone, hit_cylinder, hit_primitive, hit_sphere
 from vinesim.kernels.raster.leaf_surface import hit_leaf, hit_leaf_rectangle, inside_outline, leaf_extent, leaf_heights
 from vinesim.kernels.raster.pinhole import (
     BATCH,
@@ -277,6 +277,12 @@ def angular_bound(shapes: Shapes, i: int, kind: int, head: LidarHead) -> Angular
     return o
 
 
+@wp.func
+def axes_in_box(head: LidarHead, q: wp.quat) -> wp.mat33:
+    """Columns: the head's axes in the frame of a box of attitude ``q``."""
+    return wp.transpose(wp.quat_to_matrix(q)) * wp.transpose(head.rotation)
+
+
 @wp.struct
 class LeafFrame:
     """A blade's axes, over its size, in the head's frame, and where the head is in the blade's frame and unit."""
@@ -452,6 +458,17 @@ def raster_clusters(
                         for m in range(n):
                             ray = leaf_ray(leaf, ray_direction(head, spots[m]))
                             depths[m] = leaf_range(shapes, i, leaf, ray, depths[m], head.max_range)
+                    elif kind == CYLINDER:
+                        while m < whole:
+                            depths[m] = hit_cylinder(a, b, a4[3], ray_direction(head, spots[m]))
+                            m += 1
+                    elif kind == BOX:
+                        half_size = wp.vec3(a4[3], shapes.c[i][0], shapes.c[i][1])
+                        eye = wp.quat_rotate_inv(as_quat(b4), head.eye - xyz(a4))
+                        turned = axes_in_box(head, as_quat(b4))
+                        while m < whole:
+                            depths[m] = hit_box(eye, turned * ray_direction(head, spots[m]), half_size)
+                            m += 1
                     else:
                         back = wp.transpose(head.rotation)
                         for m in range(n):
