@@ -196,7 +196,7 @@ def bounding_balls(shapes: Shapes, i: int, kind: int, head: LidarHead) -> BallCh
 
 @wp.struct
 class AngularBound:
-    """Azimuths and elevations, in the head's frame, that hold a solid."""
+    """Azimuths and elevations, in the head's frame, that hold a primitive."""
 
     azimuth: float
     """[rad] Its middle."""
@@ -205,32 +205,73 @@ class AngularBound:
     low: float
     high: float
     """Tangents of the elevations."""
-    is_around_eye: int
-    """1 if the head is inside: no ray meets a solid from inside."""
+
+
+@wp.struct
+class OrientedBox:
+    """A box around a primitive, in the head's frame: its centre and its half axes [m]."""
+
+    centre: wp.vec3
+    x: wp.vec3
+    y: wp.vec3
+    z: wp.vec3
 
 
 @wp.func
-def angular_bound(shapes: Shapes, i: int, kind: int, head: LidarHead) -> AngularBound:
-    """Bound of a box or cylinder by the corners of its box. A robot's own body around its lidar is why: the ball
-    around a link next to the head holds the head, and would be tested against every ray."""
+def oriented_box(shapes: Shapes, i: int, kind: int, head: LidarHead) -> OrientedBox:
+    """The box around a box, cylinder or leaf."""
     a4 = shapes.a[i]
     b4 = shapes.b[i]
-    centre = head.rotation * (xyz(a4) - head.eye)
-    x = wp.vec3(0.0, 0.0, 0.0)
-    y = wp.vec3(0.0, 0.0, 0.0)
-    z = wp.vec3(0.0, 0.0, 0.0)
+    o = OrientedBox()
+    o.centre = head.rotation * (xyz(a4) - head.eye)
     if kind == BOX:
         q = as_quat(b4)
-        x = head.rotation * wp.quat_rotate(q, wp.vec3(a4[3], 0.0, 0.0))
-        y = head.rotation * wp.quat_rotate(q, wp.vec3(0.0, shapes.c[i][0], 0.0))
-        z = head.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, shapes.c[i][1]))
-    else:
-        z = 0.5 * (head.rotation * (xyz(b4) - xyz(a4)))
-        centre += z
-        axis = z / wp.max(wp.length(z), 1.0e-9)
+        o.x = head.rotation * wp.quat_rotate(q, wp.vec3(a4[3], 0.0, 0.0))
+        o.y = head.rotation * wp.quat_rotate(q, wp.vec3(0.0, shapes.c[i][0], 0.0))
+        o.z = head.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, shapes.c[i][1]))
+    elif kind == CYLINDER:
+        o.z = 0.5 * (head.rotation * (xyz(b4) - xyz(a4)))
+        o.centre += o.z
+        axis = o.z / wp.max(wp.length(o.z), 1.0e-9)
         other = wp.where(wp.abs(axis[2]) < 0.7, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
-        x = wp.normalize(wp.cross(axis, other)) * a4[3]
-        y = wp.cross(axis, x)
+        o.x = wp.normalize(wp.cross(axis, other)) * a4[3]
+        o.y = wp.cross(axis, o.x)
+    else:
+        rib = head.rotation * xyz(b4)
+        up = head.rotation * xyz(shapes.c[i])
+        heights = leaf_heights(shapes.d[i])
+        extent = leaf_extent(shapes.hull, int(b4[3]))
+        o.centre += (rib * (extent[1] + extent[2]) + up * (heights[0] + heights[1])) * (0.5 * a4[3])
+        o.x = wp.cross(rib, up) * (extent[0] * a4[3])
+        o.y = rib * (0.5 * (extent[2] - extent[1]) * a4[3])
+        o.z = up * (0.5 * (heights[1] - heights[0]) * a4[3])
+    return o
+
+
+@wp.func
+def holds_eye(box: OrientedBox, kind: int, radius: float) -> bool:
+    """Whether the head is inside of a box or cylinder, given by the box around it: no ray meets it from inside."""
+    c = box.centre
+    inside = wp.where(kind == BOX, 1.0, 0.999999)
+    u = wp.abs(wp.dot(c, box.x)) < inside * wp.dot(box.x, box.x)
+    v = wp.abs(wp.dot(c, box.y)) < inside * wp.dot(box.y, box.y)
+    w = wp.abs(wp.dot(c, box.z)) < inside * wp.dot(box.z, box.z)
+    if kind == CYLINDER:
+        off = c - box.z * (wp.dot(c, box.z) / wp.max(wp.dot(box.z, box.z), 1.0e-12))
+        u = wp.dot(off, off) < inside * radius * radius
+        v = u
+    return u and v and w
+
+
+@wp.func
+def angular_bound(box: OrientedBox) -> AngularBound:
+    """Bound of a box by its corners. The ball around a link of the robot next to the head holds the head, and would be
+    tested against every ray; the ball around a leaf that is seen edge-on holds many times the rays that the leaf does.
+    """
+    centre = box.centre
+    x = box.x
+    y = box.y
+    z = box.z
     o = AngularBound()
     o.azimuth = wp.atan2(centre[1], centre[0])
     o.half = 3.1416
@@ -265,15 +306,6 @@ def angular_bound(shapes: Shapes, i: int, kind: int, head: LidarHead) -> Angular
     bottom -= margin
     o.high = wp.where(top > 0.0, top / wp.max(near, 1.0e-9), top / (far + margin))
     o.low = wp.where(bottom < 0.0, bottom / wp.max(near, 1.0e-9), bottom / (far + margin))
-    inside = wp.where(kind == BOX, 1.0, 0.999999)
-    u = wp.abs(wp.dot(centre, x)) < inside * wp.dot(x, x)
-    v = wp.abs(wp.dot(centre, y)) < inside * wp.dot(y, y)
-    w = wp.abs(wp.dot(centre, z)) < inside * wp.dot(z, z)
-    if kind == CYLINDER:
-        off = centre - z * (wp.dot(centre, z) / wp.max(wp.dot(z, z), 1.0e-12))
-        u = wp.dot(off, off) < inside * a4[3] * a4[3]
-        v = u
-    o.is_around_eye = wp.where(u and v and w, 1, 0)
     return o
 
 
@@ -317,17 +349,15 @@ def leaf_ray(leaf: LeafFrame, direction: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def leaf_range(shapes: Shapes, i: int, leaf: LeafFrame, ray: wp.vec3, t: float, max_range: float) -> float:
-    """Range [m] of blade ``i`` along a ray that meets its rectangle at ``t``, FAR where its outline is missed."""
+def leaf_range(shapes: Shapes, i: int, leaf: LeafFrame, ray: wp.vec3, t: float) -> float:
+    """Range [m] of blade ``i`` along a ray that meets its rectangle at ``t``, or in several places if that is negative; FAR
+    where its outline is missed."""
     number = int(shapes.b[i][3])
     if t < 0.0:
         return hit_leaf(shapes.outline, number, shapes.d[i], leaf.eye, ray, 0)
-    if t < max_range:
-        u = leaf.eye[0] + t * ray[0]
-        v = leaf.eye[1] + t * ray[1]
-        if not inside_outline(shapes.outline, number, u, v, 0):
-            return FAR
-    return t
+    u = leaf.eye[0] + t * ray[0]
+    v = leaf.eye[1] + t * ray[1]
+    return wp.where(inside_outline(shapes.outline, number, u, v, 0), t, FAR)
 
 
 @wp.kernel
@@ -380,18 +410,19 @@ def raster_clusters(
         b = balls.b
         r = balls.r
         pieces = balls.count
-        solid = AngularBound()
-        is_solid = kind == BOX or (kind == CYLINDER and pieces == 1)
-        if is_solid:
-            solid = angular_bound(shapes, i, kind, head)
-            if solid.is_around_eye == 1:
+        bound = AngularBound()
+        is_boxed = kind == BOX or kind == LEAF or (kind == CYLINDER and pieces == 1)
+        if is_boxed:
+            box = oriented_box(shapes, i, kind, head)
+            if kind != LEAF and holds_eye(box, kind, a4[3]):
                 continue
+            bound = angular_bound(box)
         for piece in range(pieces):
             p = a + (b - a) * ((float(piece) + 0.5) / float(pieces))
             around = wp.sqrt(p[0] * p[0] + p[1] * p[1])
             span = circle_tangents(p[2], around, r)
-            if is_solid:
-                span = wp.vec2(wp.max(span[0], solid.low), wp.min(span[1], solid.high))
+            if is_boxed:
+                span = wp.vec2(wp.max(span[0], bound.low), wp.min(span[1], bound.high))
             row = first_row(head, span[0])
             row += (part - row % slices + slices) % slices - slices
             more = row + slices < rows
@@ -400,9 +431,9 @@ def raster_clusters(
             if more:
                 azimuth = wp.atan2(p[1], p[0])
                 half = half_angle(r, around) + 1.0e-5
-                if is_solid and solid.half < half:
-                    azimuth = solid.azimuth
-                    half = solid.half
+                if is_boxed and bound.half < half:
+                    azimuth = bound.azimuth
+                    half = bound.half
                 half = wp.min(half / wp.abs(head.step), 0.5 * period)
                 nearest = wp.int64(int(wp.max(wp.length(p) - r, 0.0) * 1.0e6)) << wp.int64(32)
                 column = wp.int32(0)
@@ -456,8 +487,9 @@ def raster_clusters(
                             )
                             m += 1
                         for m in range(n):
-                            ray = leaf_ray(leaf, ray_direction(head, spots[m]))
-                            depths[m] = leaf_range(shapes, i, leaf, ray, depths[m], head.max_range)
+                            if depths[m] < head.max_range:
+                                ray = leaf_ray(leaf, ray_direction(head, spots[m]))
+                                depths[m] = leaf_range(shapes, i, leaf, ray, depths[m])
                     elif kind == CYLINDER:
                         while m < whole:
                             depths[m] = hit_cylinder(a, b, a4[3], ray_direction(head, spots[m]))
