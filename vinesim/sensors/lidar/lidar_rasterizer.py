@@ -13,6 +13,7 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels.raster import lidar_raster
 from vinesim.kernels.raster import primitives as shapes
+from vinesim.kernels.raster.lidar_bounds import ELEVATION_SLOTS, LidarHead
 from vinesim.kernels.raster.pinhole import EMPTY_KEY
 from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 from vinesim.sensors.scene.primitives import Primitives
@@ -46,14 +47,14 @@ class LidarRasterizer:
         self._keys = wp.empty(columns * self.rows, dtype=wp.int64, device=device)
         order = np.argsort(elevation, kind="stable")
         tangent = np.clip(np.tan(elevation[order]), -1.0e6, 1.0e6).astype(np.float32)
-        slot = ((tangent / (1.0 + np.abs(tangent)) + 1.0) * (0.5 * lidar_raster.ELEVATION_SLOTS - 0.01)).astype(int)
-        head = lidar_raster.LidarHead()
+        slot = ((tangent / (1.0 + np.abs(tangent)) + 1.0) * (0.5 * ELEVATION_SLOTS - 0.01)).astype(int)
+        head = LidarHead()
         head.tangent, head.azimuth = (
             wp.array(v.astype(np.float32), dtype=float, device=device) for v in (tangent, azimuth[order])
         )
         head.row_index = wp.array(order.astype(np.int32), device=device)
         # one slot early: the division above may round otherwise than a kernel's
-        slots = np.searchsorted(slot, np.arange(lidar_raster.ELEVATION_SLOTS + 3) - 1).astype(np.int32)
+        slots = np.searchsorted(slot, np.arange(ELEVATION_SLOTS + 3) - 1).astype(np.int32)
         head.row_slots = wp.array(slots, device=device)
         head.direction, head.step = _as_floats(self.direction), self.step
         self._head = head
@@ -117,10 +118,10 @@ class LidarRasterizer:
         shape = (count, self.rows)
         return self.distance[part].numpy().reshape(shape), self.primitive[part].numpy().reshape(shape)
 
-    def _head_at(self, pose: np.ndarray, reach: float, first: int, end: int) -> lidar_raster.LidarHead:
+    def _head_at(self, pose: np.ndarray, reach: float, first: int, end: int) -> LidarHead:
         """The head at ``pose`` [7], firing the columns from ``first`` to before ``end``."""
-        head = lidar_raster.LidarHead()
-        for name in lidar_raster.LidarHead.vars:
+        head = LidarHead()
+        for name in LidarHead.vars:
             setattr(head, name, getattr(self._head, name))
         head.eye = wp.vec3(*map(float, pose[:3]))
         head.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
