@@ -144,6 +144,7 @@ def run_loop(
     """Step in real time until ``stop`` (set by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until done."""
     gc.collect()
     gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
+    gc.enable()
     # until here Ctrl-C simply interrupts; from now on it ends the run in order
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -12,6 +12,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.sensing.ros_worker import STEP_TOPICS, RosChannel, RosConfig, run_ros_worker
+from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import WorkerProcess
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
@@ -54,8 +55,8 @@ class RosProcess:
             frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
         )  # fmt: skip
         self.worker = WorkerProcess(
-            f"the ROS process of {name}", run_ros_worker, config, lambda context: RosChannel(config, context),
-            self._receive,
+            f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
+            lambda context: RosChannel(config, context), self._receive,
         )  # fmt: skip
 
     def attach(self, client: Client, robot: Robot | None = None) -> None:

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import multiprocessing
 import os
 import queue
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
 from typing import Any, Generic, NoReturn, Protocol, TypeVar
+
+from vinesim.client.sensing.spawned_process import CONTEXT, spawn
 
 log = logging.getLogger(__name__)
 
@@ -77,15 +78,13 @@ S = TypeVar("S", bound=Shared)
 class Run(Generic[S]):
     """One run of the process, from its start to its end."""
 
-    def __init__(self, title: str, target: Callable[..., None], config: Any, shared: S, context: BaseContext) -> None:
+    def __init__(self, title: str, modules: Sequence[str], target: Callable[..., None], config: Any, shared: S) -> None:
         self.shared = shared
-        self.pipe, worker_end = context.Pipe()
+        spawned = spawn(title, modules)
+        self.pipe, self.process = spawned.pipe, spawned.process
         self.ready_since: float | None = None
         """Time at which the process was ready [s]."""
-        # BaseContext lacks Process in its annotations, every context has it
-        self.process = context.Process(target=target, args=(config, shared, worker_end), name=title, daemon=True)  # type: ignore[attr-defined]
-        self.process.start()
-        worker_end.close()
+        spawned.run(target, config, shared)
         self._outgoing: queue.SimpleQueue[tuple[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=self._send, name=f"to {title}", daemon=True).start()
 
@@ -111,21 +110,21 @@ class Run(Generic[S]):
 class WorkerProcess(Generic[S]):
     """Keeps one process running. ``title`` names it in messages: "the sensor process of picker".
 
-    ``target(config, shared, pipe)`` runs in the process; it sends ("ready", None) when it is, ("failed", text) before
-    it ends with an error, and ends at ("stop", None) or when the pipe is closed. ``share(context)`` makes what is
-    shared with one run. ``receive(kind, value)`` takes all other messages, and ("restarted", None) before those of a
-    further run, in a thread.
+    ``target(config, shared, pipe)`` runs in the process when that has imported ``modules``; it sends ("ready", None)
+    when it is, ("failed", text) before it ends with an error, and ends at ("stop", None) or when the pipe is closed.
+    ``share(context)`` makes what is shared with one run. ``receive(kind, value)`` takes all other messages, and
+    ("restarted", None) before those of a further run, in a thread.
     """
 
     def __init__(
-        self, title: str, target: Callable[..., None], config: Any, share: Callable[[BaseContext], S],
-        receive: Callable[[str, Any], None],
+        self, title: str, modules: Sequence[str], target: Callable[..., None], config: Any,
+        share: Callable[[BaseContext], S], receive: Callable[[str, Any], None],
     ) -> None:  # fmt: skip
         self.title = title
         self.restarts = 0
         """How often the process was started again."""
-        self._target, self._config, self._share, self._receive = target, config, share, receive
-        self._context = multiprocessing.get_context("spawn")
+        self._modules, self._target, self._config = modules, target, config
+        self._share, self._receive = share, receive
         self._closing = threading.Event()
         self._first_result = threading.Event()
         self._failure = ""
@@ -180,7 +179,7 @@ class WorkerProcess(Generic[S]):
     # ------------------------------------------------------------------ the supervising thread
 
     def _start(self) -> Run[S]:
-        return Run(self.title, self._target, self._config, self._share(self._context), self._context)
+        return Run(self.title, self._modules, self._target, self._config, self._share(CONTEXT))
 
     def _supervise(self) -> None:
         failures = 0
