@@ -3,14 +3,17 @@
 import msgspec
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.support import sensor_scenes
 from vinesim import frames
+from vinesim.kernels.sensing import stereo_input
 from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame
 from vinesim.sensors import spec_file
 from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.camera.stereo import Stereo
 from vinesim.sensors.raster.camera_rasterizer import pinhole
 from vinesim.sensors.spec_file import SensorError
 
@@ -234,3 +237,32 @@ def test_shadows_fall_on_the_same_side_in_a_turned_picture(quality: str) -> None
         plate = np.flatnonzero(frame.exact_depth[INFO.height // 2] < 1.0)
         assert len(columns) > 3
         assert columns.max() <= plate[0]
+
+
+def test_what_a_gpu_measures_from_its_own_picture_is_what_the_host_measures() -> None:
+    """The same noise, exact depth and colours as arrays of the device: the same bits."""
+    primitives, _ = sensor_scenes.world(_wall(2.5), _wall(1.2, half=0.2, index=1))
+    frame = Camera(SPEC, INFO, "camera").render(primitives, sensor_scenes.AHEAD)
+    lens = pinhole(INFO, frame.pose)
+    stereo = Stereo(SPEC.stereo, INFO, (SPEC.nearest.value, SPEC.farthest.value))
+    stereo.draw_noise(spec_file.noise_rng(0, "camera", 0))
+    by_host = stereo.measure(primitives, lens, frame.exact_depth, frame.rgb, None)
+    arrays = wp.array(frame.exact_depth.ravel()), wp.array(frame.rgb.reshape(-1, 3))
+    by_device = stereo.measure_on_device(primitives, lens, *arrays).numpy().reshape(by_host.shape)
+    assert np.isnan(by_host).any()
+    assert np.array_equal(by_host, by_device, equal_nan=True)
+
+
+def test_noise_of_a_gpu_is_normal_and_alike_within_a_window() -> None:
+    """Variance 1; fields that are independent; correlation falls to zero over one window."""
+    raw, noise, window = wp.empty((2, 308, 408)), wp.empty((2, 300, 400)), 9
+    wp.launch(stereo_input.draw_normals, raw.size, inputs=[5], outputs=[raw.flatten()])
+    wp.launch(stereo_input.correlate, noise.shape, inputs=[raw, window], outputs=[noise])
+    first, second = noise.numpy()
+    assert np.abs(raw.numpy().mean()) < 0.01
+    assert raw.numpy().std() == pytest.approx(1.0, abs=0.01)
+    assert first.std() == pytest.approx(1.0, abs=0.08)
+    assert abs((first * second).mean()) < 0.1
+    for lag in (1, 4, window):
+        alike = (first[:, lag:] * first[:, :-lag]).mean() / first.var()
+        assert alike == pytest.approx(1.0 - lag / window, abs=0.08)

@@ -204,17 +204,24 @@ class Camera:
         is_lit = CameraOutput.RGB in outputs or (CameraOutput.DEPTH in outputs and self._stereo is not None)
         measures = self._stereo is not None and CameraOutput.DEPTH in outputs
         picture = self.render_on_device(primitives, pose, time, is_lit=is_lit, measures=measures)
-        wanted = [
+        lens, measured = pinhole(self.info, pose), None
+        if measures and self._stereo and self.device != "cpu":
+            assert picture is not None
+            measured = self._stereo.measure_on_device(primitives, lens, self.rasterizer.depth, picture)
+        needs_exact = CameraOutput.EXACT_DEPTH in outputs or (CameraOutput.DEPTH in outputs and measured is None)
+        rgb, exact, labels, depth = self._download(
             picture if is_lit else None,
-            self.rasterizer.depth if outputs & (CameraOutput.DEPTH | CameraOutput.EXACT_DEPTH) else None,
+            self.rasterizer.depth if needs_exact else None,
             self.rasterizer.labels if CameraOutput.LABELS in outputs else None,
-        ]
-        rgb, exact, labels = self._download(*wanted)
+            measured,
+        )
         rgb, exact = rgb.reshape(-1, shape[1], 3), exact.reshape(-1, shape[1])
         if CameraOutput.DEPTH not in outputs:
             depth = np.zeros((0, 0), np.float32)
+        elif measured is not None:
+            depth = depth.reshape(shape)
         elif self._stereo:
-            depth = self._stereo.measure(primitives, pinhole(self.info, pose), exact, rgb, None)
+            depth = self._stereo.measure(primitives, lens, exact, rgb, None)
         else:
             too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
             depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))

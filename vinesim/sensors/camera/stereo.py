@@ -19,7 +19,7 @@ import warp as wp
 
 from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.raster.pinhole import NEAR_DEPTH, Pinhole
-from vinesim.kernels.sensing import stereo_depth, stereo_rows
+from vinesim.kernels.sensing import stereo_depth, stereo_input, stereo_rows
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer
@@ -100,6 +100,10 @@ class Stereo:
         self._window = max(1, round(spec.window.value))
         cells = int(np.ceil(info.height * s.scale)), int(np.ceil(info.width * s.scale))
         self._noise = wp.empty((2, *cells), dtype=float, device=device)
+        margin = self._window - 1
+        self._normal = wp.empty(
+            (2, cells[0] + margin, cells[1] + margin) if device != "cpu" else 0, dtype=float, device=device
+        )
         self._pixels = _imager_pixels(cells, s.scale, info)
         pixels = info.width * info.height
         self._depth = wp.empty(pixels, dtype=float, device=device)
@@ -124,17 +128,37 @@ class Stereo:
         if rng is not None:
             self.draw_noise(rng)
         second = self._second_pinhole(lens)
-        if self.device != "cpu":
+        if not self._second_from_first:
             self._second.draw(primitives, second)
-            self._disparity.assign((np.float32(self._parameters.focal_baseline) / depth).ravel())
-            self._grey.assign(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).ravel())
-            self._measure_on_gpu(lens, second)
-        else:
-            if not self._second_from_first:
-                self._second.draw(primitives, second)
-            self._set_picture(depth, rgb)
-            self._measure_on_cpu(lens, second)
+        self._set_picture(depth, rgb)
+        self._measure_on_cpu(lens, second)
         return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
+
+    def measure_on_device(self, primitives: PosedPrimitives, lens: Pinhole, depth: wp.array, rgb: wp.array) -> wp.array:
+        """The same on a GPU, from and to arrays [pixel] there, with the noise of the last :meth:`draw_noise`.
+
+        Nothing is waited for.
+        """
+        second = self._second_pinhole(lens)
+        self._second.draw(primitives, second)
+        wp.launch(
+            stereo_input.convert_picture,
+            len(self._depth),
+            inputs=[depth, rgb, self._parameters.focal_baseline],
+            outputs=[self._disparity, self._grey],
+            device=self.device,
+        )
+        _, rows, columns = self._noise.shape
+        wp.launch(
+            stereo_depth.measure_depth,
+            rows * columns,
+            inputs=[
+                self._parameters, lens, second, self._disparity, self._grey, self._second_depth, self._noise, 1,
+            ],
+            outputs=[self._depth],
+            device=self.device,
+        )  # fmt: skip
+        return self._depth
 
     def _set_picture(self, depth: np.ndarray, rgb: np.ndarray) -> None:
         """Disparity and grey levels of a picture for the kernels of a CPU."""
@@ -143,17 +167,22 @@ class Stereo:
         cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY, dst=self._grey.numpy().reshape(depth.shape))
 
     def draw_noise(self, rng: np.random.Generator) -> None:
-        """Draw the noise of the next measurement; it does not depend on the picture."""
-        self._noise.assign(self._correlated_noise(rng))
-
-    def _measure_on_gpu(self, lens: Pinhole, second: Pinhole) -> None:
-        _, rows, columns = self._noise.shape
-        arrays = [self._disparity, self._grey, self._second_depth, self._noise, 1]
+        """Draw the noise of the next measurement; it does not depend on the picture. Other bits on a GPU."""
+        if self.device == "cpu":
+            self._noise.numpy()[:] = self._correlated_noise(rng)
+            return
         wp.launch(
-            stereo_depth.measure_depth,
-            rows * columns,
-            inputs=[self._parameters, lens, second, *arrays],
-            outputs=[self._depth],
+            stereo_input.draw_normals,
+            self._normal.size,
+            inputs=[int(rng.integers(1 << 31))],
+            outputs=[self._normal.flatten()],
+            device=self.device,
+        )
+        wp.launch(
+            stereo_input.correlate,
+            self._noise.shape,
+            inputs=[self._normal, self._window],
+            outputs=[self._noise],
             device=self.device,
         )
 
