@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import pathlib
 from typing import Any
 
 import msgspec
@@ -83,12 +84,8 @@ class HumanModel:
 @functools.lru_cache(16)
 def load_human_model(height: float, name: str = "worker") -> HumanModel:
     """The human model of this height [m], from ``data/figures``; :class:`AppearanceError` if it cannot be read."""
-    path = find_data_file("figures", name, ".toml")
-    file = load_toml(path, HumanFile, AppearanceError)
+    file = _load_file(find_data_file("figures", name, ".toml"))
     scale = height / file.height
-    for part, specs in file.parts.items():
-        for i, spec in enumerate(specs):
-            check_spec(file.paints, spec, f"{path}: parts.{part}[{i}]")
     parts: dict[str, tuple[Shape, ...]] = {}
     for part, specs in file.parts.items():
         sides = ((part, False),) if not part.startswith("left_") else ((part, False), (f"right_{part[5:]}", True))
@@ -113,6 +110,16 @@ def load_human_model(height: float, name: str = "worker") -> HumanModel:
         parts=parts, limbs=limbs, root=np.array(roots), length=scale * np.array([f.lengths for f in every]),
         bent=np.array([f.bent for f in every]),
     )  # fmt: skip
+
+
+@functools.cache
+def _load_file(path: pathlib.Path) -> HumanFile:
+    """The checked content of a file; one for people of all heights."""
+    file = load_toml(path, HumanFile, AppearanceError)
+    for part, specs in file.parts.items():
+        for i, spec in enumerate(specs):
+            check_spec(file.paints, spec, f"{path}: parts.{part}[{i}]")
+    return file
 
 
 def _scaled(value: Any, scale: float) -> Any:

@@ -250,6 +250,16 @@ def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
     return height, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None] * np.ones((SKY_ROWS, 1))
 
 
+@functools.cache
+def _clear_sky() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What is the same for every sun: horizontal components of the directions and the blue [row, column, 3]."""
+    height, azimuth = _sky_directions()
+    flat = np.sqrt(1.0 - height**2)
+    horizon = np.exp(-5.5 * height)[..., None]
+    blue = (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
+    return flat * np.cos(azimuth), flat * np.sin(azimuth), blue
+
+
 @functools.lru_cache(maxsize=4)
 def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
     """Radiance of the sky by sqrt(sine of elevation) and azimuth: [SKY_ROWS, SKY_COLUMNS, 3] float32.
@@ -266,12 +276,9 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
 
 def _sky_rows(rows: slice, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
     """Some rows of the sky's table [row, SKY_COLUMNS, 3]; they lie within or beyond :data:`_RIDGE_ROWS`."""
-    (height, azimuth), layers = _sky_directions(), _sky_layers()
-    height, azimuth = height[rows], azimuth[rows]
-    flat = np.sqrt(1.0 - height**2)
-    x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
-    horizon = np.exp(-5.5 * height)[..., None]
-    colour = (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
+    (height, _), layers = _sky_directions(), _sky_layers()
+    x, y, colour = (part[rows] for part in _clear_sky())
+    height = height[rows]
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
     halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
     colour = colour + halo[..., None] * colour_of_sun
