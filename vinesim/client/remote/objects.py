@@ -172,14 +172,10 @@ class ObjectSync:
 
     def _is_moved_remotely(self, parent: str) -> bool:
         """Whether a remote actor moves a parent frame, itself or by what it rests on."""
-        if parent == GROUND:
-            return False
-        box = parse_object_name(parent)
-        if box is None:
-            return parent.partition("/")[0] not in self._local_actors
-        return box in self._remote_updates or (
-            box in self._resting and self._is_moved_remotely(self._resting[box].parent)
-        )
+        boxes, base = self._supports(parent)
+        if any(box in self._remote_updates for box in boxes):
+            return True
+        return base != GROUND and base.partition("/")[0] not in self._local_actors
 
     def _place_on_support(self, numbers: list[int]) -> None:
         """Put objects of one parent, as far as they have bodies, where they rest in its frame."""
@@ -249,10 +245,25 @@ class ObjectSync:
         record = self._resting.get(number)
         if record is None or record.parent == GROUND:
             return ""
-        box = parse_object_name(record.parent)
-        if box is None:
-            return record.parent.partition("/")[0]
-        return (self._supporting_actor(box) or self._resting[box].author) if box in self._resting else ""
+        boxes, base = self._supports(record.parent)
+        if base != GROUND:
+            return base.partition("/")[0]
+        resting = [self._resting[box].author for box in boxes if box in self._resting]
+        return resting[-1] if resting else ""
+
+    def _supports(self, parent: str) -> tuple[list[int], str]:
+        """The boxes that ``parent`` is or rests in, one in the other, and the frame below them that is no box.
+
+        That is :data:`GROUND` if a box does not rest by a record, or rests in itself by way of others: records of
+        several authors may say so.
+        """
+        boxes: list[int] = []
+        while (box := parse_object_name(parent)) is not None and box not in boxes:
+            boxes.append(box)
+            if box not in self._resting:
+                return boxes, GROUND
+            parent = self._resting[box].parent
+        return boxes, parent if box is None else GROUND
 
     @property
     def moving(self) -> list[int]:

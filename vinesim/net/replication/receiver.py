@@ -11,6 +11,7 @@ from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import Hello, MessageError, MessageKind, ObjectStates, RetainedRecord, TreeStates
 from vinesim.net.replication.authority import NOBODY, Claim
 from vinesim.net.replication.interest import Cell
+from vinesim.net.replication.model_check import check_record, check_tree_states
 from vinesim.net.replication.replication_state import ReplicationState, put_counted
 from vinesim.net.transport.bus import Reply
 from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
@@ -127,7 +128,7 @@ class Receiver:
             for record in messages.decode_records(payload, state.object_counts):
                 if record.author != sender:
                     raise MessageError(f"record by {record.author!r} published by {sender!r}")
-                self._receive_record(cell, record, step, is_remote=sender not in state.peers.local_actors)
+                self._receive_record(cell, record, sender, step, is_remote=sender not in state.peers.local_actors)
         elif kind == MessageKind.CLAIMS:
             for object_id, claim, touching in messages.decode_claims(payload, state.object_counts):
                 state.ownership.receive_claim(object_id, claim, touching, sender, step.time)
@@ -151,6 +152,7 @@ class Receiver:
     def _receive_trees(self, trees: TreeStates, sender: str, step: _Step) -> None:
         """Accept or drop each state by its claim."""
         state = self._state
+        check_tree_states(trees, state.model)
         is_near = state.cells.is_within_radius(state.tree_stream.middle[trees.tree])
         columns = (trees.tree, trees.ownership, trees.authority, trees.flags)
         for row, (tree, ownership, sequence, flags) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
@@ -177,9 +179,19 @@ class Receiver:
             else:
                 state.counters.dropped += 1
 
-    def _receive_record(self, cell: Cell, record: RetainedRecord, step: _Step, *, is_remote: bool = True) -> None:
-        """Merge a record; if that changed anything, the client gets it unless its own actor published it."""
+    def _receive_record(
+        self, cell: Cell, record: RetainedRecord, sender: str, step: _Step, *, is_remote: bool = True
+    ) -> None:
+        """Merge a record; if that changed anything, the client gets it unless its own actor published it.
+
+        One that cannot be true of the model is dropped, and the others of its message are not.
+        """
         state = self._state
+        try:
+            check_record(record, state.model, state.object_counts)
+        except MessageError as error:
+            state.peers.count_malformed(sender, error)
+            return
         if not state.retained.merge(cell, record):
             return
         claim = Claim(record.ownership, record.authority, record.author if record.moving else NOBODY)
@@ -201,7 +213,7 @@ class Receiver:
             return
         state.retained.mark_answered(cell)
         for record in records:
-            self._receive_record(cell, record, step)
+            self._receive_record(cell, record, "the server", step)
 
     def _publish_correction(self, object_id: int) -> None:
         """Repeat the winning claim to all subscribers of the object's cell."""

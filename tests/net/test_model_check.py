@@ -1,0 +1,103 @@
+"""Well-formed records and states that say what the model forbids: dropped, counted, and nothing else lost."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from tests.net.test_replicator import TICK, Client, run, vineyard
+from vinesim.net.codec import messages
+from vinesim.net.codec.messages import MessageError, RetainedRecord, TreeStates
+from vinesim.net.replication.model_check import check_record, check_tree_states
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import ObjectKind, object_id
+from vinesim.scene.spec import load_scene
+
+TREE = 2
+BOX = object_id(ObjectKind.BOX, 0)
+COUNTS = (8, 4, 4)
+
+
+def state_of(tree: int, **others) -> bytes:
+    """A tree at rest as a message of one tree."""
+    model = vineyard()
+    size = int(model.tree_size[tree])
+    here = model.bodies_of(tree)
+    states = TreeStates(
+        1.0, np.array([tree]), np.array([1]), np.array([1]), np.array([0]), np.array([size]),
+        model.joint_settled[here].astype(float), np.zeros((size, 3)), **others,
+    )  # fmt: skip
+    return messages.encode_trees(states)[0][0]
+
+
+def record(**values) -> RetainedRecord:
+    return msgspec.structs.replace(RetainedRecord(TREE, 1, 1, "ada"), **values)
+
+
+LIES = {
+    "a body that there is not": record(cut=(1_000_000,)),
+    "a body of another tree": record(cut=(0,)),
+    "no state": record(trees=b"abc"),
+    "another tree's state": record(trees=state_of(1)),
+    "a box that is cut": record(object=BOX, cut=(1,)),
+    "a box with a tree's state": record(object=BOX, trees=state_of(TREE)),
+    "a box that lies in itself": record(object=BOX, parent="box/0"),
+    "a parent that there is not": record(object=BOX, parent="box/99"),
+    "a parent beyond all numbers": record(object=BOX, parent="box/" + "9" * 60),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_record_that_cannot_be_true_is_refused(lie: str) -> None:
+    with pytest.raises(MessageError):
+        check_record(LIES[lie], vineyard(), COUNTS)
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        record(),
+        record(cut=(int(vineyard().tree_first[TREE]) + 3,), trees=state_of(TREE)),
+        record(object=BOX, parent="box/1"),
+        record(object=BOX, parent="ada/gripper"),
+    ],
+)
+def test_a_record_that_may_be_true_is_accepted(truth: RetainedRecord) -> None:
+    check_record(truth, vineyard(), COUNTS)
+
+
+def test_a_berry_cluster_cannot_be_cut_off_alone() -> None:
+    model = generate(load_scene("demo"))
+    tree = int(np.flatnonzero(model.tree_size > model.tree_core)[0])
+    core, first = int(model.tree_core[tree]), int(model.tree_first[tree])
+    with pytest.raises(MessageError, match="it has wood from"):
+        check_record(RetainedRecord(tree, 1, 1, "ada", cut=(first + core,)), model, COUNTS)
+    states = TreeStates(
+        1.0, np.array([tree]), *(np.array([1]) for _ in range(3)), np.array([model.tree_size[tree]]), np.zeros((0, 4)),
+        np.zeros((0, 3)), np.array([1]), np.array([core]), np.zeros((1, 3)), np.zeros((1, 3)),
+    )  # fmt: skip
+    with pytest.raises(MessageError, match="berry cluster"):
+        check_tree_states(states, model)
+
+
+def test_the_other_records_of_a_message_are_received() -> None:
+    """A peer says two lies and a truth about trees in one message: the lies never reach the client."""
+    hub = MemoryHub()
+    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    run(hub, [ada, bob], 0.5)
+    body = int(vineyard().tree_first[TREE]) + 3
+    truth = record(object=TREE, cut=(body,))
+    lies = [record(object=1, cut=(1_000_000,)), record(object=3, trees=b"abc")]
+    publisher = ada.bus.publisher("fact/0/0/ada", reliable=True)
+    received = []
+    publisher.put(messages.encode_records([lies[0], truth, lies[1]]))
+    for _ in range(100):
+        run(hub, [ada, bob], TICK)
+        received += bob.inbox.records
+    assert [(one.object, one.cut) for one, _ in received] == [(TREE, (body,))]
+    assert bob.replicator.record(TREE) == truth
+    assert bob.replicator.record(1) is None
+    assert bob.replicator.record(3) is None
+    assert bob.replicator.counters.malformed == len(lies)
