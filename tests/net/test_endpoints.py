@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from vinesim.net.transport.endpoints import Endpoint, client_links, default_listen, parse, resolve_ports
+from vinesim.errors import UsageError
+from vinesim.net.transport.endpoints import Endpoint, check_exposure, client_links, default_listen, parse, resolve_ports
 
 
 @pytest.mark.parametrize(
@@ -66,5 +67,15 @@ def test_port_0_is_one_free_number_for_both_protocols():
 
 
 def test_a_server_listens_on_both_protocols_by_default():
-    assert [str(one) for one in resolve_ports(default_listen())] == ["tcp/0.0.0.0:7447", "udp/0.0.0.0:7447"]
+    assert [str(one) for one in resolve_ports(default_listen())] == ["tcp/127.0.0.1:7447", "udp/127.0.0.1:7447"]
+    assert default_listen(insecure=True) == ("tcp/0.0.0.0:7447", "udp/0.0.0.0:7447")
     assert [one.protocol for one in resolve_ports(default_listen(secured=True), secured=True)] == ["tls", "quic"]
+
+
+def test_nobody_listens_to_a_network_unchecked_unless_told_to():
+    check_exposure(["tcp/127.0.0.1:0", "udp/[::1]:0", "tcp/localhost:7447"])
+    check_exposure(["tls/0.0.0.0:7447", "quic/0.0.0.0:7447"], secured=True)
+    check_exposure(["tcp/0.0.0.0:7447"], insecure=True)
+    for place in ("tcp/0.0.0.0:7447", "udp/192.168.1.5:0", "tcp/[::]:7447", "tcp/vines.example:7447"):
+        with pytest.raises(UsageError, match=r"--tls DIR.*--insecure"):
+            check_exposure(["tcp/127.0.0.1:7447", place])

@@ -81,7 +81,7 @@ def run_clients(line: Link) -> tuple[Rows, Rows]:
     roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}
     with tempfile.TemporaryDirectory() as folder, NetworkEmulator(dict.fromkeys(roles, line)) as net:
         server = net.start(
-            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--status", "none"],
+            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--insecure", "--status", "none"],
             stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert server.stdout is not None
@@ -105,7 +105,7 @@ def measure_notification(line: Link, touches: int = TOUCHES) -> list[float]:
     """
     with NetworkEmulator({"ada": line, "bob": line}) as net:
         server = net.start(
-            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--status", "none"],
+            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--insecure", "--status", "none"],
             stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert server.stdout is not None

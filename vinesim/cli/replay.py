@@ -17,19 +17,22 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.keys import sender_of
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
+from vinesim.net.transport.endpoints import check_exposure
 
 POLL = 0.004
 """Between two looks at what is due [s]."""
 
 
 def run(
-    *, file: pathlib.Path, connect: str | None, listen: str | None, world: str, speed: float, start: float,
-    end: float | None, out: pathlib.Path | None, pose: tuple[float, float, float] | None, scene: str | None,
-    seed: int | None,
+    *, file: pathlib.Path, connect: str | None, listen: str | None, insecure: bool, world: str, speed: float,
+    start: float, end: float | None, out: pathlib.Path | None, pose: tuple[float, float, float] | None,
+    scene: str | None, seed: int | None,
 ) -> int:  # fmt: skip
     """Play a file; 0 when its end is reached, or on Ctrl-C."""
     if sum(way is not None for way in (connect, listen, out)) != 1:
         raise UsageError("give one of --connect (play to a server), --listen (be one) and --out (look at it)")
+    if listen is not None:
+        check_exposure([listen], insecure=insecure)
     tape = read_recording(file)
     if tape.damage:
         print(tape.damage, file=sys.stderr, flush=True)

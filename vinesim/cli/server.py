@@ -12,7 +12,7 @@ from vinesim.errors import UsageError
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.retained_store import Quota
 from vinesim.net.server.server import Server
-from vinesim.net.transport.endpoints import default_listen
+from vinesim.net.transport.endpoints import check_exposure, default_listen
 
 STATUS_PERIOD = 1.0
 """Between two status lines [s]."""
@@ -20,7 +20,8 @@ STATUS_PERIOD = 1.0
 
 def run(
     *, listen: list[str] | None, connect: list[str] | None, state_dir: pathlib.Path | None, scene: str | None,
-    seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, status: str,
+    seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, insecure: bool,
+    status: str,
 ) -> int:  # fmt: skip
     """Carry messages until SIGINT or SIGTERM."""
     if status not in ("text", "json", "none"):
@@ -29,12 +30,14 @@ def run(
         raise UsageError(f"--quota {quota[0]:g} {quota[1]:g}: both must be above zero, or nothing is ever kept")
     if seed is not None and scene is None:
         raise UsageError(f"--seed {seed} without a scene: give --scene as well")
+    places = listen or default_listen(secured=tls is not None, insecure=insecure)
+    check_exposure(places, secured=tls is not None, insecure=insecure)
     plan = None if scene is None else _plan(scene, seed)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     with Server(
-        listen or default_listen(secured=tls is not None), connect=connect or (), state_folder=state_dir, scene=plan,
+        places, connect=connect or (), state_folder=state_dir, scene=plan,
         max_actors=max_clients, quota=Quota(*quota), certificates=tls,
     ) as server:  # fmt: skip
         if status != "json":

@@ -1,7 +1,7 @@
 """Emulated links of a wide network on one machine: delay, jitter, loss and cuts between network namespaces.
 
 with NetworkEmulator({"ada": Link(LinkProfile(0.05, 0.02, 0.01)), "bob": Link()}) as net: server = net.start("hub",
-["vinesim", "server", "--listen", "tcp/0.0.0.0:7447"]) client = net.start("ada", ["vinesim", "client", "--connect",
+["vinesim", "server", "--insecure"]) client = net.start("ada", ["vinesim", "client", "--connect",
 f"tcp/{net.hub('ada')}:7447"]) sent, received = net.counts("ada")
 
 Each end of the star is a namespace of its own, joined to the hub's by a pair of TUN devices, and a process between them

@@ -18,6 +18,10 @@ ImageSize = Annotated[
 ]
 Seconds = Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")]
 StatusFormat = Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")]
+Insecure = Annotated[
+    bool,
+    typer.Option(help="Listen on a network without certificates: whoever reaches it may send anything under any name."),
+]
 World = Annotated[str, typer.Option(help="Which of the server's worlds.")]
 Pose = tuple[float, float, float]
 """X Y [m] and YAW [rad]."""

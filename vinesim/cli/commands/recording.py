@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Pose, Seconds, Seed, World
+from vinesim.cli.commands.options import Insecure, Pose, Seconds, Seed, World
 
 
 def record(
@@ -47,6 +47,7 @@ def replay(
     file: Annotated[pathlib.Path, typer.Argument(help="A file that vinesim record wrote, whole or cut off.")],
     connect: Annotated[str | None, typer.Option(help="Publish it to this server.")] = None,
     listen: Annotated[str | None, typer.Option(help="Be a server, and start when the first client is there.")] = None,
+    insecure: Insecure = False,
     world: World = "vineyard",
     speed: Annotated[float, typer.Option(min=0.01, max=100.0, help="Times as fast as it was.")] = 1.0,
     start: Annotated[float, typer.Option("--from", min=0.0, help="Seconds after its beginning to start at.")] = 0.0,
@@ -67,7 +68,7 @@ def replay(
     Examples:
       vinesim replay run.mcap --out pictures
       vinesim replay run.mcap --connect tcp/127.0.0.1:7447 --from 20 --to 40
-      vinesim replay run.mcap --listen tcp/0.0.0.0:7447 --speed 0.5
+      vinesim replay run.mcap --listen tcp/127.0.0.1:7447 --speed 0.5
     """
     options = dict(locals())
     from vinesim.cli.replay import run

@@ -7,15 +7,16 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import StatusFormat
+from vinesim.cli.commands.options import Insecure, StatusFormat
 
 
 def server(
     listen: Annotated[
         list[str] | None,
         typer.Option(
-            help="Where to listen, several times if need be; port 0 takes a free one. tcp/0.0.0.0:7447 for everything "
-            "and udp/0.0.0.0:7447 for poses, unless given; with --tls tls/ and quic/."
+            help="Where to listen, several times if need be; port 0 takes a free one. tcp/127.0.0.1:7447 for "
+            "everything and udp/127.0.0.1:7447 for poses, this machine alone, unless given; with --tls tls/ and quic/ "
+            "on all interfaces."
         ),
     ] = None,
     connect: Annotated[
@@ -40,6 +41,7 @@ def server(
     tls: Annotated[
         pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): nobody else gets in.")
     ] = None,
+    insecure: Insecure = False,
     status: StatusFormat = "none",
 ) -> None:
     """Route messages between clients, and keep the retained state. The server simulates nothing.
@@ -52,6 +54,7 @@ def server(
       vinesim server --listen tcp/127.0.0.1:0 --status text
       vinesim server --scene vsp --max-clients 12 --state-dir harvest/
       vinesim server --tls certs/
+      vinesim server --insecure
       vinesim server --connect tcp/192.168.1.5:7447
     """
     options = dict(locals())

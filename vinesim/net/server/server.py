@@ -30,7 +30,7 @@ from vinesim.net.transport.zenoh_session import close_session, config, open_sess
 
 log = logging.getLogger(__name__)
 
-LISTEN = "tcp/0.0.0.0:7447"
+LISTEN = "tcp/127.0.0.1:7447"
 """Default endpoint: all interfaces, Zenoh's port."""
 
 LEASE = 1000

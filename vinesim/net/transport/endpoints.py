@@ -76,9 +76,22 @@ def parse(text: str, *, secured: bool = False) -> Endpoint:
     return Endpoint(protocol, host, int(port))
 
 
-def default_listen(*, secured: bool = False) -> tuple[str, ...]:
-    """Endpoints of a server by default: all interfaces, stream and datagrams."""
-    return tuple(f"{protocol}/0.0.0.0:{PORT}" for protocol in (("tls", "quic") if secured else ("tcp", "udp")))
+def default_listen(*, secured: bool = False, insecure: bool = False) -> tuple[str, ...]:
+    """Endpoints of a server by default, a stream and datagrams: this machine alone, unless ``secured`` by certificates
+    or told to be ``insecure``; then all interfaces."""
+    host = "0.0.0.0" if secured or insecure else "127.0.0.1"
+    return tuple(f"{protocol}/{host}:{PORT}" for protocol in (("tls", "quic") if secured else ("tcp", "udp")))
+
+
+def check_exposure(listen: Sequence[str], *, secured: bool = False, insecure: bool = False) -> None:
+    """Raise :class:`vinesim.errors.UsageError` for a place to listen that others on the network reach unchecked."""
+    for text in listen:
+        endpoint = parse(text, secured=secured)
+        if not (endpoint.secured or endpoint.loopback or insecure):
+            raise UsageError(
+                f"--listen {endpoint}: whoever reaches it may send anything under any name; give certificates "
+                "(--tls DIR, see vinesim certs new), or --insecure if everyone on that network is trusted"
+            )
 
 
 class Links(NamedTuple):
