@@ -25,9 +25,9 @@ from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
+from vinesim.net.replication.hand_forces import LinkCentre
 from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.replication.peers import ACTOR_PERIOD
-from vinesim.net.replication.hand_forces import LinkCentre
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
