@@ -94,6 +94,7 @@ class Receiver:
         early = [message for hello in inbox.joined for message in self.early.take(hello.name)]
         for key, payload in early + state.bus.poll():
             self._dispatch(key, payload, step)
+        state.counters.lost, state.counters.network_failures = state.bus.dropped, state.bus.failures
         state.ownership.expire(time)
         inbox.released = state.ownership.released()
         for object_id in inbox.released:
