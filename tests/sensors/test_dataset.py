@@ -278,7 +278,7 @@ def test_a_failing_disk_leaves_the_image_before_whole_and_the_same_command_goes_
     for name in ("annotations.json", "val.txt", "data.yaml"):
         with pytest.MonkeyPatch.context() as patch:
             _full_disk(patch, name, error)
-            with pytest.raises(WriteError, match="annotations.json and the lists"):
+            with pytest.raises(WriteError, match=r"annotations\.json and the lists"):
                 dataset.finish(out, IMAGES)
         assert _files(out) == before
     assert list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES))) == [1]
@@ -377,7 +377,7 @@ def test_yolo_finds_every_image_and_its_labels_from_any_folder(
         for image in found[split]:
             assert image.is_file()
             assert (whole / "labels" / f"{image.stem}.txt").is_file()
-    assert sorted(sum(found.values(), [])) == sorted((whole / "images").glob("*.png"))
+    assert sorted(image for images in found.values() for image in images) == sorted((whole / "images").glob("*.png"))
     assert [len(found[split]) for split in dataset.SPLITS] == [5, 1, 0]
 
 

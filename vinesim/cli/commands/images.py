@@ -96,7 +96,7 @@ def dataset(
 
     Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, actors and the viewpoint are random.
     Killed or stopped, the same command continues, and renders again what was deleted or truncated; more images may be
-    asked for later, fewer are refused. All images of a vineyard (five) are in one split: train, val or test (8 : 1 : 1).
+    asked for later, fewer are refused. The five images of a vineyard are in one split: train, val or test (8 : 1 : 1).
 
     \b
     Examples:
