@@ -110,6 +110,15 @@ class Physics:
             stage()
         self.tick += 1
 
+    @property
+    def faults(self) -> dict[str, int]:
+        """How often something was stopped or left out so far, by what it was."""
+        return {
+            "trees_stopped": int(self.fault_guard.count.sum()),
+            "robots_stopped": self.rigid.faults,
+            "contacts_dropped": self.contact_solver.dropped_contacts,
+        }
+
     # ------------------------------------------------------------------ stages that pass values between parts
 
     def _set_wind(self) -> None:
