@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, MAX_STORED_BYTES, KEEP_LAST_64, NameTaken, SampleStore, matches
+from vinesim.net.transport.bus import (
+    KEEP_ALL,
+    KEEP_LAST_1,
+    KEEP_LAST_64,
+    MAX_STORED_BYTES,
+    NameTaken,
+    SampleStore,
+    matches,
+)
 from vinesim.net.transport.memory_bus import MemoryHub
 
 

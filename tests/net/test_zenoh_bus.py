@@ -473,7 +473,9 @@ def test_poses_return_to_datagrams_when_they_pass_again(monkeypatch):
             bob.subscribe("a/ada", KEEP_ALL)
             wait(lambda: pose.matching, "bob's subscription")
             before = bob.bytes_in
-            wait(lambda: (pose.put(bytes(1000)) and time.sleep(0.001)) or bob.bytes_in - before >= 50_000, "fifty poses")
+            wait(
+                lambda: (pose.put(bytes(1000)) and time.sleep(0.001)) or bob.bytes_in - before >= 50_000, "fifty poses"
+            )
             assert relay.up - up < 10_000, "poses took the stream"
             assert ada.status_message == ""
         datagrams.close()
