@@ -31,7 +31,7 @@ def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
         _log.warning(
             "%d of %d joints ask for less damping than beta = (2 phi - 1) dt = %.2g ms, the least at phi %g and dt %g s,"
             " and have that; lower dt or phi (0.5 adds none), or raise their beta",
-            raised.sum(), len(raised), 1e3 * floor, phi, dt,
+            raised.sum(), len(model.body_mass), 1e3 * floor, phi, dt,
         )  # fmt: skip
 
 
