@@ -116,7 +116,10 @@ def test_a_world_without_plants_steps() -> None:
         (lambda rigid: rigid.apply_wrench("anna", "chassis", np.full(3, NAN)), "force is .*; give finite numbers"),
         (lambda rigid: rigid.place_robot("anna", np.full(7, NAN), HOME), "pose is .*; give finite numbers"),
         (lambda rigid: rigid.set_gains("anna", *[np.full(len(HOME), NAN)] * 3), "joint stiffness is .*; give finite"),
-        (lambda rigid: rigid.set_remote_wrenches("anna", {"chassis": np.full(6, NAN)}), "wrench on 'chassis' is .*; give"),
+        (
+            lambda rigid: rigid.set_remote_wrenches("anna", {"chassis": np.full(6, NAN)}),
+            "wrench on 'chassis' is .*; give",
+        ),
     ],
 )
 def test_commands_that_are_not_finite_are_refused(call: Callable[[RigidWorld], object], message: str) -> None:
