@@ -66,7 +66,7 @@ def test_a_negative_radius_is_refused() -> None:
 def test_dt_is_fixed_from_the_start(part: str) -> None:
     physics = Physics(one_cane())
     owner = getattr(physics, part) if part else physics
-    with pytest.raises(AttributeError, match="property 'dt' of .* has no setter"):
+    with pytest.raises(AttributeError, match=r"property 'dt' of .* has no setter"):
         owner.dt = 0.001
     assert physics.dt == physics.plants.dt == physics.rigid.dt == 0.01
 

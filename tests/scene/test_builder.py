@@ -129,7 +129,7 @@ def test_invalid_trees_are_refused_with_the_reason():
     ):
         with pytest.raises(ValueError, match=f"body 0: {finding}"):
             builder.TreeBuilder(POSE).add_body(-1, **fields)
-    with pytest.raises(ValueError, match="body 0 has no field 'lenght'; it has: .*length"):
+    with pytest.raises(ValueError, match=r"body 0 has no field 'lenght'; it has: .*length"):
         builder.TreeBuilder(POSE).add_body(-1, lenght=0.1)
     without_springs = builder.TreeBuilder(POSE)
     without_springs.add_body(-1, mass=1.0)

@@ -47,7 +47,7 @@ class SceneRandomizer:
 
     share: float = 0.4
     """Share of the images with actors or wind."""
-    parameters: PhysicsParameters = PhysicsParameters()
+    parameters: PhysicsParameters = dataclasses.field(default_factory=PhysicsParameters)
     """Numbers of the physics, those of the models' scene."""
 
     def settings(self) -> dict[str, Any]:

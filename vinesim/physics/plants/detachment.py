@@ -199,8 +199,10 @@ class DetachmentMonitor:
         self._record(body, bunch, cause, actor, carried)
 
     def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
-        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between steps. :class:`ValueError`
-        if it cannot be."""
+        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between steps.
+
+        :class:`ValueError` if it cannot be cut.
+        """
         plants, body = self.plants, checked_index("body", body, len(self._wood))
         if plants.model.body_organ[body] == int(Organ.BUNCH):
             raise ValueError(f"body {body} is no piece of wood that can be cut")

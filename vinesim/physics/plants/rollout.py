@@ -110,8 +110,8 @@ class Rollout:
     ) -> None:
         if ticks < 1 or checkpoint < 1 or not 0.0 < dt < math.inf or not 0.5 <= phi <= 1.0:
             raise ValueError(
-                f"{ticks} ticks of {dt} s, a checkpoint every {checkpoint}, phi {phi}: need 1 or more, a finite dt above 0, "
-                "phi from 0.5 to 1"
+                f"{ticks} ticks of {dt} s, a checkpoint every {checkpoint}, phi {phi}: need 1 or more, a finite dt "
+                "above 0, phi from 0.5 to 1"
             )
         self.model, self.ticks, self.dt, self.fault_rate, self.device = (
             model,

@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 def checked_trees(trees: np.ndarray | int, count: int) -> np.ndarray:
-    """Numbers of trees [k] as an array; :class:`ValueError` naming the first that is not from 0 to ``count`` - 1."""
+    """Numbers of trees [k] as an array; :class:`ValueError` naming the first not from 0 to ``count`` - 1."""
     trees = np.atleast_1d(trees)
     if len(trees) and (trees.dtype.kind not in "iu" or trees.min() < 0 or trees.max() >= count):
         for tree in trees.tolist():
