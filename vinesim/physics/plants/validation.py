@@ -29,7 +29,7 @@ def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
     raised = ((stiffness > 0.0) & (model.joint_damping < (1.0 - 1e-3) * floor * stiffness)).any(1)
     if raised.any():
         _log.warning(
-            "%d of %d joints ask for less damping than beta = (2 phi - 1) dt = %.2g ms, the least at phi %g and dt %g s,"
+            "%d of %d joints ask for less damping than beta = (2 phi - 1) dt = %.2g ms, least of phi %g and dt %g s,"
             " and have that; lower dt or phi (0.5 adds none), or raise their beta",
             raised.sum(), len(model.body_mass), 1e3 * floor, phi, dt,
         )  # fmt: skip
