@@ -13,6 +13,15 @@ class UsageError(ValueError):
     """
 
 
+class WriteError(RuntimeError):
+    """Files that a command was asked for could not be written: a full disk, a read-only folder.
+
+    The message names the place, the reason and the remedy, in one line. The command line exits with code 5.
+    """
+
+    exit_code = 5
+
+
 def checked_index(what: str, index: SupportsIndex, count: int, error: type[ValueError] = ValueError) -> int:
     """``index`` as an int; ``error`` naming ``what`` unless it is a whole number from 0 to ``count`` - 1."""
     try:

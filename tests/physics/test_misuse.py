@@ -141,7 +141,7 @@ def test_a_grasp_beyond_the_limit_is_counted_and_the_step_goes_on() -> None:
     with pytest.raises(TieLimitError, match=f"body {body} is one too many: 1 are held already"):
         physics.plants.add_tie(body, np.zeros(3), 1.0, 0.0)
     move(physics, spec, 0.0, 0.03, 0.0, ticks=20, wait=30, closed=True)
-    assert physics.grasp_manager.refused_grasps == 1
+    assert physics.faults["grasps_refused"] == 1
     assert len(physics.grasp_manager.held_trees) == 0
     assert np.isfinite(physics.snapshot().body_q).all()
 

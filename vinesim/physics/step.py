@@ -112,6 +112,16 @@ class Physics:
             stage()
         self.tick += 1
 
+    @property
+    def faults(self) -> dict[str, int]:
+        """How often something was stopped or left out so far, by what it was."""
+        return {
+            "trees_stopped": int(self.fault_guard.count.sum()),
+            "robots_stopped": self.rigid.faults,
+            "contacts_dropped": self.contact_solver.dropped_contacts,
+            "grasps_refused": self.grasp_manager.refused_grasps,
+        }
+
     # ------------------------------------------------------------------ stages that pass values between parts
 
     def _set_wind(self) -> None:
