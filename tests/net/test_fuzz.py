@@ -8,6 +8,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 
 from tests.support.live_server import ServerProcess, wait
 from vinesim.bench import message_fuzz
@@ -17,30 +18,63 @@ from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
+from vinesim.net.replication.model_check import check_record
+from vinesim.net.replication.streams import object_counts
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
+from vinesim.scene.values import RobotUpdate
 
 
-def test_a_flood_of_malformed_messages_is_counted_logged_once_and_leaves_all_in_agreement(caplog):
+@pytest.mark.parametrize("kind", ["robot", "human"])
+def test_a_flood_of_malformed_messages_is_counted_logged_once_and_leaves_all_in_agreement(caplog, kind):
     """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
-    ada, bob, _, arrived = message_fuzz.run_storm(3_000, seed=11)
+    result = message_fuzz.run_storm(3_000, seed=11, kind=kind)
+    ada, bob = result.clients
     log_lines = [
         record.message for record in caplog.records if ATTACKER in record.message and "dropped" in record.message
     ]
     assert len(log_lines) == 2, "once by each of the two receivers"
     counters = ada.replicator.counters
-    assert arrived > 1_500
-    assert counters.malformed > 0.3 * arrived
-    assert counters.malformed + counters.dropped <= 2 * arrived
+    assert result.arrived > 1_500
+    assert counters.malformed > 0.3 * result.arrived
+    assert counters.retained.messages_in > 200
     for fake_client in (ada, bob):
         for tree in (1, 2):
             assert fake_client.replicator.owner(tree) == "ada"
-        for update in fake_client.robots.values():
-            assert np.isfinite(np.concatenate([update.base_q, update.base_qd, update.position, update.velocity])).all()
+        _assert_possible(fake_client)
     assert bob.heard[2] > 0.0
+
+
+def test_a_flood_from_a_stranger_changes_nothing():
+    """A program that was never admitted, under its own and other names."""
+    ada, bob = message_fuzz.run_storm(3_000, seed=12, is_stranger=True).clients
+    counters = ada.replicator.counters
+    assert counters.retained.messages_in > 200
+    assert counters.dropped > 1_000
+    for fake_client in (ada, bob):
+        assert fake_client.replicator.known == {1, 2}, "what ada touched, and nothing else"
+        assert fake_client.facts == {}
+        assert set(fake_client.robots) == {"ada", "bob"} - {fake_client.name}
+        assert fake_client.replicator.owner(1) == fake_client.replicator.owner(2) == "ada"
+
+
+def _assert_possible(fake_client: FakeClient) -> None:
+    """Nothing is believed that the model forbids."""
+    replicator, model = fake_client.replicator, fake_client.model
+    counts = object_counts(model)
+    for object_id in replicator.known:
+        messages.check_object_id(object_id, counts)
+    records = [record for record in map(replicator.record, sorted(fake_client.facts)) if record is not None]
+    assert records
+    for record in records:
+        check_record(record, model, counts)
+    for update in fake_client.robots.values():
+        assert np.isfinite(update.base_q).all()
+        if isinstance(update, RobotUpdate):
+            assert np.isfinite(np.concatenate([update.base_qd, update.position, update.velocity])).all()
 
 
 def test_a_message_from_the_far_future_does_not_block_its_sender():
