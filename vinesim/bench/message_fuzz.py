@@ -102,13 +102,8 @@ def _record(model: Model, claim: Claim, now: float, chance: random.Random) -> Re
     """A retained record of any object: parents, cuts and states, true or impossible."""
     kind = chance.choice(tuple(ObjectKind))
     number = _object_id(model, kind, chance)
-    pose = (
-        *(chance.choice((chance.uniform(-3.0, 3.0), chance.uniform(-1e5, 1e5))) for _ in range(3)),
-        0.0,
-        0.0,
-        0.0,
-        1.0,
-    )
+    x, y, z = (chance.choice((chance.uniform(-3.0, 3.0), chance.uniform(-1e5, 1e5))) for _ in range(3))
+    pose = (x, y, z, 0.0, 0.0, 0.0, 1.0)
     record = RetainedRecord(
         number, claim.ownership, claim.authority, claim.owner, pose=pose, moving=chance.random() < 0.3,
         parent=chance.choice(_PARENTS) if kind != ObjectKind.TREE or chance.random() < 0.1 else "",
