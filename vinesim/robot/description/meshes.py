@@ -13,6 +13,8 @@ from vinesim.robot.description.urdf_model import parse_origin
 
 MESH_FORMATS = (".stl", ".obj", ".msh")
 """File formats that MuJoCo reads; meshes of others, such as Collada, are replaced."""
+MAX_STL_FACES = 200_000
+"""Of an STL file that MuJoCo reads."""
 
 
 def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
@@ -49,9 +51,10 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
     def readable(shape: etree._Element) -> bool:
         mesh = shape.find("geometry/mesh")
         suffix = pathlib.Path(mesh.get("filename")).suffix.lower() if mesh is not None else ".stl"
-        if suffix not in MESH_FORMATS:
-            unread.add(suffix)
-        return suffix in MESH_FORMATS
+        readable = suffix in MESH_FORMATS and (mesh is None or suffix != ".stl" or _is_binary_stl(mesh.get("filename")))
+        if not readable:
+            unread.add(suffix if suffix not in MESH_FORMATS else f"{suffix} (text, or too large)")
+        return readable
 
     for link in root.iterfind("link"):
         for shape in [shape for shape in link.iterfind("collision") if not readable(shape)]:
@@ -67,6 +70,14 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
     if unread:
         formats = ", ".join(sorted(unread))
         notes.append(f"meshes of format {formats} cannot be read: seen as collision shapes, touched as boxes")
+
+
+def _is_binary_stl(filename: str) -> bool:
+    """Whether physics can read an STL file: binary, as its size tells, and of no more faces than are allowed."""
+    with open(filename, "rb") as file:
+        header = file.read(84)
+    faces = int.from_bytes(header[80:84], "little")
+    return 1 <= faces <= MAX_STL_FACES and pathlib.Path(filename).stat().st_size >= 84 + 50 * faces
 
 
 def _replace_by_box(shape: etree._Element, file: pathlib.Path) -> None:

@@ -33,6 +33,8 @@ def read_xml(file: pathlib.Path) -> etree._Element:
         raise description_error(
             file, f"not well-formed XML: {error.msg}", "mend that line (is it a xacro? expand it)"
         ) from error
+    if root.getroottree().docinfo.internalDTD is not None:
+        raise description_error(file, "it declares a document type (DTD)", "remove <!DOCTYPE ...>: a URDF needs none")
     if root.tag != "robot":
         raise description_error(
             file, f"its root is <{root.tag}>, not <robot>", "give a URDF (MJCF and SDF are not read)"
