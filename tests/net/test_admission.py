@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import collections
+import types
+
 import msgspec
 import pytest
 from hypothesis import given
@@ -10,6 +13,7 @@ from hypothesis import strategies as st
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.server.admission import PROVISIONAL_TIMEOUT, AdmissionControl, SceneId
+from vinesim.net.transport import zenoh_admission
 
 
 def join(admission, name, digest="D1", *, world="w", session="", scene="vsp", now=0.0):
@@ -111,3 +115,44 @@ def test_all_actors_of_a_world_share_one_scene(events):
         assert len(set(members.values())) <= 1
         assert len(members) <= 2
         assert admission.scene_of("w").digest == next(iter(members.values()), "")
+
+
+class _SlowlyRouted:
+    """A Zenoh session with a server that is announced, and to which the first queries are not routed."""
+
+    def __init__(self, lost: int) -> None:
+        self.lost, self.queries = lost, 0
+        self.matching_status = types.SimpleNamespace(matching=True)
+
+    def zid(self) -> str:
+        return "a1"
+
+    def declare_querier(self, _key: str) -> _SlowlyRouted:
+        return self
+
+    def declare_matching_listener(self, _callback: object) -> None:
+        return None
+
+    def get(self, _key: str, **_: object) -> list[types.SimpleNamespace]:
+        self.queries += 1
+        if self.queries <= self.lost:
+            return []
+        payload = types.SimpleNamespace(to_bytes=lambda: messages.encode_welcome(messages.Welcome()))
+        return [types.SimpleNamespace(ok=types.SimpleNamespace(payload=payload))]
+
+
+def test_a_hello_is_repeated_until_the_server_that_is_announced_replies(monkeypatch):
+    """However long that takes, and without keeping the thread from its other tasks."""
+    monkeypatch.setattr(zenoh_admission, "RETRY_PERIOD", 0.0)
+    monkeypatch.setattr(zenoh_admission, "CONNECT_TIMEOUT", 0.0)
+    tasks = collections.deque()
+    session = _SlowlyRouted(lost=50)
+    admission = zenoh_admission.ServerAdmission(
+        session, "vs/1/w/", name="ada", world="w", endpoint="tcp/h:1", is_secured=False, submit=tasks.append
+    )
+    admission.join(b"hello")
+    while tasks:
+        assert len(tasks) == 1
+        tasks.popleft()()
+    assert session.queries == 51
+    assert admission.rejection == ""

@@ -4,12 +4,46 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from vinesim.net.replication.hand_forces import MAX_AGE, WrenchSync
+from vinesim import frames
+from vinesim.net.codec.messages import Hello, MessageError
+from vinesim.net.codec.wrenches import MAX_WRENCH, WrenchMessage, encode_wrenches
+from vinesim.net.counters import Counters
+from vinesim.net.replication.hand_forces import (
+    MAX_AGE,
+    MAX_PERSON_FORCE,
+    MAX_PERSON_MOMENT,
+    MAX_PUSHING_PEOPLE,
+    REACH,
+    WrenchSync,
+)
 from vinesim.net.transport.memory_bus import MemoryBus, MemoryHub
+from vinesim.scene.values import POINT_NAMES, HumanPose, HumanUpdate
 
+_wrenches = arrays(float, 6, elements=st.floats(-MAX_WRENCH, MAX_WRENCH))
 PUSH = np.array([10.0, 0.0, -5.0, 0.1, 0.2, 0.3])
 TICK = 0.01
+LINKS = {"arm": np.array([0.0, 0.0, 1.0]), "base": np.array([0.2, 0.0, 0.4])}
+EVA = Hello("eva", kind="human")
+
+
+def person(name: str = "eva", hands: tuple[float, float] = (0.3, 0.4)) -> HumanUpdate:
+    """A person whose hands are at these x [m], 1 m above the ground."""
+    points = np.tile(frames.pose(np.array([0.8, 0.0, 1.0])), (len(POINT_NAMES), 1))
+    points[[POINT_NAMES.index("left"), POINT_NAMES.index("right")], 0] = hands
+    return HumanUpdate(name, 0.0, HumanPose(*points), np.zeros((len(POINT_NAMES), 6)))
+
+
+def robot_sync() -> WrenchSync:
+    return WrenchSync(MemoryHub().bus("anna"), "anna", Counters())
+
+
+def receive(sync: WrenchSync, wrenches: dict[str, np.ndarray], sender: str = "eva", time: float = 1.0) -> None:
+    payload = encode_wrenches(WrenchMessage(time, wrenches))
+    sync.receive(payload, Hello(sender, kind="human"), person(sender), 0.0, LINKS.get)
 
 
 class Pair:
@@ -18,14 +52,16 @@ class Pair:
     def __init__(self, delay: float = 0.02) -> None:
         self.hub = MemoryHub(delay=delay)
         self.person_bus, self.robot_bus = self.hub.bus("eva"), self.hub.bus("anna")
-        self.person, self.robot = WrenchSync(self.person_bus, "eva"), WrenchSync(self.robot_bus, "anna")
+        self.person, self.robot = (
+            WrenchSync(bus, name, Counters()) for bus, name in ((self.person_bus, "eva"), (self.robot_bus, "anna"))
+        )
         self.left: list[bytes] = []
 
     def tick(self, wrenches: dict | None = None) -> dict[str, np.ndarray]:
         now = self.hub.time
         for key, payload in self.robot_bus.poll():
             assert key == "force/anna/eva"
-            self.robot.receive(payload, "eva", now)
+            self.robot.receive(payload, EVA, person(), now, LINKS.get)
         self.left += self.person.publish({"anna": wrenches} if wrenches else {}, now, now)
         self.hub.advance(TICK)
         return self.robot.net_wrenches(now)
@@ -75,7 +111,7 @@ def test_a_wrench_expires_when_its_sender_disconnects():
     for _ in range(30):
         now = pair.hub.time
         for _, payload in pair.robot_bus.poll():
-            pair.robot.receive(payload, "eva", now)
+            pair.robot.receive(payload, EVA, person(), now, LINKS.get)
         pair.hub.advance(TICK)
         stale += bool(pair.robot.net_wrenches(now))
     assert stale * TICK <= MAX_AGE + 0.04
@@ -83,14 +119,71 @@ def test_a_wrench_expires_when_its_sender_disconnects():
 
 def test_wrenches_of_two_humans_add_up_and_repeated_messages_are_ignored():
     pair = Pair()
-    other = WrenchSync(pair.hub.bus("ida"), "ida")
+    other = WrenchSync(pair.hub.bus("ida"), "ida", Counters())
     first = other.publish({"anna": {"arm": PUSH, "base": PUSH}}, 0.0, 5.0)
     assert first, "the robot subscribes"
-    pair.robot.receive(first[0], "ida", 0.0)
-    pair.robot.receive(first[0], "eva", 0.0)
-    assert not pair.robot.receive(first[0], "eva", 0.0)
+    for sender in ("ida", "eva", "eva"):
+        pair.robot.receive(first[0], Hello(sender, kind="human"), person(sender), 0.0, LINKS.get)
     received = pair.robot.net_wrenches(0.0)
     np.testing.assert_allclose(received["arm"], 2.0 * PUSH, rtol=1e-6)
     assert set(received) == {"arm", "base"}
     pair.robot.remove_peer("ida")
     np.testing.assert_allclose(pair.robot.net_wrenches(0.0)["base"], PUSH, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["robot", "spectator"])
+def test_only_people_push(kind):
+    robot = robot_sync()
+    payload = encode_wrenches(WrenchMessage(1.0, {"arm": PUSH}))
+    with pytest.raises(MessageError, match=f"a {kind}: only people"):
+        robot.receive(payload, Hello("eva", kind=kind), person(), 0.0, LINKS.get)
+    assert robot.net_wrenches(0.0) == {}
+
+
+@pytest.mark.parametrize(
+    ("pose", "refused"),
+    [(None, 2), (person(hands=(REACH + 0.02, REACH + 0.3)), 1), (person(hands=(5.0, REACH - 0.1)), 0)],
+    ids=["no pose", "too far", "one hand near"],
+)
+def test_a_link_that_no_hand_reaches_is_not_pushed(pose, refused):
+    counters = Counters()
+    robot = WrenchSync(MemoryHub().bus("anna"), "anna", counters)
+    payload = encode_wrenches(WrenchMessage(1.0, {"arm": PUSH, "base": PUSH, "no such link": PUSH}))
+    robot.receive(payload, EVA, pose, 0.0, LINKS.get)
+    assert counters.wrenches_refused == refused + 1
+    assert len(robot.net_wrenches(0.0)) == 2 - refused
+
+
+@given(st.lists(st.dictionaries(st.sampled_from(sorted(LINKS)), _wrenches, min_size=1), min_size=1, max_size=8))
+@settings(max_examples=100, deadline=None)
+def test_no_person_and_not_all_together_push_harder_than_hands_can(pushes):
+    robot = robot_sync()
+    for number, wrenches in enumerate(pushes):
+        alone = robot_sync()
+        for sync in (alone, robot):
+            receive(sync, wrenches, f"person_{number}")
+        _assert_limited(alone.net_wrenches(0.0), 1)
+    _assert_limited(robot.net_wrenches(0.0), MAX_PUSHING_PEOPLE)
+
+
+def _assert_limited(wrenches: dict[str, np.ndarray], people: int) -> None:
+    total = sum(np.linalg.norm(wrench.reshape(2, 3), axis=1) for wrench in wrenches.values())
+    assert (total <= people * (1.0 + 1e-9) * np.array([MAX_PERSON_FORCE, MAX_PERSON_MOMENT])).all()
+
+
+def test_a_wrench_that_is_too_strong_keeps_its_line_of_action_and_is_counted():
+    counters = Counters()
+    robot = WrenchSync(MemoryHub().bus("anna"), "anna", counters)
+    receive(robot, {"arm": 100.0 * PUSH})
+    got = robot.net_wrenches(0.0)["arm"]
+    np.testing.assert_allclose(got / np.linalg.norm(got), PUSH / np.linalg.norm(PUSH), rtol=1e-6)
+    assert np.linalg.norm(got[:3]) == pytest.approx(MAX_PERSON_FORCE)
+    assert counters.wrenches_limited == 1
+
+
+def test_wrenches_that_leave_are_limited_too():
+    """A contact that physics resolves with a shock ends neither the tick nor is it sent."""
+    pair = Pair()
+    for _ in range(10):
+        received = pair.tick({"arm": 1e6 * PUSH})
+    assert np.linalg.norm(received["arm"][:3]) == pytest.approx(MAX_PERSON_FORCE)

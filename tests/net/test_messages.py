@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -229,6 +230,37 @@ def test_a_hello_is_decoded_and_invalid_ones_are_refused():
         messages.decode_hello(messages.encode_hello(Hello("a", protocol=2)))
     with pytest.raises(MessageError, match="too long"):
         messages.encode_hello(Hello("a", urdf="x" * messages.MAX_MESSAGE))
+
+
+_NAN, _INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        *({"index": index} for index in (-1, ids.LABEL_STRIDE, 1 << 40)),
+        *({"joints": joints} for joints in (-2, messages.MAX_JOINTS + 1, 1 << 40)),
+        *({"seed": seed} for seed in (-2, 1 << 63)),
+        *({"height": height} for height in (_NAN, _INF, -_INF, 0.0, 0.9, 2.6, 1e9)),
+        {"kind": "ghost"},
+    ],
+    ids=str,
+)
+def test_a_number_of_a_hello_that_is_out_of_its_range_is_refused(change):
+    (field,) = change
+    hello = Hello("ada", **change)
+    with pytest.raises(MessageError, match=f"'ada' with {field}"):
+        messages.encode_hello(hello)
+    payload = messages.MAGIC + bytes((messages.PROTOCOL, messages.MessageKind.HELLO)) + msgspec.msgpack.encode(hello)
+    with pytest.raises(MessageError, match=f"'ada' with {field}"):
+        messages.decode_hello(payload)
+
+
+def test_every_index_of_a_hello_fits_a_label_of_any_organ():
+    hello = messages.decode_hello(messages.encode_hello(Hello("ada", index=ids.LABEL_STRIDE - 1)))
+    for organ in ids.Organ:
+        value = np.array(ids.label(organ, hello.index), np.int32)
+        assert ids.unlabel(int(value)) == (organ, hello.index)
 
 
 def test_claims_are_decoded_and_invalid_ones_are_refused():

@@ -25,6 +25,7 @@ from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
+from vinesim.net.replication.hand_forces import LinkCentre
 from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.replication.peers import ACTOR_PERIOD
 from vinesim.net.replication.receiver import Inbox
@@ -97,8 +98,8 @@ class Pair:
         """What the second client was told in its last tick."""
         receive = self.second.replicator.receive
 
-        def receive_and_keep(now: float) -> Inbox:
-            self.inbox = receive(now)
+        def receive_and_keep(now: float, link_centre: LinkCentre | None = None) -> Inbox:
+            self.inbox = receive(now, link_centre)
             return self.inbox
 
         self.second.replicator.receive = receive_and_keep

@@ -12,6 +12,7 @@ network.
 
 from __future__ import annotations
 
+import functools
 import logging
 import time
 import zlib
@@ -261,7 +262,10 @@ class Client:
 
     def _receive_all(self, now: float) -> Inbox:
         """Merge the inboxes of all local actors; of each remote actor the update of its nearest one counts."""
-        inboxes = {name: replicator.receive(now) for name, replicator in self.replicators.items()}
+        inboxes = {
+            name: replicator.receive(now, functools.partial(self._link_centre, name) if name in self.robots else None)
+            for name, replicator in self.replicators.items()
+        }
         for name in self.robots:
             self._apply_remote_wrenches(name, inboxes[name].wrenches)
         inbox = inboxes[self.name]
@@ -292,6 +296,13 @@ class Client:
         """Whether an actor of another client owns an object or tree."""
         owners = {replicator.owner(number) for replicator in self.replicators.values()} - {None}
         return bool(owners) and not owners & self.replicators.keys()
+
+    def _link_centre(self, name: str, link: str) -> np.ndarray | None:
+        """Centre of mass [3] m of a link of a local robot; None if it has no such link."""
+        try:
+            return self.physics.rigid.link_centre(name, link)
+        except ValueError:
+            return None
 
     def _apply_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
         """Apply the wrenches [6] N, N m of remote humans to the links of a local robot."""

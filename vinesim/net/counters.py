@@ -47,6 +47,10 @@ class Counters:
     dropped: int = 0
     """Valid messages and states that were not used: outdated, of an unknown peer, too far away, or of a lesser claim.
     """
+    wrenches_refused: int = 0
+    """Wrenches of peers on links that their hands do not reach, or that there are not."""
+    wrenches_limited: int = 0
+    """Messages and steps whose wrenches were reduced to what hands can do."""
 
     def to_report(self) -> dict[str, Any]:
         """All counters under the keys of ``report.json``, where retained records are called ``fact``."""

@@ -55,16 +55,14 @@ class Light:
 
 @wp.func
 def fast_atan2(y: float, x: float) -> float:
-    """atan2 to 1e-4 rad."""
+    """atan2 to 1e-4 rad, without a branch."""
     ax = wp.abs(x)
     ay = wp.abs(y)
     a = wp.min(ax, ay) / wp.max(wp.max(ax, ay), 1.0e-9)
     q = a * a
     r = ((-0.0464964749 * q + 0.15931422) * q - 0.327622764) * q * a + a
-    if ay > ax:
-        r = 1.57079637 - r
-    if x < 0.0:
-        r = 3.14159274 - r
+    r = wp.where(ay > ax, 1.57079637 - r, r)
+    r = wp.where(x < 0.0, 3.14159274 - r, r)
     return wp.where(y < 0.0, -r, r)
 
 

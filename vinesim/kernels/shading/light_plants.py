@@ -80,46 +80,6 @@ def sampled(table: wp.array2d(dtype=wp.float32), t: Texels, channel: int) -> flo
     )
 
 
-@wp.kernel
-def light_blades(
-    # model
-    tables: FloatTables,
-    materials: Materials,
-    # in
-    light: Light,
-    maps: ShadowMaps,
-    lens: Pinhole,
-    points: Points,
-    first_list: int,
-    # out
-    radiance_out: wp.array(dtype=wp.vec3),
-):
-    """One thread lights the points of one list that lie on leaves or grass.
-
-    first_list: of the first thread; radiance: [pixel] linear RGB.
-    """
-    number = first_list + wp.tid()
-    start = (number * CLASS_COUNT + BLADES) * points.capacity
-    end = start + points.count[number, BLADES]
-    back = wp.transpose(lens.rotation)
-    red = FloatBatch()
-    green = FloatBatch()
-    blue = FloatBatch()
-    for first in range(start, end, BATCH):
-        count = wp.min(end - first, BATCH)
-        whole = (count + 7) // 8 * 8
-        m = wp.int32(0)
-        while m < whole:
-            slot = first + wp.min(m, count - 1)
-            colour = blade_light(tables, materials, light, maps, lens, back, points, slot)
-            red[m] = colour[0]
-            green[m] = colour[1]
-            blue[m] = colour[2]
-            m += 1
-        for k in range(count):
-            write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
-
-
 @wp.func
 def autumn_colour(tables: FloatTables, albedo: wp.vec3, i: int, u: float, v: float, share: float) -> wp.vec3:
     """Colour of leaf ``i`` at (u, v) as it turns yellow from the edge, then brown; ``share`` 0 leaves it as it is."""
@@ -235,59 +195,19 @@ def blade_light(
     return haze(light, colour, z * scale)
 
 
-@wp.kernel
-def light_ground(
-    # model
-    tables: FloatTables,
-    materials: Materials,
-    ground_sky: wp.array(dtype=wp.float32),
-    # in
-    light: Light,
-    maps: ShadowMaps,
-    lens: Pinhole,
-    points: Points,
-    first_list: int,
-    # out
-    radiance_out: wp.array(dtype=wp.vec3),
-):
-    """One thread lights the points of one list that lie on the ground.
-
-    ground_sky: the table of the materials, flat; first_list: of the first thread; radiance: [pixel] linear RGB.
-    """
-    number = first_list + wp.tid()
-    start = (number * CLASS_COUNT + GROUND) * points.capacity
-    end = start + points.count[number, GROUND]
-    back = wp.transpose(lens.rotation)
-    red = FloatBatch()
-    green = FloatBatch()
-    blue = FloatBatch()
-    for first in range(start, end, BATCH):
-        count = wp.min(end - first, BATCH)
-        whole = (count + 7) // 8 * 8
-        m = wp.int32(0)
-        while m < whole:
-            slot = first + wp.min(m, count - 1)
-            ray = point_ray(lens, back, points.u[slot], points.v[slot])
-            colour = ground_light(tables, materials, ground_sky, light, maps, lens, ray)
-            red[m] = colour[0]
-            green[m] = colour[1]
-            blue[m] = colour[2]
-            m += 1
-        for k in range(count):
-            write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
-
-
 @wp.func
 def ground_light(
     tables: FloatTables,
     materials: Materials,
-    ground_sky: wp.array(dtype=wp.float32),
     light: Light,
     maps: ShadowMaps,
     lens: Pinhole,
-    ray: wp.vec3,
+    back: wp.mat33,
+    points: Points,
+    slot: int,
 ) -> wp.vec3:
-    """Light of the ground where ``ray`` meets it; see ``ground_surface`` and ``shade_surface``."""
+    """Light of one point of the ground; see ``ground_surface`` and ``shade_surface``."""
+    ray = point_ray(lens, back, points.u[slot], points.v[slot])
     z = -lens.eye[2] / ray[2]
     scale = wp.length(ray)
     p = lens.eye + ray * z
@@ -316,8 +236,8 @@ def ground_light(
     fx = x - float(i)
     fy = y - float(j)
     at = j * columns + i
-    low = ground_sky[at] * (1.0 - fx) + ground_sky[at + 1] * fx
-    above = ground_sky[at + columns] * (1.0 - fx) + ground_sky[at + columns + 1] * fx
+    low = tables.ground_sky[at] * (1.0 - fx) + tables.ground_sky[at + 1] * fx
+    above = tables.ground_sky[at + columns] * (1.0 - fx) + tables.ground_sky[at + columns + 1] * fx
     sky = wp.where(within, low * (1.0 - fy) + above * fy, 0.75)
     edge = wp.min(wp.min(x, wide - x), wp.min(y, high - y)) * materials.ground_cell
     inside = wp.where(within, smoothstep(0.0, 3.0, edge), 0.0)
@@ -340,46 +260,6 @@ def ground_light(
     direct = light.sun_colour * (wp.max(ndl, 0.0) * lit * (0.35 + 0.65 * occlusion))
     colour = wp.cw_mul(albedo, direct + ambient_light(light, n, sky) * occlusion)
     return haze(light, colour, z * scale)
-
-
-@wp.kernel
-def light_berries(
-    # model
-    tables: FloatTables,
-    materials: Materials,
-    # in
-    light: Light,
-    maps: ShadowMaps,
-    lens: Pinhole,
-    points: Points,
-    first_list: int,
-    # out
-    radiance_out: wp.array(dtype=wp.vec3),
-):
-    """One thread lights the points of one list that lie on berries.
-
-    first_list: of the first thread; radiance: [pixel] linear RGB.
-    """
-    number = first_list + wp.tid()
-    start = (number * CLASS_COUNT + BERRIES) * points.capacity
-    end = start + points.count[number, BERRIES]
-    back = wp.transpose(lens.rotation)
-    red = FloatBatch()
-    green = FloatBatch()
-    blue = FloatBatch()
-    for first in range(start, end, BATCH):
-        count = wp.min(end - first, BATCH)
-        whole = (count + 7) // 8 * 8
-        m = wp.int32(0)
-        while m < whole:
-            slot = first + wp.min(m, count - 1)
-            colour = berry_light(tables, materials, light, maps, lens, back, points, slot)
-            red[m] = colour[0]
-            green[m] = colour[1]
-            blue[m] = colour[2]
-            m += 1
-        for k in range(count):
-            write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
 
 
 @wp.func
@@ -461,3 +341,53 @@ def berry_light(
     mirrored = mix(light.ground_colour * 0.8, mirrored, smoothstep(-0.25, 0.25, r[2]))
     colour += mirrored * (fresnel * reflectivity * occlusion)
     return haze(light, colour, z * scale)
+
+
+def _kernel(name: str, kind: int, light_point: wp.Function) -> wp.Kernel:
+    """A kernel that lights the points of one class with ``light_point``."""
+    kind = wp.constant(kind)
+
+    def light_list(
+        # model
+        tables: FloatTables,
+        materials: Materials,
+        # in
+        light: Light,
+        maps: ShadowMaps,
+        lens: Pinhole,
+        points: Points,
+        first_list: int,
+        # out
+        radiance_out: wp.array(dtype=wp.vec3),
+    ):
+        """One thread lights the points of one list.
+
+        first_list: of the first thread; radiance: [pixel] linear RGB.
+        """
+        number = first_list + wp.tid()
+        start = (number * CLASS_COUNT + kind) * points.capacity
+        end = start + points.count[number, kind]
+        back = wp.transpose(lens.rotation)
+        red = FloatBatch()
+        green = FloatBatch()
+        blue = FloatBatch()
+        for first in range(start, end, BATCH):
+            count = wp.min(end - first, BATCH)
+            whole = (count + 7) // 8 * 8
+            m = wp.int32(0)
+            while m < whole:
+                slot = first + wp.min(m, count - 1)
+                colour = light_point(tables, materials, light, maps, lens, back, points, slot)
+                red[m] = colour[0]
+                green[m] = colour[1]
+                blue[m] = colour[2]
+                m += 1
+            for k in range(count):
+                write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
+
+    return wp.Kernel(light_list, key=name, module=wp.get_module(__name__))
+
+
+light_ground = _kernel("light_ground", GROUND, ground_light)
+light_blades = _kernel("light_blades", BLADES, blade_light)
+light_berries = _kernel("light_berries", BERRIES, berry_light)

@@ -9,7 +9,7 @@ import warp as wp
 
 from vinesim.kernels.raster.pinhole import BATCH, FloatBatch, Pinhole
 from vinesim.kernels.raster.primitives import LEAF, SPHEROID, Shapes
-from vinesim.kernels.shading.deferred import Light, surface_light
+from vinesim.kernels.shading.deferred import Light, fast_atan2, surface_light
 from vinesim.kernels.shading.materials import BERRY, Materials, mix
 from vinesim.kernels.shading.shadow_maps import SUN_DISTANCE, ShadowMap
 
@@ -65,6 +65,8 @@ class FloatTables:
     """[texel, 4]"""
     sky_table: wp.array2d(dtype=wp.float32)
     """[texel, 3]"""
+    ground_sky: wp.array(dtype=wp.float32)
+    """[cell] the sky that the ground sees, flat"""
 
 
 @wp.struct
@@ -311,7 +313,7 @@ def light_sky(
         m = wp.int32(0)
         while m < whole:
             d = unit(point_ray(lens, back, points.u[first + m], points.v[first + m]))
-            x = (lane_atan2(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
+            x = (fast_atan2(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
             y = wp.sqrt(wp.max(d[2], 0.0)) * float(rows - 1)
             i = wp.clamp(int(x), 0, columns - 2)
             j = wp.clamp(int(y), 0, rows - 2)
@@ -330,16 +332,3 @@ def light_sky(
             m += 1
         for k in range(count):
             write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
-
-
-@wp.func
-def lane_atan2(y: float, x: float) -> float:
-    """atan2 to 1e-4 rad, without a branch."""
-    ax = wp.abs(x)
-    ay = wp.abs(y)
-    a = wp.min(ax, ay) / wp.max(wp.max(ax, ay), 1.0e-9)
-    q = a * a
-    r = ((-0.0464964749 * q + 0.15931422) * q - 0.327622764) * q * a + a
-    r = wp.where(ay > ax, 1.57079637 - r, r)
-    r = wp.where(x < 0.0, 3.14159274 - r, r)
-    return wp.where(y < 0.0, -r, r)

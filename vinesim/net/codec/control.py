@@ -19,11 +19,22 @@ from vinesim.net.codec.header import (
     kind_of,
 )
 from vinesim.net.codec.objects import check_object_id
+from vinesim.net.codec.robot import MAX_JOINTS
 from vinesim.net.codec.trees import MAX_BODIES, MAX_TREES
 from vinesim.net.replication.authority import Claim
+from vinesim.scene.ids import LABEL_STRIDE
 
 MAX_RECORDS = 4096
 """Retained records in one message."""
+
+HEIGHT_RANGE = (1.0, 2.5)
+"""Shortest and tallest person [m]. GUESSED."""
+
+MAX_SEED = (1 << 63) - 1
+"""Largest seed of a scene."""
+
+ACTOR_KINDS = ("robot", "human", "spectator")
+"""Kinds of actors."""
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,13 +54,13 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """``Model.digest()`` of its scene: equal digests mean equal object ids."""
     protocol: int = PROTOCOL
     index: int = 0
-    """Instance index of its label in label images."""
+    """Instance index of its label in label images, below :data:`vinesim.scene.ids.LABEL_STRIDE`."""
     joints: int = -1
-    """Number of joints in its poses; -1: that of its first pose."""
+    """Number of joints in its poses, at most :data:`MAX_JOINTS`; -1: that of its first pose."""
     seed: int = -1
     """Seed of its scene, from which others can generate the same; -1: not given."""
     height: float = 1.75
-    """Height of a person [m]."""
+    """Height of a person [m], in :data:`HEIGHT_RANGE`."""
 
 
 class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -109,9 +120,11 @@ def _unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decod
 
 
 def encode_hello(hello: Hello) -> bytes:
-    """Encode a hello; :class:`MessageError` if its name cannot be part of a key or it is too large."""
+    """Encode a hello; :class:`MessageError` if its name cannot be part of a key, a number is out of its range, or it
+    is too large."""
     if not is_valid_name(hello.name):
         raise MessageError(f"actor name {hello.name!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
+    _check_hello(hello)
     payload = _pack(MessageKind.HELLO, hello)
     if len(payload) > MAX_MESSAGE:
         raise MessageError(f"greeting of {len(payload)} B, at most {MAX_MESSAGE} B: the URDF is too long")
@@ -125,7 +138,22 @@ def decode_hello(payload: bytes) -> Hello:
         raise MessageError(f"greeting of an actor named {hello.name[:60]!r}")
     if hello.protocol != PROTOCOL:
         raise WrongVersion(hello.protocol)
+    _check_hello(hello)
     return hello
+
+
+def _check_hello(hello: Hello) -> None:
+    """Raise :class:`MessageError` unless the kind exists and every number is in its range."""
+    if hello.kind not in ACTOR_KINDS:
+        raise MessageError(f"greeting of {hello.name!r} with kind {hello.kind[:60]!r}, not {', '.join(ACTOR_KINDS)}")
+    for what, value, low, high in (
+        ("index", hello.index, 0, LABEL_STRIDE - 1),
+        ("joints", hello.joints, -1, MAX_JOINTS),
+        ("seed", hello.seed, -1, MAX_SEED),
+        ("height", hello.height, *HEIGHT_RANGE),
+    ):
+        if not low <= value <= high:
+            raise MessageError(f"greeting of {hello.name!r} with {what} {value}, not from {low} to {high}")
 
 
 def encode_welcome(welcome: Welcome) -> bytes:

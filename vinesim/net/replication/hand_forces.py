@@ -3,23 +3,47 @@
 Key ``force/<robot>/<person>``: the mean wrench on each link over a sixtieth of a second, best effort, during contact;
 then one empty message and silence. The robot's client applies the last message for :data:`MAX_AGE`, and in its
 simulation copies of people's hands do not collide with robots: no contact counts twice
-(``docs/decisions/forces-between-clients.md``).
+(``docs/decisions/forces-between-clients.md``). Only people push, only what their hands reach, and no harder than two
+hands can.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
+from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
+from vinesim.net.counters import Counters
 from vinesim.net.transport.bus import KEEP_LAST_1, Bus, Publisher
+from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 SEND_PERIOD = 1.0 / 60.0
 """Time between two messages about one robot [s]."""
 
 MAX_AGE = 0.1
 """A wrench is applied for so long after it arrived [s], unless a newer one does."""
+
+MAX_PERSON_FORCE = 200.0
+"""Largest sum of the forces of a person's two hands [N]: 100 N each (CANOPIES D6.4, section 3.1.1)."""
+
+MAX_PERSON_MOMENT = 200.0
+"""Largest sum of their moments about centres of mass [N m]: those forces at a lever of 1 m. GUESSED."""
+
+MAX_PUSHING_PEOPLE = 4
+"""All people together push a robot no harder than so many of them. GUESSED."""
+
+REACH = 1.2
+"""Farthest centre of mass of a link that a hand touches [m], from the palm: half of a long link, and the way of a
+running person until the pose arrives. GUESSED."""
+
+MAX_POSE_AGE = 1.0
+"""A person whose last pose is older than this pushes nothing [s]."""
+
+LinkCentre = Callable[[str], np.ndarray | None]
+"""Centre of mass [3] m of a link of the own robot; None if it has no such link."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -34,25 +58,58 @@ class _PushedRobot:
     """The last message was not empty."""
 
 
+def limit(wrenches: dict[str, np.ndarray], people: int = 1) -> tuple[dict[str, np.ndarray], bool]:
+    """Wrenches [6] by link, all reduced alike to what the hands of so many people can do; whether that was needed."""
+    force = sum(float(np.linalg.norm(wrench[:3])) for wrench in wrenches.values())
+    moment = sum(float(np.linalg.norm(wrench[3:])) for wrench in wrenches.values())
+    excess = max(force / MAX_PERSON_FORCE, moment / MAX_PERSON_MOMENT) / people
+    if excess <= 1.0:
+        return wrenches, False
+    return {link: wrench / excess for link, wrench in wrenches.items()}, True
+
+
+def is_within_reach(update: HumanUpdate, centre: np.ndarray | None) -> bool:
+    """Whether a hand of a person can touch a link with this centre of mass [3] m; None: there is no such link."""
+    if centre is None:
+        return False
+    return min(float(np.linalg.norm(hand[:3] - centre)) for hand in (update.pose.left, update.pose.right)) <= REACH
+
+
 class WrenchSync:
     """Wrenches of the own hands on others' robots, and of others' hands on the own robot."""
 
-    def __init__(self, bus: Bus, name: str) -> None:
-        self._bus, self._name = bus, name
+    def __init__(self, bus: Bus, name: str, counters: Counters) -> None:
+        self._bus, self._name, self._counters = bus, name, counters
         self._pushed: dict[str, _PushedRobot] = {}
         self._received: dict[str, tuple[float, WrenchMessage]] = {}
         bus.subscribe(f"force/{name}/*", KEEP_LAST_1)
 
-    def receive(self, payload: bytes, sender: str, now: float) -> bool:
-        """Take a message of ``sender``; False if it is not newer. Raises :class:`MessageError` if it is invalid."""
+    def receive(
+        self, payload: bytes, sender: Hello, pose: HumanUpdate | RobotUpdate | None, now: float, link_centre: LinkCentre
+    ) -> None:
+        """Take a message of ``sender``, whose last pose is ``pose`` (None: unknown or too old), and count what is not
+        used.
+
+        Raises :class:`MessageError` if it is invalid or not from a person.
+        """
+        if sender.kind != "human":
+            raise MessageError(f"wrenches by {sender.name!r}, a {sender.kind}: only people's hands send them")
         message = decode_wrenches(payload)
-        if sender in self._received and message.time <= self._received[sender][1].time:
-            return False
-        self._received[sender] = now, message
-        return True
+        if sender.name in self._received and message.time <= self._received[sender.name][1].time:
+            self._counters.dropped += 1
+            return
+        reached = {}
+        if isinstance(pose, HumanUpdate):
+            reached = {
+                link: wrench for link, wrench in message.wrenches.items() if is_within_reach(pose, link_centre(link))
+            }
+        self._counters.wrenches_refused += len(message.wrenches) - len(reached)
+        reached, is_limited = limit(reached)
+        self._counters.wrenches_limited += is_limited
+        self._received[sender.name] = now, WrenchMessage(message.time, reached)
 
     def net_wrenches(self, now: float) -> dict[str, np.ndarray]:
-        """Sum of the wrenches [6] of all people on each own link, by link name."""
+        """Sum of the wrenches [6] of all people on each own link, by link name; limited as a whole."""
         links: dict[str, np.ndarray] = {}
         for sender in sorted(self._received):
             arrived, message = self._received[sender]
@@ -60,6 +117,8 @@ class WrenchSync:
                 continue
             for link, wrench in message.wrenches.items():
                 links[link] = links.get(link, 0.0) + wrench
+        links, is_limited = limit(links, MAX_PUSHING_PEOPLE)
+        self._counters.wrenches_limited += is_limited
         return links
 
     def remove_peer(self, name: str) -> None:
@@ -82,7 +141,7 @@ class WrenchSync:
             if now < robot_state.due - 1e-9:
                 continue
             mean = {link: total / robot_state.ticks for link, total in robot_state.total.items()}
-            payload = encode_wrenches(WrenchMessage(time, mean))
+            payload = encode_wrenches(WrenchMessage(time, limit(mean)[0]))
             robot_state.due = max(robot_state.due, now - SEND_PERIOD) + SEND_PERIOD
             robot_state.total, robot_state.ticks, robot_state.is_active = {}, 0, bool(mean)
             if robot_state.publisher.put(payload):

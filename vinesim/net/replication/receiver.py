@@ -10,6 +10,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import Hello, MessageError, MessageKind, ObjectStates, RetainedRecord, TreeStates
 from vinesim.net.replication.authority import NOBODY, Claim
+from vinesim.net.replication.hand_forces import MAX_POSE_AGE, LinkCentre
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.model_check import check_record, check_tree_states
 from vinesim.net.replication.replication_state import ReplicationState, put_counted
@@ -18,6 +19,10 @@ from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpd
 
 MAX_EARLY_MESSAGES = 100
 """Messages with retained records that wait for the hello of their author, for each author."""
+
+
+def _no_link(_: str) -> None:
+    """The actor is no robot."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -50,6 +55,7 @@ class _Step:
     """Own clock [s]."""
     time: float
     """Network time [s]."""
+    link_centre: LinkCentre = _no_link
     inbox: Inbox = dataclasses.field(default_factory=Inbox)
     new_trees: dict[int, tuple[TreeStates, str]] = dataclasses.field(default_factory=dict)
     """The newest accepted batch and its owner, by tree."""
@@ -63,12 +69,14 @@ class Receiver:
         self._early: dict[str, list[tuple[str, bytes]]] = {}
         """Messages with retained records whose author has not been admitted yet."""
 
-    def receive(self, now: float, offset: float) -> Inbox:
+    def receive(self, now: float, offset: float, link_centre: LinkCentre | None = None) -> Inbox:
         """Everything since the last call; ``offset`` [s]: network time minus own time ``now`` [s].
+
+        ``link_centre``: of the own robot's links; None: nothing can be pushed.
 
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
-        state, step = self._state, _Step(now, now + offset)
+        state, step = self._state, _Step(now, now + offset, link_centre or _no_link)
         inbox, peers, time = step.inbox, state.peers, step.time
         inbox.left = peers.poll_liveliness(now)
         for name in inbox.left:
@@ -114,7 +122,9 @@ class Receiver:
                 assert peer is not None
                 counters.dropped += not peer.receive(decode_pose(payload, sender), step.time)
             elif family == "force":
-                counters.dropped += not state.wrench_sync.receive(payload, sender, step.time - state.peers.clock.offset)
+                assert peer is not None
+                pose = peer.update if peer.update and step.time - peer.update.time <= MAX_POSE_AGE else None
+                state.wrench_sync.receive(payload, peer.hello, pose, step.now, step.link_centre)
             else:
                 self._receive_in_cell(family, (int(chunks[0]), int(chunks[1])), payload, sender, step)
         except MessageError as error:

@@ -30,7 +30,7 @@ class ReplicationState:
         self.cells = CellChannels(bus, interest_radius)
         self.counters = Counters()
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
-        self.wrench_sync = WrenchSync(bus, hello.name)
+        self.wrench_sync = WrenchSync(bus, hello.name, self.counters)
         self.ownership = Ownership(hello.name, self.peers.known)
         self.retained = RetainedSync(bus, self.counters)
         self.tree_stream = TreeStream(model)

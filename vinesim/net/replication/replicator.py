@@ -20,6 +20,7 @@ from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.counters import Counters
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.hand_forces import LinkCentre
 from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
 from vinesim.net.replication.sender import LocalStep, Sender
@@ -105,13 +106,15 @@ class Replicator:
         """Network time minus the client's own time [s]."""
         return self._state.peers.clock.offset
 
-    def receive(self, now: float) -> Inbox:
+    def receive(self, now: float, link_centre: LinkCentre | None = None) -> Inbox:
         """Everything that arrived since the last call.
 
+        ``link_centre(link)``: centre of mass [3] m of a link of this robot, None for a link that it has not. Without
+        it, people of other clients push nothing.
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
         self._state.peers.clock.advance(now)
-        return self._receiver.receive(now, self.offset)
+        return self._receiver.receive(now, self.offset, link_centre)
 
     def send(
         self,

@@ -66,12 +66,16 @@ class ServerAdmission:
             self._submit(lambda: self._join_again(querier, hello))
 
     def _join_again(self, querier: zenoh.Querier, hello: bytes) -> None:
-        """Send the hello to a server that has appeared, and note whether it rejects this actor."""
-        welcomes, end = self._query(hello), time.monotonic() + CONNECT_TIMEOUT
-        # between linked routers a server is announced before queries are routed to it
-        while not welcomes and has_match(querier) and time.monotonic() < end:
+        """Send the hello to a server that has appeared, and note whether it rejects this actor.
+
+        Between linked routers a server is announced before queries are routed to it: without a reply this is submitted
+        again, behind what else the thread has to do, as long as the server is announced.
+        """
+        welcomes = self._query(hello)
+        if not welcomes and has_match(querier):
             time.sleep(RETRY_PERIOD)
-            welcomes = self._query(hello)
+            self._submit(lambda: self._join_again(querier, hello))
+            return
         self.rejection = next((welcome.refused for welcome in welcomes if welcome.refused), "")
         if self.rejection:
             log.error("%s: the server that came back rejects this actor: %s", self._name, self.rejection)

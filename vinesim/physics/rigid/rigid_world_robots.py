@@ -116,6 +116,10 @@ class RobotAccess(WorldCore):
 
     # ------------------------------------------------------------------ links
 
+    def link_centre(self, name: str, link: str) -> np.ndarray:
+        """Centre of mass [3] m of a link at the last step's start; ``ValueError`` if there is none of this name."""
+        return self.mj_data.xipos[self._link_body(name, link)].copy()
+
     def jacobian(self, name: str, link: str, point: np.ndarray) -> np.ndarray:
         """[6, joint]: velocity of the world ``point`` [3] of a link, then its angular velocity, per joint velocity."""
         robot, body = self.robot(name), self._link_body(name, link)

@@ -35,7 +35,6 @@ class LiveLight:
             setattr(points, name, wp.empty(places, dtype=wp.int32, device="cpu"))
         points.count = wp.empty((self.list_count, light_points.CLASS_COUNT), dtype=wp.int32, device="cpu")
         self._tables = light_points.FloatTables()
-        self._ground_sky: wp.array = wp.empty(0, dtype=float, device="cpu")
         self._sources: list[wp.array] = []
         """Arrays that the tables are views of."""
 
@@ -76,9 +75,8 @@ class LiveLight:
         launch(light_points.sort_points, [primitives.shapes, materials, lens, *seen], arrays)
         launch(light_points.light_sky, [tables, light, lens, points, first], [radiance])
         where = [light, maps, lens, points, first]
-        launch(light_plants.light_ground, [tables, materials, self._ground_sky, *where], [radiance])
-        launch(light_plants.light_blades, [tables, materials, *where], [radiance])
-        launch(light_plants.light_berries, [tables, materials, *where], [radiance])
+        for kernel in (light_plants.light_ground, light_plants.light_blades, light_plants.light_berries):
+            launch(kernel, [tables, materials, *where], [radiance])
         solid = [light, maps.near, maps.far, lens, points, first]
         launch(light_points.light_others, [primitives.shapes, materials, *solid], [radiance])
 
@@ -93,7 +91,7 @@ class LiveLight:
         for name, source in zip(names, sources, strict=True):
             setattr(self._tables, name, _numbers(source))
         self._tables.outline = shapes.outline.flatten()
-        self._ground_sky = materials.ground_sky.flatten()
+        self._tables.ground_sky = materials.ground_sky.flatten()
         self._sources = sources
 
 
