@@ -107,7 +107,7 @@ def add_missing_masses(root: etree._Element, robot: Robot, base: str, order: lis
     ``base``: its root link, ``order``: its joints outwards. A body is a moving link and all that is fixed to it.
     """
     anchors = link_anchors(base, order)
-    mass = {link: 0.0 for link in (base, *(joint.child for joint in order if joint.type != "fixed"))}
+    mass = dict.fromkeys((base, *(joint.child for joint in order if joint.type != "fixed")), 0.0)
     inertia = dict(mass)
     for link in robot.links:
         if link.inertial is not None:

@@ -23,7 +23,9 @@ def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
             raise description_error(file, f"{kind} {twice[0]!r} is there twice", "rename one")
     if "world" in links:
         raise description_error(
-            file, "a link called 'world' is not the root", "rename it, or let it be the root, which bolts the robot down"
+            file,
+            "a link called 'world' is not the root",
+            "rename it, or let it be the root, which bolts the robot down",
         )
     if not robot.links:
         raise description_error(file, "no links", "give a robot with at least one link")
