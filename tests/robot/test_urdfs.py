@@ -1,4 +1,4 @@
-"""URDFs as they are found: what they leave out is assumed with one warning, and the robots of example-robot-data hold."""
+"""URDFs as they are found: what they leave out is assumed with one warning; example-robot-data's robots hold."""
 
 from __future__ import annotations
 

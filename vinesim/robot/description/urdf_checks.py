@@ -25,7 +25,7 @@ def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
         raise description_error(
             file,
             "a link called 'world' is not the root",
-            "rename it, or let it be the root, which bolts the robot down",
+            "rename it, or make it the root to bolt the robot down",
         )
     if not robot.links:
         raise description_error(file, "no links", "give a robot with at least one link")
