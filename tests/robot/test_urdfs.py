@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import logging
 import pathlib
+import sys
+import tempfile
 
 import numpy as np
 import pytest
+import trimesh
 
 from tests.support.robot_yard import Yard
 from vinesim import frames
 from vinesim.net.codec.robot import decode_robot, encode_robot
+from vinesim.physics.rigid.urdf import shapes_of
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.package_resources import find_installed
@@ -208,3 +212,70 @@ def test_the_hand_of_a_panda_opens_as_far_as_asked() -> None:
     yard.run(1.0)
     left, right = (yard.rigid.link_pose("anna", f"panda_{side}finger")[:3] for side in ("left", "right"))
     assert np.linalg.norm(left - right) == pytest.approx(0.05, abs=1e-4)
+
+
+# ---------------------------------------------------------------------- text from the network
+
+
+def remote_text(folder: pathlib.Path, shapes: str) -> pathlib.Path:
+    shell = f'<link name="shell">{shapes}</link>'
+    fixed = '<joint name="fix" type="fixed"><parent link="arm"/><child link="shell"/></joint>'
+    return write(folder, link("base"), link("arm"), joint("j", "base", "arm"), shell, fixed)
+
+
+OPENED: list[str] = []
+"""Names of the files that Python opened since the list was cleared."""
+sys.addaudithook(lambda event, arguments: OPENED.append(str(arguments[0])) if event == "open" else None)
+
+
+def test_no_file_that_a_text_from_the_network_names_is_opened(
+    tmp_path: pathlib.Path,
+) -> None:
+    """A box of the bounds it gives stands in; a mesh without bounds is left out, even where the file exists."""
+    (tmp_path / "secret.stl").write_bytes(b"solid")
+    meshes = "".join(
+        f'<{tag}><geometry><mesh filename="{tmp_path}/secret.stl"{bounds}/></geometry></{tag}>'
+        for tag, bounds in (("visual", ' bounds="-0.1 -0.2 0 0.3 0.2 0.5" scale="2 1 1"'), ("collision", ""))
+    )
+    file = remote_text(tmp_path, meshes)
+    OPENED.clear()
+    description = load_description(file, is_remote=True)
+    yard = Yard(description)
+    assert str(file) in OPENED
+    assert not [name for name in OPENED if "secret" in name]
+    (shape,) = shapes_of(description.urdf)["shell"]
+    assert shape.kind == "box"
+    np.testing.assert_allclose(shape.size, [0.4, 0.2, 0.25])
+    np.testing.assert_allclose(shape.pose[:3], [0.2, 0.0, 0.25], atol=1e-9)
+    assert np.isfinite(yard.run(0.1)).all()
+
+
+@pytest.mark.parametrize("declared", ["SYSTEM 'file:///dev/null'", "[<!ENTITY secret SYSTEM 'secret.txt'>]"])
+def test_a_text_with_a_document_type_is_refused(declared: str, tmp_path: pathlib.Path) -> None:
+    """So no entity exists: neither one of a file nor one that grows."""
+    (tmp_path / "secret.txt").write_text("secret")
+    file = write(tmp_path, link("base"), link("arm"), joint("j", "base", "arm"), "<author>&secret;</author>")
+    file.write_text(f"<!DOCTYPE robot {declared}>" + file.read_text())
+    with pytest.raises(DescriptionError, match="document type"):
+        load_description(file, is_remote=True)
+
+
+@pytest.mark.skipif(ANCHOR is None, reason="example-robot-data is not installed")
+def test_a_robot_with_meshes_is_boxes_on_another_machine() -> None:
+    """The boxes enclose what the meshes of the sender do: the same bounds of each link."""
+    assert ANCHOR is not None
+    file = ANCHOR.parents[2] / "talos_data/robots/talos_left_arm.urdf"
+    own = load_description(file)
+    with tempfile.TemporaryDirectory() as folder:
+        copy = pathlib.Path(folder) / "talos.urdf"
+        copy.write_text(own.urdf)
+        other = load_description(copy, is_remote=True)
+    boxes = 0
+    for name, shapes in shapes_of(other.urdf).items():
+        meshes = [shape for shape in shapes_of(own.urdf)[name] if shape.kind == "mesh"]
+        stand_ins = [shape for shape in shapes if shape.kind == "box"]
+        for box, mesh in zip(stand_ins, meshes, strict=True):
+            extents = trimesh.load(mesh.file, force="mesh").extents * np.abs(mesh.size)
+            np.testing.assert_allclose(2.0 * np.array(box.size), extents, rtol=1e-3, atol=2e-4)
+            boxes += 1
+    assert boxes > 10

@@ -24,7 +24,7 @@ from vinesim.robot.description.drive_parameters import home_positions, make_driv
 from vinesim.robot.description.errors import DescriptionError, description_error
 from vinesim.robot.description.inferred_defaults import guess_cameras, guess_groups, guess_lidars
 from vinesim.robot.description.kinematics import joint_origin, link_anchors, moving_joints
-from vinesim.robot.description.meshes import resolve_meshes
+from vinesim.robot.description.meshes import replace_unopened_meshes, resolve_meshes
 from vinesim.robot.description.package_resources import find_installed
 from vinesim.robot.description.repairs import (
     MOUNT,
@@ -45,9 +45,10 @@ BOLTED_EFFORT = (1e6, 1e6)
 """[N], [N m] With which the base of a robot that is bolted down is held: a robot's pushes move it by micrometres."""
 
 
-def load_description(name: str | pathlib.Path) -> RobotDescription:
+def load_description(name: str | pathlib.Path, *, is_remote: bool = False) -> RobotDescription:
     """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
 
+    ``is_remote``: its text came over the network, so no file that it names is opened.
     Raises :class:`DescriptionError` in one line if it cannot be simulated.
     """
     file = _locate(str(name))
@@ -55,7 +56,10 @@ def load_description(name: str | pathlib.Path) -> RobotDescription:
     check_numbers(root, file)
     notes: list[str] = []
     assumed: list[str] = []
-    resolve_meshes(root, file, notes)
+    if is_remote:
+        replace_unopened_meshes(root, assumed)
+    else:
+        resolve_meshes(root, file, notes)
     fix_wheels(root, notes)
     rename_world(root, notes)
     repair_joints(root, assumed)
