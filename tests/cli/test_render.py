@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import pathlib
 
 import msgspec
 import pytest
 
 from vinesim.cli.render import run
-from vinesim.errors import UsageError
+from vinesim.errors import UsageError, WriteError
 
 HEADER = "x,y,z,look_x,look_y,look_z\n"
 
@@ -77,5 +79,27 @@ def test_a_viewpoint_is_needed_and_only_once(tmp_path: pathlib.Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: pathlib.Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(UsageError, match=r"--out .* cannot be written: Not a directory"):
+    with pytest.raises(WriteError, match=r"--out .* cannot be written: Not a directory; make room .* render again"):
         render(tmp_path / "file" / "out", at="0.4,1.2,1.3", look="3,1,1.7")
+
+
+def test_a_full_disk_leaves_the_picture_that_was_there(tmp_path: pathlib.Path) -> None:
+    """All files of a picture are replaced, or none."""
+    render(tmp_path, at="0.4,1.2,1.3", look="3,1,1.7")
+    before = files(tmp_path)
+    real = pathlib.Path.open
+
+    def full(path: pathlib.Path, mode: str = "r", *rest, **options):
+        if "w" in mode and "truth" in path.name:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(path, mode, *rest, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pathlib.Path, "open", full)
+        with pytest.raises(WriteError, match="No space left on device") as said:
+            render(tmp_path, at="0.4,1.2,1.4", look="3,1,1.7")
+    assert said.value.exit_code == 5
+    assert files(tmp_path) == before
+    render(tmp_path, at="0.4,1.2,1.4", look="3,1,1.7")
+    assert files(tmp_path).keys() == before.keys()
+    assert files(tmp_path)["rgb.png"] != before["rgb.png"]

@@ -1,12 +1,17 @@
 """Pictures and data sets as files: formats as their readers read them, bitwise repeatable, whole after any end."""
 
+import contextlib
+import errno
 import json
+import os
 import pathlib
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import types
 
 import cv2
 import numpy as np
@@ -17,7 +22,7 @@ from pycocotools.coco import COCO
 from vinesim.cli.render import run as render
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.client.composition.scene_composer import PlacementError
-from vinesim.errors import UsageError
+from vinesim.errors import UsageError, WriteError
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.scene.data_files import DataFileNotFound
 from vinesim.scene.ids import Organ, label
@@ -61,7 +66,7 @@ def whole(scene: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> path
     """A data set made in this process, in one go."""
     out = tmp_path_factory.mktemp("whole") / "set"
     plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
-    dataset.prepare_folder(plan, out)
+    dataset.prepare_folder(plan, out, IMAGES)
     assert list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES))) == list(range(IMAGES))
     dataset.finish(out, IMAGES)
     return out
@@ -188,7 +193,7 @@ def test_an_image_is_the_same_whatever_was_drawn_before(
 ) -> None:
     """The last image of a vineyard, alone: wind, actors and picked bunches of the others leave no trace."""
     plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
-    dataset.prepare_folder(plan, tmp_path)
+    dataset.prepare_folder(plan, tmp_path, IMAGES)
     last = dataset.IMAGES_PER_VINEYARD - 1
     list(dataset.render_images(plan, tmp_path, [last]))
     alone = {name: data for name, data in _files(tmp_path).items() if f"{last:06d}" in name}
@@ -204,7 +209,7 @@ def _turned(q, v: np.ndarray) -> np.ndarray:
 def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path) -> None:
     plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
     before = _files(whole)
-    dataset.prepare_folder(plan, whole)
+    dataset.prepare_folder(plan, whole, IMAGES)
     assert _files(whole) == before
     for other, words in (
         (DatasetPlan(load_scene(scene), 6, "d435", (160, 120), LIFE), "seed 5, not 6"),
@@ -213,26 +218,167 @@ def test_another_plan_is_not_mixed_in(scene: pathlib.Path, whole: pathlib.Path, 
         (DatasetPlan(load_scene(scene), 5, "d435", (160, 120)), "life"),
     ):
         with pytest.raises(DatasetError, match=words):
-            dataset.prepare_folder(other, whole)
+            dataset.prepare_folder(other, whole, IMAGES)
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(DatasetError, match="other things"):
-        dataset.prepare_folder(plan, tmp_path)
+        dataset.prepare_folder(plan, tmp_path, IMAGES)
     with pytest.raises(DatasetError, match="cannot be used"):
-        dataset.prepare_folder(plan, tmp_path / "mine.txt")
+        dataset.prepare_folder(plan, tmp_path / "mine.txt", IMAGES)
 
 
 def test_a_full_disk_leaves_nothing_half(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     """No file may grow beyond 20 kB: to a program that is a full disk, at the first picture."""
     plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120))
-    dataset.prepare_folder(plan, tmp_path)
+    dataset.prepare_folder(plan, tmp_path, IMAGES)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, before[1]))
     try:
-        with pytest.raises(DatasetError, match=r"image 0 cannot be written .* make room"):
+        with pytest.raises(WriteError, match=r"image 0 cannot be written .* make room"):
             list(dataset.render_images(plan, tmp_path, [0]))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert list(_files(tmp_path)) == ["dataset.json"]
+
+
+def _full_disk(monkeypatch: pytest.MonkeyPatch, name: str, error: int) -> None:
+    """Any write to a file whose name contains ``name`` fails half-way."""
+    real = pathlib.Path.open
+
+    def opened(path: pathlib.Path, mode: str = "r", *rest, **options):
+        file = real(path, mode, *rest, **options)
+        if "w" in mode and name in path.name:
+
+            def stop(pieces) -> None:
+                file.write(next(iter(pieces))[:3])
+                raise OSError(error, os.strerror(error))
+
+            return contextlib.closing(types.SimpleNamespace(writelines=stop, close=file.close))
+        return file
+
+    monkeypatch.setattr(pathlib.Path, "open", opened)
+
+
+@pytest.mark.parametrize("error", [errno.ENOSPC, errno.EROFS])
+def test_a_failing_disk_leaves_the_image_before_whole_and_the_same_command_goes_on(
+    whole: pathlib.Path, scene: pathlib.Path, tmp_path: pathlib.Path, error: int
+) -> None:
+    """Whichever file of an image fails, none of that image is new."""
+    out = tmp_path / "set"
+    shutil.copytree(whole, out)
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    (out / "images" / "000001.png").unlink()
+    before = _files(out)
+    with pytest.MonkeyPatch.context() as patch:
+        _full_disk(patch, "000001.txt", error)
+        with pytest.raises(WriteError, match=f"image 1 .*{os.strerror(error)}; make room .* goes on") as said:
+            list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES)))
+    assert "\n" not in str(said.value)
+    assert said.value.exit_code == 5
+    assert _files(out) == before
+    for name in ("annotations.json", "val.txt", "data.yaml"):
+        with pytest.MonkeyPatch.context() as patch:
+            _full_disk(patch, name, error)
+            with pytest.raises(WriteError, match=r"annotations\.json and the lists"):
+                dataset.finish(out, IMAGES)
+        assert _files(out) == before
+    assert list(dataset.render_images(plan, out, dataset.missing_images(out, IMAGES))) == [1]
+    dataset.finish(out, IMAGES)
+    assert _files(out) == _files(whole)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_in_one_line(
+    scene: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _full_disk(monkeypatch, "dataset.json", errno.EROFS)
+    with pytest.raises(DatasetError, match="cannot be used: Read-only file system; give a folder that can be written"):
+        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435"), tmp_path, 1)
+    assert not _files(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '"vinesim"', "\udcff"])
+def test_a_damaged_dataset_json_is_one_line(scene: pathlib.Path, tmp_path: pathlib.Path, text: str) -> None:
+    (tmp_path / "dataset.json").write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(DatasetError, match=r"dataset\.json is not what a data set was begun with") as said:
+        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435"), tmp_path, 1)
+    assert "\n" not in str(said.value)
+
+
+def _truncate(file: pathlib.Path) -> None:
+    file.write_bytes(file.read_bytes()[:-2])
+
+
+def _empty(file: pathlib.Path) -> None:
+    file.write_bytes(b"")
+
+
+@pytest.mark.parametrize("damage", [_truncate, _empty, pathlib.Path.unlink])
+@pytest.mark.parametrize("kind", ["images", "labels", "depth", "measured", "ids", "berries", "records"])
+def test_a_damaged_file_makes_its_image_missing(whole: pathlib.Path, tmp_path: pathlib.Path, kind: str, damage) -> None:
+    out = tmp_path / "set"
+    shutil.copytree(whole, out)
+    assert dataset.missing_images(out, IMAGES) == []
+    damage(next((out / kind).glob("000003.*")))
+    assert dataset.missing_images(out, IMAGES) == [3]
+
+
+def test_the_same_command_renders_damaged_images_again(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    out = tmp_path / "set"
+    shutil.copytree(whole, out)
+    _truncate(out / "images" / "000002.png")
+    (out / "depth" / "000005.png").unlink()
+    done = subprocess.run(_command(scene, out, 1), capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert f"{IMAGES} images (5 train, 1 val, 0 test), 2 of them new" in done.stdout
+    assert _files(out) == _files(whole)
+
+
+def test_fewer_images_than_there_are_are_refused(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    """Lists and folders would tell of different data sets."""
+    plan, before = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE), _files(whole)
+    with pytest.raises(DatasetError, match=r"holds image 000005, .*3 images.* give --images 6 or more") as said:
+        dataset.prepare_folder(plan, whole, 3)
+    assert "\n" not in str(said.value)
+    dataset.prepare_folder(plan, whole, IMAGES + 1)
+    assert _files(whole) == before
+
+
+def test_all_images_of_a_vineyard_are_in_one_split_that_never_changes(whole: pathlib.Path) -> None:
+    splits = [dataset.split_of(image) for image in range(1000)]
+    for vineyard in range(200):
+        first = vineyard * dataset.IMAGES_PER_VINEYARD
+        assert len(set(splits[first : first + dataset.IMAGES_PER_VINEYARD])) == 1
+    assert [splits.count(split) for split in dataset.SPLITS] == [800, 100, 100]
+    assert set(splits[:11]) == set(dataset.SPLITS)  # a small data set has all three
+    images = json.loads((whole / "annotations.json").read_text())["images"]
+    records = [json.loads(p.read_text()) for p in sorted((whole / "records").glob("*.json"))]
+    assert [one["split"] for one in images] == [one["split"] for one in records] == splits[:IMAGES]
+    vineyards = {(one["scene"]["digest"], one["split"]) for one in records}
+    assert len(vineyards) == len({digest for digest, _ in vineyards}) == 2
+
+
+def test_yolo_finds_every_image_and_its_labels_from_any_folder(
+    whole: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the rules of Ultralytics: ``path``, unless given, is the folder of data.yaml; a list's ``./`` is its folder;
+    the last ``images`` of a path becomes ``labels``."""
+    monkeypatch.chdir(tmp_path)
+    lines = dict(line.split(": ") for line in (whole / "data.yaml").read_text().splitlines() if line != "names:")
+    assert lines.pop("  0") == "bunch"
+    assert list(lines) == list(dataset.SPLITS)  # no `path`: it would be relative to the working folder
+    found = {}
+    for split, name in lines.items():
+        listed = (whole / name).read_text().splitlines()
+        assert all(one.startswith("./") for one in listed)
+        found[split] = [whole / one for one in listed]
+        for image in found[split]:
+            assert image.is_file()
+            assert (whole / "labels" / f"{image.stem}.txt").is_file()
+    assert sorted(image for images in found.values() for image in images) == sorted((whole / "images").glob("*.png"))
+    assert [len(found[split]) for split in dataset.SPLITS] == [5, 1, 0]
 
 
 def test_what_stops_a_worker_is_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:

@@ -180,9 +180,11 @@ def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form
 
 def status_line(values: dict[str, Any]) -> str:
     """One line of text for a status."""
+    faults = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in values["faults"].items())
     return (
         f"{values['time']:7.1f} s  {values['tick_hz']:6.2f} Hz  p99 {values['tick_p99_ms']:5.2f} ms  "
         f"awake {values['awake']:3d}  force {values['force']:6.2f} N  "
         f"dropped {values['frames_dropped']} frames {values['messages_dropped']} messages  "
         f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'nobody'}"
+        f"{'  FAULTS: ' if faults else ''}{faults}"
     )

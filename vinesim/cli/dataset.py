@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import multiprocessing
 import os
 import pathlib
@@ -15,12 +16,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vinesim.cli.render import parse_size
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
-from vinesim.errors import UsageError
+from vinesim.errors import UsageError, WriteError
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.physics.plants.device_buffers import find_device
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
+from vinesim.sensors.export.files import remove_partial_files
 from vinesim.sensors.raster import renderer_selection
 
 Worker = tuple[BaseProcess, Any]
@@ -46,9 +48,10 @@ def run(
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     find_device(device)
-    randomizer = SceneRandomizer(actors) if actors > 0.0 else None
+    loaded = load_scene(scene)
+    randomizer = SceneRandomizer(actors, loaded.physics) if actors > 0.0 else None
     plan = DatasetPlan(
-        load_scene(scene),
+        loaded,
         seed,
         camera,
         None if size is None else parse_size(size),
@@ -59,7 +62,7 @@ def run(
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     running: list[Worker] = []
     try:
-        dataset.prepare_folder(plan, out)
+        dataset.prepare_folder(plan, out, images)
         compile_kernels(SENSOR_PACKAGES, device)
         wanted = dataset.missing_images(out, images)
         # Of an image on a GPU the cores only generate, write and compute the truth; they share the GPU.
@@ -76,7 +79,9 @@ def run(
         return 130
     finally:
         _stop_workers(running, out)
-    print(f"{dataset.finish(out, images)}: {images} images, {len(wanted)} of them new")
+    splits = collections.Counter(map(dataset.split_of, range(images)))
+    parts = ", ".join(f"{splits[split]} {split}" for split in dataset.SPLITS)
+    print(f"{dataset.finish(out, images)}: {images} images ({parts}), {len(wanted)} of them new")
     return 0
 
 
@@ -109,12 +114,12 @@ def _run_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int], pipe: Co
             pipe.send(image)
     except BrokenPipeError:
         return
-    except DatasetError as bad:
-        pipe.send(str(bad))
+    except (DatasetError, WriteError) as bad:
+        pipe.send(bad)
 
 
 def _wait_for(workers: list[Worker], advance: Callable[[], None]) -> None:
-    """Call ``advance`` for each image until all workers are done; :class:`DatasetError` if one of them failed."""
+    """Call ``advance`` for each image until all workers are done; raises what stopped one of them."""
     working = {pipe: process for process, pipe in workers}
     while working:
         for pipe in wait(list(working)):
@@ -129,8 +134,8 @@ def _wait_for(workers: list[Worker], advance: Callable[[], None]) -> None:
                         f"a worker ended with code {process.exitcode}; what is done is kept, the same command goes on"
                     ) from None
                 continue
-            if isinstance(message, str):
-                raise DatasetError(message)
+            if isinstance(message, Exception):
+                raise message
             advance()
 
 
@@ -142,5 +147,5 @@ def _stop_workers(workers: list[Worker], out: pathlib.Path) -> None:
         process.join()
         pipe.close()
     if workers:
-        dataset.remove_partial_files(out)
+        remove_partial_files(out)
     workers.clear()

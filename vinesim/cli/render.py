@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from vinesim.errors import UsageError
+from vinesim.errors import UsageError, WriteError
 
 if TYPE_CHECKING:
     from vinesim.client.composition.scene_composer import SceneComposer
@@ -89,7 +89,7 @@ def run(
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
     compile_kernels(SENSOR_PACKAGES, device)
     model = generate(plan)
-    view = staged.compose(model)
+    view = staged.compose(model, plan.physics)
     primitives = Primitives(model, renderer=renderer, device=device)
     primitives.update(view)
     for viewpoint in viewpoints:
@@ -108,7 +108,10 @@ def run(
                 print(f"{folder}: {sight}")
             written[-1].result()
     except OSError as bad:
-        raise UsageError(f"--out {out} cannot be written: {bad.strerror or bad}") from None
+        raise WriteError(
+            f"--out {out} cannot be written: {bad.strerror or bad}; make room there or give another folder, and render "
+            "again"
+        ) from None
     return 0
 
 
@@ -120,14 +123,14 @@ class _Picture:
     records: dict[str, Any]
 
     def write(self, folder: pathlib.Path) -> None:
-        """Write PNG and JSON files; OSError if that fails."""
+        """Write PNG and JSON files, all or none; OSError if that fails."""
         from vinesim.sensors.export import annotations as formats
         from vinesim.sensors.export import images as picture
+        from vinesim.sensors.export.files import write_files
 
-        for name, image in self.images.items():
-            picture.write_png(folder / f"{name}.png", image)
-        for name, record in self.records.items():
-            formats.write_json(folder / f"{name}.json", record)
+        files = {folder / f"{name}.png": [picture.encode_png(image)] for name, image in self.images.items()}
+        files |= {folder / f"{name}.json": [formats.json_text(one).encode()] for name, one in self.records.items()}
+        write_files(files)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

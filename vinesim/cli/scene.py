@@ -7,6 +7,7 @@ import pathlib
 from rich.console import Console
 from rich.table import Table
 
+from vinesim.errors import WriteError
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
 from vinesim.scene.summary import summary_rows as rows_of
@@ -24,6 +25,9 @@ def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
         table.add_row(quantity, value, unit)
     console.print(table)
     target = out or pathlib.Path(f"{scene.name}.png")
-    render_overview(model, rest_snapshot(model), target, sun=scene.sun.direction())
+    try:
+        render_overview(model, rest_snapshot(model), target, sun=scene.sun.direction())
+    except OSError as bad:
+        raise WriteError(f"--out {target} cannot be written: {bad.strerror or bad}; give another file") from None
     console.print(f"picture: {target}")
     return 0

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from vinesim.client.client import Client
+from vinesim.client.faults import FaultLog, count_faults
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import touch_to_motion
 from vinesim.robot.tasks.task import Task
@@ -34,6 +35,7 @@ class Status:
         anything; ``sensors`` gives the status of sensors."""
         self.client, self.rate_loop, self._task = client, rate_loop, task
         self._sensors = sensors
+        self._fault_log = FaultLog()
         self._sent: Callable[[], dict[str, int]] = sent or dict
         self._before: dict[str, int] = {}
         self._before_time = 0.0
@@ -48,6 +50,8 @@ class Status:
         traffic = self.client.replicator.counters
         families = (traffic.actor, traffic.environment, traffic.event)
         p50, p99 = loop.work_ms(50, 99)
+        faults = count_faults(client, loop.dropped)
+        self._fault_log.update(faults)
         force = np.sum([np.linalg.norm(c.force) for c in client.physics.contacts if c.actor == client.name] or [0.0])
         return {
             "name": client.name,
@@ -64,6 +68,7 @@ class Status:
             "bytes_out": sum(family.bytes_out for family in families),
             "environment_bytes_in": traffic.environment.bytes_in,
             "environment_bytes_out": traffic.environment.bytes_out,
+            "faults": faults,
             "phase": "" if self._task is None else self._task.phase,
             "others": sorted(client.remote_actors),
             "topics": rates,

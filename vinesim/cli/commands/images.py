@@ -76,7 +76,7 @@ def render(
 
 
 def dataset(
-    images: Annotated[int, typer.Option(min=1, max=999_999, help="How many.")],
+    images: Annotated[int, typer.Option(min=1, max=999_999, help="How many; never fewer than OUT holds.")],
     out: Annotated[pathlib.Path, typer.Option(help="Folder of the data set; an unfinished one is continued.")],
     scene: Scene = "demo",
     seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
@@ -95,7 +95,8 @@ def dataset(
     """Render random pictures of random vineyards with their truth: COCO with masks, YOLO, depth, ids, poses.
 
     Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, actors and the viewpoint are random.
-    Killed or stopped, the same command continues; more images may be asked for later.
+    Killed or stopped, the same command continues, and renders again what was deleted or truncated; more images may be
+    asked for later, fewer are refused. The five images of a vineyard are in one split: train, val or test (8 : 1 : 1).
 
     \b
     Examples:

@@ -93,15 +93,14 @@ class RobotProcesses:
         """Publish a client's status on /diagnostics, with that of the sensors."""
         if self.ros is None:
             return
-        is_behind = status["real_time_factor"] <= 0.99
-        loop = {key: status[key] for key in _LOOP_VALUES}
+        is_behind, faults = status["real_time_factor"] <= 0.99, status["faults"]
+        loop = {key: status[key] for key in _LOOP_VALUES} | faults
+        trouble = ["behind"] * is_behind + [name.replace("_", " ") for name in faults]
         report, awaited = self.report(), self.sensors.awaited()
         self.ros.publish_diagnostics(
             status["time"],
             [
-                ComponentStatus(
-                    "simulation", "warning" if is_behind else "ok", "behind" if is_behind else "well", loop
-                ),
+                ComponentStatus("simulation", "warning" if trouble else "ok", ", ".join(trouble) or "well", loop),
                 ComponentStatus(
                     "sensors", "error" if awaited else "ok", f"not ready: {awaited[0]}" if awaited else "well", report
                 ),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pathlib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -129,6 +128,7 @@ def coco_json(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
             "file_name": one["file"],
             "width": one["camera"]["width"],
             "height": one["camera"]["height"],
+            "split": one["split"],
             "camera": one["camera"],
         }
         yield (",\n" if number else "\n") + json.dumps(image)
@@ -197,8 +197,7 @@ def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
     return image
 
 
-def write_json(path: pathlib.Path, value: Any) -> pathlib.Path:
-    """Write a value as JSON, one line for each entry of the outermost object."""
+def json_text(value: dict[str, Any]) -> str:
+    """A value as JSON, one line for each entry of the outermost object."""
     lines = ",\n".join(f"  {json.dumps(k)}: {json.dumps(v)}" for k, v in value.items())
-    path.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
-    return path
+    return f"{{\n{lines}\n}}\n"

@@ -1,14 +1,15 @@
 """Data sets: random pictures of random vineyards with their ground truth, in files that a killed run leaves whole.
 
 What an image shows follows from (plan, its number) alone: any process may draw it, in any order, and gets the same
-bits. An image is done when its record is there; the record is written last, and every file is renamed into place.
+bits. An image is done when its record is there, which is written last, and its files have the sizes that the record
+names: what was deleted, truncated or half copied since then is drawn again. Checksums would find changed bytes too, but
+would read the whole data set at every start; sizes need one system call a file.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import pathlib
 from collections.abc import Iterable, Iterator
 from typing import Any, Protocol
@@ -18,6 +19,7 @@ import numpy as np
 
 import vinesim
 from vinesim import frames
+from vinesim.errors import WriteError
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.generation.vineyard import generate_uncached
@@ -28,6 +30,7 @@ from vinesim.scene.values import CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
+from vinesim.sensors.export.files import remove_partial_files, write_files
 from vinesim.sensors.scene.bunch_primitives import Ripeness
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.scene.ray_caster import RayCaster, enclosing_primitive
@@ -52,10 +55,21 @@ MIN_ACTOR_SHARE = 0.01
 """Least share of the pixels that show actors or boxes, where there are any."""
 _MAX_TRIES, _TRIES_WITH_ACTORS = 60, 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
+_SUFFIXES = {"labels": ".txt", "records": ".json"}
+"""Of files in folders that hold no PNGs."""
+SPLITS = ("train", "val", "test")
+_VAL_VINEYARD, _TEST_VINEYARD, _SPLIT_PERIOD = 1, 2, 10
+"""Of every ten vineyards in the order of their numbers, the second is for validation and the third for tests."""
 
 
 class DatasetError(SensorError):
     """A data set that cannot be made or gone on with. The text is one line."""
+
+
+def split_of(image: int) -> str:
+    """The split that an image belongs to: one for all images of a vineyard, whatever the number of images."""
+    place = image // IMAGES_PER_VINEYARD % _SPLIT_PERIOD
+    return {_VAL_VINEYARD: "val", _TEST_VINEYARD: "test"}.get(place, "train")
 
 
 def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
@@ -153,10 +167,10 @@ class VineyardRenderer:
         assert frame.exact_depth is not None
         bunches = formats.bunch_records(truths, self.info, self.ripeness.bunch)
         activity["actors"] = formats.actor_records(activity.get("actors", []), seen.labels)
-        name = f"{image:06d}"
         record = {
             "image": image,
-            "file": f"images/{name}.png",
+            "file": _file_of("images", image),
+            "split": split_of(image),
             "scene": {
                 "name": self.scene.name,
                 "seed": self.scene.seed,
@@ -169,20 +183,18 @@ class VineyardRenderer:
             "camera": formats.camera_record(self.spec.model, self.info, seen.pose),
             "bunches": bunches,
         }
-        images = {
+        pixels = {
             "images": frame.rgb,
             "depth": depth_millimetres(frame.exact_depth),
             "measured": depth_millimetres(frame.depth),
             "ids": formats.encode_labels(frame.labels),
             "berries": formats.encode_berry_numbers(seen),
         }
-        for kind, pixels in images.items():
-            with _atomic_file(folder / kind / f"{name}.png") as part:
-                picture.write_png(part, pixels)
-        with _atomic_file(folder / "labels" / f"{name}.txt") as part:
-            part.write_text(formats.yolo_labels(bunches, self.info.width, self.info.height))
-        with _atomic_file(_record_path(folder, image)) as part:
-            formats.write_json(part, record)
+        files = {_file_of(kind, image): picture.encode_png(values) for kind, values in pixels.items()}
+        files[_file_of("labels", image)] = formats.yolo_labels(bunches, self.info.width, self.info.height).encode()
+        record["files"] = {name: len(data) for name, data in files.items()}
+        files[_file_of("records", image)] = formats.json_text(record).encode()
+        write_files({folder / name: [data] for name, data in files.items()})
 
     def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
         """Pose the primitives for one image, whatever the image before showed: snapshot, place [2] m, record of it."""
@@ -256,46 +268,47 @@ def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, fl
 # ---- files -----------------------------------------------------------------------------------------------------------
 
 
-class _atomic_file:  # noqa: N801  (reads as a word where it is used)
-    """A file under another name until it is whole."""
+class _RecordedFiles(msgspec.Struct):
+    """What a record says of the files of its image."""
 
-    def __init__(self, path: pathlib.Path) -> None:
-        self.path = path
-        self.part = path.with_name(f".{path.name}.{os.getpid()}.part")
-
-    def __enter__(self) -> pathlib.Path:
-        return self.part
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        if kind is None:
-            self.part.replace(self.path)
-        else:
-            self.part.unlink(missing_ok=True)
+    files: dict[str, int]
+    """Size of each file [B]."""
 
 
-def _record_path(folder: pathlib.Path, image: int) -> pathlib.Path:
-    return folder / "records" / f"{image:06d}.json"
+def _file_of(kind: str, image: int) -> str:
+    """A file of an image, relative to the data set's folder."""
+    return f"{kind}/{image:06d}{_SUFFIXES.get(kind, '.png')}"
 
 
-def prepare_folder(plan: DatasetPlan, folder: pathlib.Path) -> None:
-    """Make the folder, or go on with it if it was begun with the same plan; :class:`DatasetError` otherwise."""
+def prepare_folder(plan: DatasetPlan, folder: pathlib.Path, images: int) -> None:
+    """Make the folder for so many images, or go on with it if it was begun with the same plan and has no more.
+
+    :class:`DatasetError` otherwise.
+    """
     file, settings = folder / "dataset.json", plan.settings()
     try:
         if file.exists():
-            _check_same_settings(json.loads(file.read_text(encoding="utf-8")), settings, folder)
+            _check_same_settings(file, settings)
+            _check_no_more_images(folder, images)
         elif folder.exists() and any(folder.iterdir()):
             raise DatasetError(f"{folder} holds other things than a data set; give an empty folder or a new one")
         for name in _FOLDERS:
             (folder / name).mkdir(parents=True, exist_ok=True)
         remove_partial_files(folder)
         if not file.exists():
-            with _atomic_file(file) as part:
-                formats.write_json(part, settings)
-    except (OSError, json.JSONDecodeError) as bad:
-        raise DatasetError(f"{folder} cannot be used: {bad}; give a folder that can be written") from None
+            write_files({file: [formats.json_text(settings).encode()]})
+    except OSError as bad:
+        raise DatasetError(
+            f"{folder} cannot be used: {bad.strerror or bad}; give a folder that can be written"
+        ) from None
 
 
-def _check_same_settings(there: dict[str, Any], wanted: dict[str, Any], folder: pathlib.Path) -> None:
+def _check_same_settings(file: pathlib.Path, wanted: dict[str, Any]) -> None:
+    folder = file.parent
+    try:
+        there = msgspec.json.decode(file.read_bytes(), type=dict[str, Any])
+    except msgspec.DecodeError as bad:
+        raise DatasetError(f"{file} is not what a data set was begun with: {bad}; give another folder") from None
     wanted = json.loads(json.dumps(wanted))
     for name, value in wanted.items():
         if there.get(name) != value:
@@ -305,19 +318,36 @@ def _check_same_settings(there: dict[str, Any], wanted: dict[str, Any], folder: 
             )
 
 
-def remove_partial_files(folder: pathlib.Path) -> None:
-    """Remove files that a killed run left unfinished."""
-    for part in folder.glob("**/.*.part"):
-        part.unlink(missing_ok=True)
+def _check_no_more_images(folder: pathlib.Path, images: int) -> None:
+    """Lists of fewer images than the folders hold would let readers of lists and of folders see two data sets."""
+    records = (path.stem for path in (folder / "records").glob("*.json"))
+    there = 1 + max((int(stem) for stem in records if stem.isdigit()), default=-1)
+    if images < there:
+        raise DatasetError(
+            f"{folder} holds image {there - 1:06d}, more than {images} images have; give --images {there} or more, or "
+            "another folder"
+        )
 
 
 def missing_images(folder: pathlib.Path, images: int) -> list[int]:
-    """Which of the first images are not there yet."""
-    return [n for n in range(images) if not _record_path(folder, n).exists()]
+    """Which of the first images are not there yet, or not there any more as they were written."""
+    return [n for n in range(images) if not _is_whole(folder, n)]
+
+
+def _is_whole(folder: pathlib.Path, image: int) -> bool:
+    """Whether the record of an image is there, and each of its files has the size that the record says."""
+    expected = {_file_of(kind, image) for kind in _FOLDERS if kind != "records"}
+    try:
+        record = msgspec.json.decode((folder / _file_of("records", image)).read_bytes(), type=_RecordedFiles)
+        return record.files.keys() == expected and all(
+            (folder / name).stat().st_size == size for name, size in record.files.items()
+        )
+    except (OSError, msgspec.DecodeError):
+        return False
 
 
 def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]) -> Iterator[int]:
-    """Draw images, in order; yields the number of each when it is done."""
+    """Draw images, in order; yields the number of each when it is done. :class:`WriteError` if one is not written."""
     number, vineyard = -1, None
     for image in images:
         if vineyard is None or image // IMAGES_PER_VINEYARD != number:
@@ -326,30 +356,36 @@ def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]
         try:
             vineyard.write_image(image, folder)
         except OSError as bad:
-            raise DatasetError(
-                f"image {image} cannot be written into {folder}: {bad.strerror or bad}; "
-                "make room there, and the same command goes on"
-            ) from None
+            raise _not_written(f"image {image}", folder, bad) from None
         yield image
 
 
 def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
-    """Gather the records of the first images into ``annotations.json`` (COCO), and write ``data.yaml`` (YOLO)."""
+    """Gather the records of the first images into ``annotations.json`` (COCO); write ``data.yaml`` (YOLO), its lists.
+
+    Returns the path of the annotations; :class:`WriteError` if one of these files is not written, then none is.
+    """
 
     def read() -> Iterator[dict[str, Any]]:
         for number in range(images):
-            yield json.loads(_record_path(folder, number).read_text(encoding="utf-8"))
+            yield json.loads((folder / _file_of("records", number)).read_text(encoding="utf-8"))
 
+    target = folder / "annotations.json"
+    # Without `path`, Ultralytics takes the folder of data.yaml; any relative `path` would be one from where it runs.
+    yaml = "".join(f"{split}: {split}.txt\n" for split in SPLITS) + "names:\n  0: bunch\n"
+    files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, formats.coco_json(read))}
+    for split in SPLITS:  # `./` is relative to the list
+        names = [f"./{_file_of('images', n)}\n" for n in range(images) if split_of(n) == split]
+        files[folder / f"{split}.txt"] = map(str.encode, names)
+    files[folder / "data.yaml"] = [yaml.encode()]
     try:
-        with _atomic_file(folder / "data.yaml") as part:
-            part.write_text("path: .\ntrain: images\nval: images\nnames:\n  0: bunch\n")
-        target = folder / "annotations.json"
-        with _atomic_file(target) as part, part.open("w", encoding="utf-8") as file:
-            for piece in formats.coco_json(read):
-                file.write(piece)
+        write_files(files)
     except OSError as bad:
-        raise DatasetError(
-            f"annotations.json cannot be written into {folder}: {bad.strerror or bad}; "
-            "make room there, and the same command goes on"
-        ) from None
+        raise _not_written("annotations.json and the lists", folder, bad) from None
     return target
+
+
+def _not_written(what: str, folder: pathlib.Path, bad: OSError) -> WriteError:
+    return WriteError(
+        f"{what} cannot be written into {folder}: {bad.strerror or bad}; make room there, and the same command goes on"
+    )

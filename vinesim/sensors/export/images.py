@@ -14,6 +14,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN
+from vinesim.sensors.export.files import write_files
 from vinesim.sensors.scene.primitives import Primitives
 
 
@@ -69,16 +70,21 @@ def label_colours(labels: np.ndarray) -> np.ndarray:
     return colours.astype(np.uint8)
 
 
-def write_png(path: str | pathlib.Path, image: np.ndarray) -> pathlib.Path:
-    """Write RGB uint8 or grey uint16; :class:`OSError` names a path that cannot be written."""
-    path = pathlib.Path(path)
+def encode_png(image: np.ndarray) -> bytes:
+    """RGB uint8 or grey uint16 as a PNG file; :class:`ValueError` for anything else."""
     data = image[..., ::-1] if image.ndim == 3 else image
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(data))
     if not done:
         raise ValueError(
             f"an image of shape {image.shape}, {image.dtype}, cannot be a PNG; give uint8 RGB or uint16 grey"
         )
-    path.write_bytes(encoded.tobytes())
+    return encoded.tobytes()
+
+
+def write_png(path: str | pathlib.Path, image: np.ndarray) -> pathlib.Path:
+    """Write RGB uint8 or grey uint16; :class:`OSError` if the path cannot be written, with nothing half-written."""
+    path = pathlib.Path(path)
+    write_files({path: [encode_png(image)]})
     return path
 
 

@@ -1,0 +1,45 @@
+"""Faults of a client so far: what was stopped, left out or refused, so that nothing goes wrong in silence."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+
+from vinesim.client.client import Client
+
+log = logging.getLogger(__name__)
+
+DESCRIPTIONS = {
+    "trees_stopped": "trees moved too fast, or by a number that is not finite, and were put to rest",
+    "robots_stopped": "robots or boxes moved by a number that is not finite and were put back",
+    "contacts_dropped": "contacts were left out, as there were more than there is room for",
+    "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",
+    "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",
+    "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
+    "deadlines_dropped": "steps were skipped after the process had stood still",
+}
+"""What each fault is, for a person."""
+
+
+def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
+    """How often each fault of :data:`DESCRIPTIONS` occurred; faults that did not are left out."""
+    counters = [replicator.counters for replicator in client.replicators.values()]
+    counts = client.physics.faults | {
+        "messages_refused": sum(one.malformed for one in counters),
+        "wrenches_refused": sum(one.wrenches_refused for one in counters),
+        "deadlines_dropped": deadlines_dropped,
+    }
+    return {name: count for name, count in counts.items() if count}
+
+
+class FaultLog:
+    """Logs the first fault of each kind; later ones are only counted."""
+
+    def __init__(self) -> None:
+        self._known: set[str] = set()
+
+    def update(self, counts: Mapping[str, int]) -> None:
+        """Log what is new in ``counts``. Call it outside the step."""
+        for name in counts.keys() - self._known:
+            self._known.add(name)
+            log.warning("%d %s (further ones are only counted: %s)", counts[name], DESCRIPTIONS[name], name)
