@@ -163,6 +163,7 @@ def test_a_gripper_with_a_mimic_finger_opens_as_far_as_asked(
     yard.run(1.0)
     left, right = (yard.rigid.link_pose("anna", name)[1] for name in ("left", "right"))
     assert left - right == pytest.approx(0.05, abs=1e-4)
+    assert yard.robot.gripper_opening("gripper_left") == pytest.approx(left - right, abs=1e-4)
 
 
 # ---------------------------------------------------------------------- the robots of example-robot-data
