@@ -266,11 +266,9 @@ class TreeBuilder:
         """
         parent = checked_index("body", parent, len(self.bodies))
         variety = checked_index("variety", variety, len(berries.VARIETIES))
-        if not 0.0 < mass < np.inf or not 1 <= count <= berries.PROTOTYPE_BERRIES[-1]:
-            raise ValueError(
-                f"bunch of {mass} kg and {count} berries; give a finite mass above 0 and 1 to {berries.PROTOTYPE_BERRIES[-1]} "
-                "berries"
-            )
+        most = berries.PROTOTYPE_BERRIES[-1]
+        if not 0.0 < mass < np.inf or not 1 <= count <= most:
+            raise ValueError(f"bunch of {mass} kg, {count} berries; give a finite mass above 0 and 1 to {most} berries")
         parameters = plant_parameters.load_plant("vine") if parameters is None else parameters
         above = self.bodies[parent]
         berry = berries.VARIETIES[variety]
