@@ -300,6 +300,8 @@ def test_a_picked_bunch_is_a_detachment():
         (lambda s: s.tip(1), "tree 1 does not exist; give 0 to 0"),
         (lambda s: s.body_pose(99), "body 99 does not exist; give 0 to 15"),
         (lambda s: s.pick(0), "bunch 0 does not exist"),
+        (lambda s: s.cut(2.7), "body 2.7 does not exist; give 0 to 15, a whole number"),
+        (lambda s: s.wake("left"), "tree left does not exist"),
         (lambda s: s.apply_wrench(0, (1.0, 2.0)), r"force is \(1.0, 2.0\); give three finite numbers \[N\]"),
         (lambda s: s.add_robot("vinebot", (1.0, 2.0)), r"pose is \[1.0, 2.0\]; give \(x, y, yaw\)"),
         (lambda s: vinesim.Lidar().scan(s), "no place, or two; give either a pose"),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import operator
+from typing import SupportsIndex
+
 
 class UsageError(ValueError):
     """A command or an API was called with arguments that contradict each other or are out of range.
@@ -17,3 +20,15 @@ class WriteError(RuntimeError):
     """
 
     exit_code = 5
+
+
+def checked_index(what: str, index: SupportsIndex, count: int, error: type[ValueError] = ValueError) -> int:
+    """``index`` as an int; ``error`` naming ``what`` unless it is a whole number from 0 to ``count`` - 1."""
+    try:
+        number = operator.index(index)
+    except TypeError:
+        number = -1
+    if not 0 <= number < count:
+        remedy = f"give 0 to {count - 1}, a whole number" if count else "there is none"
+        raise error(f"{what} {index} does not exist; {remedy}")
+    return number

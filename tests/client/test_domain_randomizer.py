@@ -6,6 +6,7 @@ import numpy as np
 
 from tests.support import sensor_scenes
 from vinesim.client.composition.domain_randomizer import FOOTPRINT_RADIUS, SceneRandomizer, random_composition
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
 
@@ -49,6 +50,17 @@ def test_wind_moves_the_plants() -> None:
         moved["wind" in record].append(np.linalg.norm(snapshot.body_q[:, :3] - rest, axis=1)[hanging].max())
     assert max(moved[False]) < 0.02
     assert max(moved[True]) > 0.02
+
+
+def test_the_parameters_of_the_scene_are_used() -> None:
+    """The same number of steps of wind lasts twice as long with steps twice as long."""
+    model, seconds = sensor_scenes.demo(), []
+    for dt in (0.01, 0.02):
+        source = SceneRandomizer(1.0, PhysicsParameters(dt=dt))
+        records = [source.snapshot(model, np.random.default_rng(seed)) for seed in (1, 2)]
+        seconds.append([record[2]["wind"]["seconds"] for record in records if record and "wind" in record[2]])
+    assert seconds[0]
+    assert seconds[1] == [2.0 * duration for duration in seconds[0]]
 
 
 def test_other_images_are_not_randomised() -> None:

@@ -17,6 +17,7 @@ from vinesim.client.composition.scene_composer import (
     SceneComposer,
     bunch_masses,
 )
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene.ids import Organ, label
 
@@ -56,6 +57,17 @@ def test_two_compositions_are_equal(filled: Physics) -> None:
     composer = SceneComposer(crates=(CRATE,))
     physics = Physics(composer.with_crates(sensor_scenes.demo()))
     assert np.array_equal(composer.populate(physics).visual_q, filled.snapshot().visual_q)
+
+
+def test_the_parameters_of_the_scene_are_used() -> None:
+    """Without weight no bunch falls into the crate: the heap stays at the height from which bunches are dropped."""
+    model, heights = sensor_scenes.demo(), []
+    composer = SceneComposer(crates=(CratePlacement(1.3, 1.25, 0.4, 0.05),))
+    for gravity in (9.81, 0.0):
+        snapshot = composer.compose(model, PhysicsParameters(gravity=gravity))
+        heap = [visual.name.startswith("bunch/") for visual in snapshot.visuals]
+        heights.append(snapshot.visual_q[heap, 2].mean())
+    assert heights[0] < heights[1] - 0.005
 
 
 def test_crates_are_appended_and_change_no_plant() -> None:

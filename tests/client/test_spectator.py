@@ -146,7 +146,15 @@ def robot_recording(tmp_path_factory) -> pathlib.Path:
 
 
 def options(file: pathlib.Path, out: pathlib.Path, **changes) -> dict:
-    defaults = {"connect": None, "listen": None, "world": "vineyard", "speed": 1.0, "start": 0.0, "end": None}
+    defaults = {
+        "connect": None,
+        "listen": None,
+        "insecure": False,
+        "world": "vineyard",
+        "speed": 1.0,
+        "start": 0.0,
+        "end": None,
+    }
     return defaults | {"file": file, "out": out, "pose": None, "scene": None, "seed": None} | changes
 
 

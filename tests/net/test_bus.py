@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, KEEP_LAST_64, NameTaken, SampleStore, matches
+from vinesim.net.transport.bus import (
+    KEEP_ALL,
+    KEEP_LAST_1,
+    KEEP_LAST_64,
+    MAX_STORED_BYTES,
+    NameTaken,
+    SampleStore,
+    matches,
+)
 from vinesim.net.transport.memory_bus import MemoryHub
 
 
@@ -33,8 +41,8 @@ def test_patterns(pattern, key, covers):
 def test_a_sample_store_keeps_the_newest_of_each_key_in_order(samples):
     store = SampleStore()
     for number, ((key, depth), _) in enumerate(samples):
-        store.put(depth, key, number)
-    taken = store.take()
+        store.put(depth, key, b"%d" % number)
+    taken = [(key, int(payload)) for key, payload in store.take()]
     assert [number for _, number in taken] == sorted(number for _, number in taken)
     for wanted, depth in (("a", KEEP_LAST_1), ("b", 3), ("e", KEEP_ALL)):
         numbers = [n for n, ((key, _), _) in enumerate(samples) if key == wanted]
@@ -45,9 +53,20 @@ def test_a_sample_store_keeps_the_newest_of_each_key_in_order(samples):
 def test_samples_beyond_the_depth_are_dropped_and_counted():
     store = SampleStore()
     for number in range(KEEP_ALL + 5):
-        store.put(KEEP_ALL, "e", number)
+        store.put(KEEP_ALL, "e", b"%d" % number)
     assert len(store.take()) == KEEP_ALL
     assert store.overflowed == 5
+
+
+def test_the_bytes_that_wait_to_be_polled_are_bounded():
+    store, payload = SampleStore(), bytes(1 << 20)
+    for _ in range(100):
+        store.put(KEEP_ALL, "e", payload)
+    kept = len(store.take())
+    assert kept * len(payload) == MAX_STORED_BYTES
+    assert kept + store.overflowed == 100
+    store.put(KEEP_ALL, "e", payload)
+    assert len(store.take()) == 1
 
 
 def test_without_a_subscriber_nothing_is_sent_or_counted():

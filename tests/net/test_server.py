@@ -74,6 +74,21 @@ def test_a_clock_query_returns_the_time_of_day():
         assert (server.pings, server.malformed) == (1, 1)
 
 
+@pytest.mark.parametrize("step", [-3600.0, 3600.0])
+def test_a_step_of_the_time_of_day_does_not_move_the_network_time(monkeypatch, step):
+    def server_minus_own_time(bus: ZenohBus) -> float:
+        asked = time.monotonic()
+        bus.query("clock", messages.encode_time(asked))
+        answers: list = []
+        wait(lambda: answers.extend(bus.replies()) or answers, "the time")
+        return messages.decode_time(answers[0].payload)[1] - asked
+
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        before, time_of_day = server_minus_own_time(ada), time.time
+        monkeypatch.setattr(time, "time", lambda: time_of_day() + step)
+        assert abs(server_minus_own_time(ada) - before) < 60.0
+
+
 def test_run_returns_when_stopped():
     with Server("tcp/127.0.0.1:0") as server:
         thread = threading.Thread(target=server.run)

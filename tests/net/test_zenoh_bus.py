@@ -20,12 +20,12 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.server.server import Server
-from vinesim.net.transport import zenoh_bus
+from vinesim.net.transport import zenoh_bus, zenoh_entities
 from vinesim.net.transport.bus import KEEP_ALL, NameTaken
 from vinesim.net.transport.certificates import create
 from vinesim.net.transport.endpoints import resolve_ports
 from vinesim.net.transport.zenoh_bus import ZenohBus
-from vinesim.net.transport.zenoh_session import ServerUnreachable
+from vinesim.net.transport.zenoh_session import ServerUnreachable, close_session
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate
@@ -450,6 +450,91 @@ def test_poses_move_to_the_stream_when_datagrams_stop(caplog, monkeypatch):
             assert ada.status_message == ""
             assert [link.partition(" ")[2] for link in ada.links] == ["reliable"]
             assert len([line for line in caplog.messages if "no datagrams pass" in line and "any more" in line]) == 1
+
+
+def test_poses_return_to_datagrams_when_they_pass_again(monkeypatch):
+    monkeypatch.setattr(zenoh_bus, "SILENCE_TIMEOUT", 0.5)
+    monkeypatch.setattr(zenoh_bus, "DATAGRAM_RETRY_PERIOD", 0.5)
+    with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, CountingRelay(server.endpoint) as relay:
+        port = int(relay.endpoint.rpartition(":")[2])
+        datagrams = DatagramRelay(port, server.endpoints[1].port)
+        with ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+            there, back = PoseAndEvent(ada, bob), PoseAndEvent(bob, ada)
+            wait(lambda: there() and back(), "poses each way")
+            datagrams.close()
+            wait(lambda: len(ada.links) == 1, "ada to give up datagrams")
+            datagrams = DatagramRelay(port, server.endpoints[1].port)
+            wait(lambda: len(ada.links) == 3, "ada to return to datagrams")
+            there.reset()
+            back.reset()
+            wait(lambda: there() and back(), "poses each way again")
+            up = relay.up
+            pose = ada.publisher("a/ada")
+            bob.subscribe("a/ada", KEEP_ALL)
+            wait(lambda: pose.matching, "bob's subscription")
+            before = bob.bytes_in
+            wait(
+                lambda: (pose.put(bytes(1000)) and time.sleep(0.001)) or bob.bytes_in - before >= 50_000, "fifty poses"
+            )
+            assert relay.up - up < 10_000, "poses took the stream"
+            assert ada.status_message == ""
+        datagrams.close()
+
+
+def test_a_session_that_closes_under_the_real_time_loop_raises_nothing(server):
+    """Puts, matching, new publishers, subscriptions and queries on a closed session are counted."""
+    with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+        bob.subscribe("own/0/0/ada", KEEP_ALL)
+        event, pose = ada.publisher("own/0/0/ada", reliable=True), ada.publisher("a/ada")
+        wait(lambda: event.matching, "bob's subscription")
+        close_session(ada.session_for(reliable=True))
+        for publisher in (event, pose, ada.publisher("a/ada/far"), ada.publisher("own/0/1/ada", reliable=True)):
+            assert not publisher.matching
+            assert not publisher.put(b"lost")
+        ada.subscribe("a/bob").close()
+        ada.query("clock")
+        ada.poll()
+        wait(lambda: ada.failures >= 4, "the failures to be counted")
+
+
+def test_a_put_that_fails_is_counted_and_the_publisher_is_declared_again(server, monkeypatch):
+    with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+        bob.subscribe("a/ada", KEEP_ALL)
+        pose = ada.publisher("a/ada")
+        wait(lambda: pose.matching, "bob's subscription")
+        monkeypatch.setattr(zenoh_entities, "has_match", lambda _: True)
+        pose._publisher.undeclare()
+        assert not pose.put(b"lost")
+        assert ada.failures == 1
+        wait(lambda: pose.put(b"sent") and bob.poll(), "the publisher to work again")
+
+
+def test_reliable_puts_that_wait_are_bounded(server, monkeypatch):
+    """A router that takes nothing blocks the bus's thread: puts are refused, counted, and accepted again later."""
+    monkeypatch.setattr(zenoh_bus, "MAX_PENDING_PUTS", 5)
+    with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+        bob.subscribe("own/0/0/ada", KEEP_ALL)
+        event = ada.publisher("own/0/0/ada", reliable=True)
+        wait(lambda: event.matching, "bob's subscription")
+        stalled = threading.Event()
+        ada.submit(stalled.wait)
+        assert [event.put(b"event") for _ in range(8)] == [True] * 5 + [False] * 3
+        assert (ada.failures, ada.bytes_out) == (3, 25)
+        stalled.set()
+        received: list = []
+        wait(lambda: received.extend(bob.poll()) or len(received) == 5, "what was accepted")
+        assert event.put(b"event")
+        monkeypatch.setattr(zenoh_bus, "MAX_PENDING_BYTES", 100)
+        assert not event.put(bytes(101))
+
+
+def test_an_error_in_the_thread_of_the_bus_does_not_end_it(server):
+    with ZenohBus("ada", connect=server.endpoint) as ada:
+        ada.submit(lambda: 1 // 0)
+        done = threading.Event()
+        ada.submit(done.set)
+        assert done.wait(TIMEOUT)
+        assert ada.failures == 1
 
 
 JOIN = """

@@ -164,7 +164,7 @@ def test_a_commanded_detachment_reports_the_weight_on_the_peduncle():
     np.testing.assert_allclose(detachment.force, [0.0, 0.0, 0.5 * 9.81], atol=1e-4)
     physics.step()
     assert physics.detachments == ()
-    with pytest.raises(ValueError, match="no bunch 7"):
+    with pytest.raises(ValueError, match="bunch 7 does not exist"):
         physics.pick(7)
 
 

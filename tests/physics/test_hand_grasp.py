@@ -25,11 +25,13 @@ SIGNS = {"left": 1.0, "right": -1.0}
 SOFT = (Drive("along", 400.0, 60.0, 1000.0, 5.0, -5.0, 5.0), Drive("press", 5000.0, 300.0, 1000.0, 5.0, -1.0, 1.0))
 
 
-def human_at_bunch(mass: float = 0.5, pull: float = 1e3) -> tuple[Physics, HumanSpec, int, np.ndarray]:
+def human_at_bunch(
+    mass: float = 0.5, pull: float = 1e3, parameters: PhysicsParameters = PhysicsParameters()
+) -> tuple[Physics, HumanSpec, int, np.ndarray]:
     """A human before a hanging bunch, the right palm 3 cm away; returns also the bunch's body and centre."""
     model, body, middle = bunch_scene(mass)
     model.bunch_pull[0], model.bunch_bend[0] = pull, 1e3
-    physics = Physics(model)
+    physics = Physics(model, parameters=parameters)
     spec = eva(middle[0], middle[1] - 0.6, 0.5 * np.pi)
     at = frames.pose(middle - np.array([0.0, 0.075 + HAND_HALF_THICKNESS, 0.0]), FORWARD)
     spec = dataclasses.replace(spec, pose=put(spec.pose, at))

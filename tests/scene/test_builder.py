@@ -121,6 +121,16 @@ def test_invalid_trees_are_refused_with_the_reason():
         builder.TreeBuilder(POSE).add_rod(-1, -1.0, (0.01, 0.01), CANE, 3)
     with pytest.raises(ValueError, match="names parent 3"):
         builder.TreeBuilder(POSE).add_body(3)
+    for fields, finding in (
+        ({"radius": (0.01, -0.01)}, r"radius is \(0.01, -0.01\); give numbers of 0 or more"),
+        ({"mass": 0.0}, "mass is 0.0; give numbers above 0"),
+        ({"inertia": (1e-4, float("nan"), 1e-4)}, "inertia is .*; give finite numbers"),
+        ({"stiffness": -1.0}, "stiffness is -1.0; give numbers of 0 or more"),
+    ):
+        with pytest.raises(ValueError, match=f"body 0: {finding}"):
+            builder.TreeBuilder(POSE).add_body(-1, **fields)
+    with pytest.raises(ValueError, match=r"body 0 has no field 'lenght'; it has: .*length"):
+        builder.TreeBuilder(POSE).add_body(-1, lenght=0.1)
     without_springs = builder.TreeBuilder(POSE)
     without_springs.add_body(-1, mass=1.0)
     with pytest.raises(ValueError, match="body 0 has joint stiffness"):

@@ -23,7 +23,7 @@ FIELDS = [field.name for field in msgspec.structs.fields(PhysicsParameters)]
 def test_every_parameter_has_a_unit_and_a_source(name):
     text = inspect.getsource(physics_parameters)
     ((annotation, description),) = re.findall(rf'^    {name}: (.*) = .*\n    """((?:.|\n)*?)"""', text, re.MULTILINE)
-    if annotation.startswith("Count") or "int" in annotation or annotation == "bool":
+    if annotation.startswith(("Count", "Capacity")) or "int" in annotation or annotation == "bool":
         return
     assert re.match(r"\[[^]]+\] ", description), f"{name}: give its unit first"
     assert re.search(r"\b(READ|DERIVED|TUNED|GUESSED)\b", description), f"{name}: give its source"

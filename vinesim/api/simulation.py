@@ -18,7 +18,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.api.energy import Energy, Momentum, energy, momentum
-from vinesim.errors import UsageError
+from vinesim.errors import UsageError, checked_index
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
@@ -167,7 +167,7 @@ class Simulation:
 
     def body_pose(self, body: int) -> np.ndarray:
         """Pose [7] (m, quaternion xyzw) of a plant's body in the world at the current time."""
-        self._check_body(body)
+        body = self._body(body)
         return self.state.body_q[body].astype(float)
 
     def tip(self, tree: int = 0) -> np.ndarray:
@@ -213,7 +213,7 @@ class Simulation:
             torque: [3] N m, world axes.
             at: [3] m in the world, the point where the force acts; the body's centre of mass unless given.
         """
-        self._check_body(body)
+        body = self._body(body)
         force, torque = _vector("force", force, "N"), _vector("torque", torque, "N m")
         pose = self.body_pose(body)
         point = pose[:3] + frames.rotate(pose[3:], self.physics.plants.body_com[body].astype(float))
@@ -227,14 +227,12 @@ class Simulation:
     def cut(self, body: int) -> None:
         """Cut a cane at the base of a body: what grows on it falls. The cut is the body's joint, not within a
         segment."""
-        self._check_body(body)
+        body = self._body(body)
         self.physics.cut(body)
 
     def pick(self, bunch: int) -> None:
         """Detach a bunch from its vine: it falls."""
-        if not 0 <= bunch < len(self.model.bunch_body):
-            raise UsageError(f"bunch {bunch} does not exist; give 0 to {len(self.model.bunch_body) - 1}")
-        self.physics.pick(bunch)
+        self.physics.pick(checked_index("bunch", bunch, len(self.model.bunch_body), UsageError))
 
     def add_robot(
         self,
@@ -286,16 +284,13 @@ class Simulation:
         plants.put_to_sleep(asleep[fastest[asleep] <= EQUILIBRIUM_RATE * self.parameters.sleep_rate])
 
     def _tree(self, tree: int) -> int:
-        if not 0 <= tree < len(self.model.tree_first):
-            raise UsageError(f"tree {tree} does not exist; give 0 to {len(self.model.tree_first) - 1}")
-        return tree
+        return checked_index("tree", tree, len(self.model.tree_first), UsageError)
 
     def _one(self, tree: int | None) -> np.ndarray | None:
         return None if tree is None else np.array([self._tree(tree)])
 
-    def _check_body(self, body: int) -> None:
-        if not 0 <= body < len(self.model.body_mass):
-            raise UsageError(f"body {body} does not exist; give 0 to {len(self.model.body_mass) - 1}")
+    def _body(self, body: int) -> int:
+        return checked_index("body", body, len(self.model.body_mass), UsageError)
 
 
 def base_pose(pose: Sequence[float] | np.ndarray) -> np.ndarray:

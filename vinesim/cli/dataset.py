@@ -48,9 +48,10 @@ def run(
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     find_device(device)
-    randomizer = SceneRandomizer(actors) if actors > 0.0 else None
+    loaded = load_scene(scene)
+    randomizer = SceneRandomizer(actors, loaded.physics) if actors > 0.0 else None
     plan = DatasetPlan(
-        load_scene(scene),
+        loaded,
         seed,
         camera,
         None if size is None else parse_size(size),

@@ -89,7 +89,7 @@ def run(
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
     compile_kernels(SENSOR_PACKAGES, device)
     model = generate(plan)
-    view = staged.compose(model)
+    view = staged.compose(model, plan.physics)
     primitives = Primitives(model, renderer=renderer, device=device)
     primitives.update(view)
     for viewpoint in viewpoints:

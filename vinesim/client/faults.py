@@ -13,6 +13,7 @@ DESCRIPTIONS = {
     "trees_stopped": "trees moved too fast, or by a number that is not finite, and were put to rest",
     "robots_stopped": "robots or boxes moved by a number that is not finite and were put back",
     "contacts_dropped": "contacts were left out, as there were more than there is room for",
+    "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",
     "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",
     "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
     "deadlines_dropped": "steps were skipped after the process had stood still",

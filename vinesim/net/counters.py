@@ -52,6 +52,11 @@ class Counters:
     wrenches_limited: int = 0
     """Messages and steps whose wrenches were reduced to what hands can do."""
 
+    lost: int = 0
+    """Received samples that the bus discarded: its store was full, or the sample too large."""
+    network_failures: int = 0
+    """Puts, declarations and queries of the bus that the network refused."""
+
     def to_report(self) -> dict[str, Any]:
         """All counters under the keys of ``report.json``, where retained records are called ``fact``."""
         return {"fact" if name == "retained" else name: value for name, value in dataclasses.asdict(self).items()}

@@ -18,6 +18,7 @@ from vinesim.physics.plants.detachment import Blade, DetachmentMonitor
 from vinesim.physics.plants.fault_guard import FaultGuard
 from vinesim.physics.plants.level_of_detail import LevelOfDetail
 from vinesim.physics.plants.sleep import SleepMonitor
+from vinesim.physics.plants.validation import warn_of_raised_damping
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.dormant_bunches import DormantBunches
 from vinesim.physics.rigid.hand_grasp import GraspManager
@@ -60,9 +61,10 @@ class Physics:
         detachment: whether bunches detach when they are pulled too hard.
         """
         p = parameters
-        self.model, self.parameters, self.dt = model, p, p.dt
+        self.model, self.parameters = model, p
         self.state = State.at_rest(model)
         self.plants = ArticulationSolver(model, self.state, p, device=device, threads=threads)
+        warn_of_raised_damping(model, p.dt, p.phi)
         self.rigid = RigidWorld(model, parameters=p)
         self.contact_solver = ContactSolver(model, self.plants, self.rigid)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
@@ -117,6 +119,7 @@ class Physics:
             "trees_stopped": int(self.fault_guard.count.sum()),
             "robots_stopped": self.rigid.faults,
             "contacts_dropped": self.contact_solver.dropped_contacts,
+            "grasps_refused": self.grasp_manager.refused_grasps,
         }
 
     # ------------------------------------------------------------------ stages that pass values between parts
@@ -155,6 +158,11 @@ class Physics:
     # ------------------------------------------------------------------ results of a step
 
     @property
+    def dt(self) -> float:
+        """[s] Duration of a step; fixed, see :class:`PhysicsParameters`."""
+        return self.parameters.dt
+
+    @property
     def time(self) -> float:
         """[s] since the start."""
         return self.tick * self.dt
@@ -179,7 +187,10 @@ class Physics:
             self._kinematics_current = True
 
     def wake(self, trees: np.ndarray) -> None:
-        """Wake trees [k] whose joints were written from outside, between steps, and bring their poses up to date."""
+        """Wake trees [k] whose joints were written from outside, between steps, and bring their poses up to date.
+
+        :class:`ValueError` if there is no such tree.
+        """
         self.sleep_monitor.wake(trees)
         self.plants.forward_kinematics(trees)
         self._body_q = None

@@ -142,10 +142,12 @@ class TreeBuilder:
         """Append one body with explicit :class:`Model` fields (names without prefix) and return its number.
 
         ``offset`` [3] m and ``rest`` [4] place its joint in the frame of ``parent`` (-1: the world's root frame).
-        :class:`ValueError` if the parent is not in the list yet.
+        :class:`ValueError` if the parent is not in the list yet, for a field that bodies do not have, or for a number
+        that no body can have.
         """
         if not -1 <= parent < len(self.bodies):
             raise ValueError(f"body {len(self.bodies)} names parent {parent}, which does not stand before it")
+        _check_fields(len(self.bodies), {"offset": offset, "rest": rest, **fields})
         self.bodies.append(
             {"parent": parent, "offset": np.asarray(offset, float), "rest": np.asarray(rest, float), **fields}
         )
@@ -181,7 +183,7 @@ class TreeBuilder:
             rest: [4] rotation of the first segment against the parent.
             bends: [segments, 4] rotation of each segment against the one before; straight unless given.
         """
-        if length <= 0.0 or min(radius) <= 0.0 or segments < 1 or material.modulus <= 0.0 or material.density <= 0.0:
+        if not (min(length, *radius, material.modulus, material.density) > 0.0 and segments >= 1):
             raise ValueError(
                 f"rod of length {length} m, radius {radius} m, {segments} segments, {material}: all must be positive"
             )
@@ -301,6 +303,25 @@ class TreeBuilder:
             [*self.bodies, *self.clusters], model.body_rest, model.joint_settled, strict=True
         ):
             body["rest"], body["settled"] = rest.astype(float), settled.astype(float)
+
+
+_POSITIVE = ("mass", "inertia", "length")
+_NOT_NEGATIVE = ("radius", "stiffness", "damping", "drag", "far", "beta")
+_FIELDS = {"offset", "rest", "organ", "com", "settled", *_POSITIVE, *_NOT_NEGATIVE}
+
+
+def _check_fields(body: int, fields: dict[str, Any]) -> None:
+    """:class:`ValueError` naming the first field that a body does not have, or whose value it cannot have."""
+    for name, given in fields.items():
+        if name not in _FIELDS:
+            raise ValueError(f"body {body} has no field {name!r}; it has: {', '.join(sorted(_FIELDS))}")
+        value = np.asarray(given, float)
+        if not np.isfinite(value).all():
+            raise ValueError(f"body {body}: {name} is {given}; give finite numbers")
+        if name in _POSITIVE and not (value > 0.0).all():
+            raise ValueError(f"body {body}: {name} is {given}; give numbers above 0")
+        if name in _NOT_NEGATIVE and not (value >= 0.0).all():
+            raise ValueError(f"body {body}: {name} is {given}; give numbers of 0 or more")
 
 
 def segment_properties(

@@ -164,8 +164,17 @@ class Model(StructOfArrays):
         return owner
 
     def depth(self) -> np.ndarray:
-        """Number of bodies between each body and its root [body]."""
+        """Number of bodies between each body and its root [body].
+
+        :class:`ValueError` if a parent does not stand before its child: parents in a cycle have no root.
+        """
         depth = np.zeros(len(self.body_mass), np.int32)
+        if (late := self.body_parent >= np.arange(len(depth))).any():
+            body = int(np.argmax(late))
+            raise ValueError(
+                f"body {body} of tree {self.body_tree[body]}: parent {self.body_parent[body]}; a parent stands before "
+                "its children (no cycles); reorder"
+            )
         above = self.body_parent.copy()
         while (above >= 0).any():
             depth += above >= 0

@@ -18,6 +18,8 @@ Positive = Annotated[float, msgspec.Meta(gt=0.0)]
 NotNegative = Annotated[float, msgspec.Meta(ge=0.0)]
 Fraction = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
+Capacity = Annotated[int, msgspec.Meta(ge=1, le=1024)]
+"""Places for which memory is set aside at the start; that of contacts grows with the square, to 1 GB."""
 
 
 class ParameterError(ValueError):
@@ -52,9 +54,9 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     stiff_tie_mass: Positive = 10.0
     """[kg] A tree whose tie has a larger stiffness * dt^2 is integrated with phi = 1. TUNED: with phi below 1 such a
     tie (1e5 N/m at 10 ms) rings and feeds energy into the cane."""
-    max_held_bodies: Count = 16
+    max_held_bodies: Capacity = 16
     """Plant bodies that hands can hold at once."""
-    max_hands_per_body: Count = 4
+    max_hands_per_body: Capacity = 4
     """Hands that can hold one plant body at once."""
 
     # ------------------------------------------------------------------ sleep of plants
@@ -97,11 +99,11 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[m/s] A contact that closes faster is an impact: its tree is integrated with phi = 1. TUNED."""
     max_separation_speed: Positive = 1.0
     """[m/s] Overlap is resolved at this speed at most. TUNED."""
-    contact_capacity: Count = 128
+    contact_capacity: Capacity = 128
     """Contacts solved in one step; of more, the deepest are kept."""
-    max_contacts_per_tree: Count = 64
+    max_contacts_per_tree: Capacity = 64
     """Contacts that one tree can have at once."""
-    max_static_geoms_per_tree: Count = 256
+    max_static_geoms_per_tree: Capacity = 256
     """Static geoms that can be near one tree at once."""
     solver_sweeps: Count = 100
     """Largest number of Gauss-Seidel sweeps; with warm start and Newton steps, up to six are usual. TUNED."""
@@ -124,7 +126,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     bunch_contact_damping_ratio: Positive = 3.0
     """[1] Damping ratio of the same. TUNED: with 1, a bunch that fell a metre into a crate leaves it at up to 110
     m/s."""
-    bunch_pool_size: Count = 12
+    bunch_pool_size: Capacity = 12
     """Free bodies that are kept ready for bunches; when all are taken, the world is compiled anew (some 10 ms)."""
     dormant_radius: Positive = 2.5
     """[m] A dormant free bunch gets its body when an actor is this near on the ground plan. DERIVED: seconds before an

@@ -17,6 +17,7 @@ from vinesim.client.composition.scene_composer import (
     RobotPlacement,
     SceneComposer,
 )
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
 from vinesim.scene import appearance
@@ -46,6 +47,8 @@ class SceneRandomizer:
 
     share: float = 0.4
     """Share of the images with actors or wind."""
+    parameters: PhysicsParameters = dataclasses.field(default_factory=PhysicsParameters)
+    """Numbers of the physics, those of the models' scene."""
 
     def settings(self) -> dict[str, Any]:
         """All that decides the scenes, as JSON."""
@@ -59,7 +62,7 @@ class SceneRandomizer:
         middle = model.forward_kinematics(model.joint_settled)[model.bunch_body[bunch], :2].astype(float)
         for _ in range(_MAX_TRIES):
             stage = random_composition(model, middle, rng)
-            physics = Physics(stage.with_crates(model))
+            physics = Physics(stage.with_crates(model), parameters=self.parameters)
             try:
                 stage.populate(physics)
             except PlacementError:

@@ -3,7 +3,7 @@
     composer = SceneComposer(
         robots=(RobotPlacement("vinebot", 1.5, 0.8),), crates=(CratePlacement(3.0, 0.5, fill=0.6),)
     )
-    snapshot = composer.compose(model)
+    snapshot = composer.compose(model, scene.physics)
 
 Bunches in a crate are picked from the nearest vines and fall in one after another, simulated by the rigid world.
 """
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description
@@ -91,14 +92,17 @@ class SceneComposer:
     crates: tuple[CratePlacement, ...] = ()
     """After those of the scene."""
 
-    def compose(self, model: Model) -> Snapshot:
-        """Snapshot of the vineyard with all of them at rest; :class:`PlacementError` if two would overlap."""
+    def compose(self, model: Model, parameters: PhysicsParameters = PhysicsParameters()) -> Snapshot:
+        """Snapshot of the vineyard with all of them at rest; :class:`PlacementError` if two would overlap.
+
+        ``parameters``: numbers of the physics, those of the model's scene.
+        """
         furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
             from vinesim.physics.step import Physics  # the kernels of plants: half a second that few pictures need
 
-            return self.populate(Physics(furnished))
-        rigid = RigidWorld(furnished)  # plants that nobody picks from need not be ready to move
+            return self.populate(Physics(furnished, parameters=parameters))
+        rigid = RigidWorld(furnished, parameters=parameters)  # plants that nobody picks from need not be ready to move
         self._add_actors(rigid)
         return rest_snapshot(model, rigid.visuals(), rigid.visual_q())
 

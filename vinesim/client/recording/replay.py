@@ -128,7 +128,7 @@ def _cell(key: str) -> tuple[int, int] | None:
 class ReplayBus:
     """A member of a recorded world; see :class:`vinesim.net.transport.bus.Bus`. What it publishes is discarded."""
 
-    bytes_out = 0
+    bytes_out = failures = 0
     status_message = ""
 
     def __init__(

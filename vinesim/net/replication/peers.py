@@ -165,6 +165,14 @@ class PeerRegistry:
         """Whether a live peer was found to have another scene or protocol version."""
         return name in self._rejected
 
+    def may_join(self, name: str) -> bool:
+        """Whether an actor is live and was not rejected."""
+        return name in self.bus.alive() and name not in self._rejected
+
+    def was_admitted(self, name: str) -> bool:
+        """Whether an actor was ever admitted, or belongs to the same client."""
+        return name in self.seen_names or name in self._local_actors
+
     def count_malformed(self, sender: str, error: MessageError) -> None:
         """Count an invalid message; log the first of each sender."""
         self.counters.malformed += 1

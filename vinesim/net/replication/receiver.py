@@ -8,17 +8,23 @@ import numpy as np
 
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
-from vinesim.net.codec.messages import Hello, MessageError, MessageKind, ObjectStates, RetainedRecord, TreeStates
+from vinesim.net.codec.messages import (
+    Hello,
+    MessageError,
+    MessageKind,
+    ObjectStates,
+    RetainedRecord,
+    TreeStates,
+    is_valid_name,
+)
 from vinesim.net.replication.authority import NOBODY, Claim
+from vinesim.net.replication.early_messages import EarlyMessages
 from vinesim.net.replication.hand_forces import MAX_POSE_AGE, LinkCentre
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.model_check import check_record, check_tree_states
 from vinesim.net.replication.replication_state import ReplicationState, put_counted
 from vinesim.net.transport.bus import Reply
 from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
-
-MAX_EARLY_MESSAGES = 100
-"""Messages with retained records that wait for the hello of their author, for each author."""
 
 
 def _no_link(_: str) -> None:
@@ -66,7 +72,7 @@ class Receiver:
 
     def __init__(self, state: ReplicationState) -> None:
         self._state = state
-        self._early: dict[str, list[tuple[str, bytes]]] = {}
+        self.early = EarlyMessages()
         """Messages with retained records whose author has not been admitted yet."""
 
     def receive(self, now: float, offset: float, link_centre: LinkCentre | None = None) -> Inbox:
@@ -85,9 +91,10 @@ class Receiver:
         inbox.joined, replies = peers.process_replies()
         for reply in replies:
             self._receive_snapshot(reply, step)
-        early = [message for hello in inbox.joined for message in self._early.pop(hello.name, ())]
+        early = [message for hello in inbox.joined for message in self.early.take(hello.name)]
         for key, payload in early + state.bus.poll():
             self._dispatch(key, payload, step)
+        state.counters.lost, state.counters.network_failures = state.bus.dropped, state.bus.failures
         state.ownership.expire(time)
         inbox.released = state.ownership.released()
         for object_id in inbox.released:
@@ -114,8 +121,9 @@ class Receiver:
         }  # fmt: skip
         traffic.get(family, counters.event).count_in(payload)
         peer = state.peers.known.get(sender)
-        if peer is None and not (family == "fact" and self._accepts_records_of(sender, key, payload)):
-            counters.dropped += sender not in state.peers.local_actors
+        if peer is None and not (family == "fact" and state.peers.was_admitted(sender)):
+            if sender not in state.peers.local_actors:
+                counters.dropped += self._keep_early(sender, key, payload) if family == "fact" else 1
             return
         try:
             if family == "a":
@@ -147,17 +155,13 @@ class Receiver:
         else:
             self._receive_trees(messages.decode_trees(payload, state.model.tree_size), sender, step)
 
-    def _accepts_records_of(self, sender: str, key: str, payload: bytes) -> bool:
-        """Whether records of an actor that is not here count: if it was admitted before.
-
-        Messages of an actor that may be admitted soon are stored until then, for records are published only once.
-        """
+    def _keep_early(self, sender: str, key: str, payload: bytes) -> int:
+        """Keep records of an actor that may be admitted soon until then, for they are published only once; the number
+        of messages that were discarded."""
         peers = self._state.peers
-        if sender in peers.local_actors or sender in peers.seen_names:
-            return True
-        if not peers.is_rejected(sender) and len(self._early.setdefault(sender, [])) < MAX_EARLY_MESSAGES:
-            self._early[sender].append((key, payload))
-        return False
+        if not is_valid_name(sender) or peers.is_rejected(sender):
+            return 1
+        return self.early.put(sender, key, payload, peers.may_join)
 
     def _receive_trees(self, trees: TreeStates, sender: str, step: _Step) -> None:
         """Accept or drop each state by its claim."""

@@ -91,6 +91,8 @@ class Server:
             self.endpoints = endpoints.resolve_ports(listen, secured=is_secured)
         except OSError as error:
             raise PortTaken(listen[0], str(error.strerror)) from error
+        self._clock_origin = time.time() - time.monotonic()
+        """Time of day [s] at the origin of the monotonic clock: a later step of the time of day moves no world."""
         self.pings = 0
         """Queries of the clock."""
         self._malformed = 0
@@ -212,7 +214,7 @@ class Server:
                 self._count_malformed(f"{_strip_root(query.key_expr)}", error)
                 return
             self.pings += 1
-            query.reply(str(query.key_expr), messages.encode_time(asked, time.time()))
+            query.reply(str(query.key_expr), messages.encode_time(asked, self._clock_origin + time.monotonic()))
 
     def _on_join_query(self, query: zenoh.Query) -> None:
         with query:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import collections
 import functools
+import threading
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
@@ -21,6 +22,9 @@ KEEP_LAST_64 = 64
 
 KEEP_ALL = 10_000
 """History depth that keeps all samples, in order: events. The number only bounds memory in a flood."""
+
+MAX_STORED_BYTES = 64 << 20
+"""Payload bytes that wait to be polled [B]."""
 
 
 class BusError(RuntimeError):
@@ -88,6 +92,9 @@ class Bus(Protocol):
         """Received samples that were discarded because the store was full or the sample too large."""
         ...
 
+    failures: int
+    """Puts, declarations and queries that the network refused; none of them raises."""
+
     @property
     def status_message(self) -> str:
         """Empty, or why the network is unreachable now."""
@@ -153,23 +160,23 @@ class SampleStore:
 
     def __init__(self) -> None:
         self._samples: collections.deque[tuple[int, str, bytes]] = collections.deque()
+        self._bytes = 0
+        self._lock = threading.Lock()
         self.overflowed = 0
 
     def put(self, depth: int, key: str, payload: bytes) -> None:
-        """Append a sample that was received with this history depth."""
-        self._samples.append((depth, key, payload))
-        if len(self._samples) > KEEP_ALL:
-            self._samples.popleft()
-            self.overflowed += 1
+        """Append a sample that was received with this history depth; the oldest ones make room for it."""
+        with self._lock:
+            self._samples.append((depth, key, payload))
+            self._bytes += len(payload)
+            while len(self._samples) > KEEP_ALL or (self._bytes > MAX_STORED_BYTES and len(self._samples) > 1):
+                self._bytes -= len(self._samples.popleft()[2])
+                self.overflowed += 1
 
     def take(self) -> list[tuple[str, bytes]]:
         """Remove and return all samples in order of arrival, without those beyond the depth of their key."""
-        taken: list[tuple[int, str, bytes]] = []
-        while True:
-            try:
-                taken.append(self._samples.popleft())
-            except IndexError:
-                break
+        with self._lock:
+            taken, self._samples, self._bytes = self._samples, collections.deque(), 0
         left: dict[str, int] = {}
         kept = []
         for depth, key, payload in reversed(taken):

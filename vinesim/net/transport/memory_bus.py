@@ -173,7 +173,7 @@ class MemoryBus:
 
     def __init__(self, hub: MemoryHub, name: str) -> None:
         self.hub, self.name = hub, name
-        self.bytes_in = self.bytes_out = 0
+        self.bytes_in = self.bytes_out = self.failures = 0
         self.queryables: dict[str, Callable[[bytes], bytes]] = {}
         self.pending_replies: list[tuple[str, bytes, float]] = []
         self._store = SampleStore()

@@ -27,11 +27,11 @@ from vinesim.net.transport.access_control import tls_config
 from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore
 from vinesim.net.transport.endpoints import Endpoint, client_links
 from vinesim.net.transport.zenoh_admission import ServerAdmission
+from vinesim.net.transport.zenoh_entities import BusPublisher, BusSubscription
 from vinesim.net.transport.zenoh_session import (
     CONNECT_TIMEOUT,
     ServerUnreachable,
     close_session,
-    has_match,
     open_client,
 )
 
@@ -52,52 +52,17 @@ WATCH_PERIOD = 0.5
 SILENCE_TIMEOUT = 3.0
 """Datagrams are given up after so long without them while the stream works [s]."""
 
+DATAGRAM_RETRY_PERIOD = 10.0
+"""Time between two attempts to send poses over datagrams again [s]."""
 
-class _Publisher:
-    """See :class:`vinesim.net.transport.bus.Publisher`."""
+MAX_PENDING_PUTS = 10_000
+"""Reliable messages that wait to be sent; further ones are refused."""
 
-    def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Publisher], reliable: bool) -> None:
-        self._bus, self._declare, self._reliable = bus, declare, reliable
-        self._publisher = declare(bus.session_for(reliable))
+MAX_PENDING_BYTES = 32 << 20
+"""Payload bytes of the same [B]."""
 
-    @property
-    def matching(self) -> bool:
-        return has_match(self._publisher)
-
-    def put(self, payload: bytes) -> bool:
-        if not self.matching:
-            return False
-        self._bus.bytes_out += len(payload)
-        if self._reliable:
-            self._bus.submit(lambda: self._publisher.put(payload))
-        else:
-            self._publisher.put(payload)
-        return True
-
-    def move_to(self, session: zenoh.Session) -> None:
-        """Publish over another session from now on."""
-        self._publisher = self._declare(session)
-
-    def close(self) -> None:
-        self._bus.unreliable.discard(self)
-        self._bus.submit(lambda: self._publisher.undeclare())
-
-
-class _Subscription:
-    """See :class:`vinesim.net.transport.bus.Subscription`."""
-
-    def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Subscriber], reliable: bool) -> None:
-        self._bus, self._declare = bus, declare
-        self._declared: zenoh.Subscriber | None = None
-        bus.submit(lambda: self.move_to(bus.session_for(reliable)))
-
-    def move_to(self, session: zenoh.Session) -> None:
-        """Subscribe over another session from now on."""
-        self._declared = self._declare(session)
-
-    def close(self) -> None:
-        self._bus.unreliable.discard(self)
-        self._bus.submit(lambda: self._declared and self._declared.undeclare())
+MAX_PENDING_REPLIES = 1000
+"""Replies to queries that wait for :meth:`ZenohBus.replies`; further ones are discarded and counted."""
 
 
 class ZenohBus:
@@ -122,7 +87,8 @@ class ZenohBus:
         links = client_links(connect, secured=certificates is not None)
         self._credentials = {} if certificates is None else tls_config(certificates, name)
         self.name, self.world, self.endpoint = name, world, str(links.bulk)
-        self.bytes_in = self.bytes_out = self._oversized = 0
+        self.bytes_in = self.bytes_out = self._oversized = self.failures = 0
+        self._put_count = self._put_bytes = self._sent_count = self._sent_bytes = 0
         self._prefix = f"{ROOT}/{world}/"
         self._store = SampleStore()
         self._replies: collections.deque[tuple[str, bytes, float]] = collections.deque()
@@ -132,9 +98,14 @@ class ZenohBus:
         self._lock = threading.Lock()
         self._lost_endpoints: set[str] = set()
         """Endpoints that are not connected now."""
-        self._datagram_endpoint = "" if links.live is None else str(links.live)
+        self._datagram_endpoint = links.live
         self._silent_since: float | None = None
-        self.unreliable: set[_Publisher | _Subscription] = set()
+        self._pose_watch: object = None
+        self._probe: threading.Thread | None = None
+        self._probed: zenoh.Session | None = None
+        """Session of datagrams that pass again, until poses are moved to it."""
+        self._next_probe = time.monotonic() + DATAGRAM_RETRY_PERIOD
+        self.unreliable: set[BusPublisher | BusSubscription] = set()
         """Publishers and subscriptions of the pose session."""
         self._session = self._pose_session = open_client(links.bulk, self._credentials)
         self._admission = ServerAdmission(
@@ -172,7 +143,7 @@ class ZenohBus:
                 self.name, endpoint, self.endpoint,
             )  # fmt: skip
             return self._session
-        self._declared.append(self._watch_connection(session, str(endpoint)))
+        self._pose_watch = self._watch_connection(session, str(endpoint))
         if zenoh.Reliability.BEST_EFFORT not in [link.reliability for link in session.info.links()]:
             log.warning(
                 "%s: the router at %s offers no datagrams on that link: poses go in line there; "
@@ -185,23 +156,51 @@ class ZenohBus:
         return self._session if reliable else self._pose_session
 
     def _watch_datagrams(self) -> None:
-        """Move poses to the stream when datagrams stop passing while the stream works."""
+        """Move poses to the stream when datagrams stop passing while the stream works, and back."""
+        endpoint = str(self._datagram_endpoint)
         if self._pose_session is self._session:
+            if self._datagram_endpoint is not None and self.endpoint not in self._lost_endpoints:
+                self._return_to_datagrams(self._datagram_endpoint)
             return
-        if self._datagram_endpoint not in self._lost_endpoints or self.endpoint in self._lost_endpoints:
+        if endpoint not in self._lost_endpoints or self.endpoint in self._lost_endpoints:
             self._silent_since = None
             return
         now = time.monotonic()
         self._silent_since = self._silent_since or now
         if now - self._silent_since < SILENCE_TIMEOUT:
             return
-        log.warning("%s: no datagrams pass to %s any more: poses go over %s", self.name, self._datagram_endpoint,
-                    self.endpoint)  # fmt: skip
-        abandoned, self._pose_session = self._pose_session, self._session
-        for entity in list(self.unreliable):
-            entity.move_to(self._session)
-        self._lost_endpoints.discard(self._datagram_endpoint)
+        log.warning("%s: no datagrams pass to %s any more: poses go over %s", self.name, endpoint, self.endpoint)
+        abandoned = self._pose_session
+        self._move_poses(self._session)
+        self._lost_endpoints.discard(endpoint)
+        self._next_probe = now + DATAGRAM_RETRY_PERIOD
         close_session(abandoned)
+
+    def _return_to_datagrams(self, endpoint: Endpoint) -> None:
+        """Move poses back if datagrams pass again, which another thread tries from time to time: that may take long."""
+        if (session := self._probed) is not None:
+            self._probed = None
+            self._pose_watch = self._watch_connection(session, str(endpoint))
+            self._silent_since = None
+            log.info("%s: datagrams pass to %s: poses go over them", self.name, endpoint)
+            self._move_poses(session)
+        elif time.monotonic() >= self._next_probe and (self._probe is None or not self._probe.is_alive()):
+            self._next_probe = time.monotonic() + DATAGRAM_RETRY_PERIOD
+            self._probe = threading.Thread(
+                target=self._try_datagrams, args=(endpoint,), name=f"datagrams of {self.name}", daemon=True
+            )
+            self._probe.start()
+
+    def _try_datagrams(self, endpoint: Endpoint) -> None:
+        """Body of the thread that opens a session over datagrams."""
+        with contextlib.suppress(ServerUnreachable):
+            self._probed = open_client(endpoint, self._credentials)
+
+    def _move_poses(self, session: zenoh.Session) -> None:
+        """Publish and receive poses over another session from now on."""
+        self._pose_session = session
+        for entity in list(self.unreliable):
+            entity.move_to(session)
 
     @property
     def links(self) -> list[str]:
@@ -239,7 +238,7 @@ class ZenohBus:
         """Note and log when the connection of a session is lost or restored."""
 
         def on_event(event: zenoh.TransportEvent) -> None:
-            if session.is_closed() or (self._pose_session is self._session and session is not self._session):
+            if session.is_closed() or session not in (self._session, self._pose_session):
                 return  # left, or given up: that is no loss
             if event.kind == zenoh.SampleKind.PUT:
                 self._lost_endpoints.discard(endpoint)
@@ -282,7 +281,7 @@ class ZenohBus:
     def join(self, greeting: bytes) -> None:
         self._admission.join(greeting)
 
-    def publisher(self, key: str, reliable: bool = False) -> _Publisher:
+    def publisher(self, key: str, reliable: bool = False) -> BusPublisher:
         if "*" in key:
             raise UsageError(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
 
@@ -296,12 +295,9 @@ class ZenohBus:
                 allowed_destination=zenoh.Locality.REMOTE,
             )
 
-        publisher = _Publisher(self, declare, reliable)
-        if not reliable:
-            self.unreliable.add(publisher)
-        return publisher
+        return BusPublisher(self, declare, reliable)
 
-    def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> _Subscription:
+    def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> BusSubscription:
         skip = len(self._prefix)
 
         def store(sample: zenoh.Sample) -> None:
@@ -315,10 +311,7 @@ class ZenohBus:
         def declare(session: zenoh.Session) -> zenoh.Subscriber:
             return session.declare_subscriber(self._prefix + pattern, store, allowed_origin=zenoh.Locality.REMOTE)
 
-        subscription = _Subscription(self, declare, depth >= KEEP_ALL)
-        if depth < KEEP_ALL:
-            self.unreliable.add(subscription)
-        return subscription
+        return BusSubscription(self, declare, depth >= KEEP_ALL)
 
     def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
@@ -329,7 +322,10 @@ class ZenohBus:
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None and len(reply.ok.payload) <= messages.MAX_MESSAGE:
                 arrived = time.monotonic()
-                self._replies.append((str(reply.ok.key_expr)[skip:], reply.ok.payload.to_bytes(), arrived))
+                if len(self._replies) >= MAX_PENDING_REPLIES:
+                    self._oversized += 1
+                else:
+                    self._replies.append((str(reply.ok.key_expr)[skip:], reply.ok.payload.to_bytes(), arrived))
 
         # Zenoh's own choice would keep one reply of a key: a snapshot comes in several
         no_consolidation = zenoh.ConsolidationMode.NONE
@@ -350,7 +346,10 @@ class ZenohBus:
         def on_query(query: zenoh.Query) -> None:
             with query:
                 request = query.payload
-                query.reply(str(query.key_expr), respond(request.to_bytes() if request is not None else b""))
+                try:
+                    query.reply(str(query.key_expr), respond(request.to_bytes() if request is not None else b""))
+                except zenoh.ZError as error:
+                    self.count_failure(error)
 
         self._declared.append(self._session.declare_queryable(self._prefix + key, on_query))
 
@@ -360,6 +359,36 @@ class ZenohBus:
     def submit(self, task: Callable[[], object]) -> None:
         """Run a function that may block, in order, in the bus's own thread."""
         self._work.put(task)
+
+    def submit_put(self, put: Callable[[], object], size: int) -> bool:
+        """Run a reliable put of ``size`` [B] in the bus's own thread; False, and counted, if too many wait already.
+
+        Only the thread of the real-time loop calls this, so that the counts need no lock.
+        """
+        if (
+            self._put_count - self._sent_count >= MAX_PENDING_PUTS
+            or self._put_bytes - self._sent_bytes + size > MAX_PENDING_BYTES
+        ):
+            self.failures += 1
+            return False
+
+        def run() -> None:
+            try:
+                put()
+            finally:
+                self._sent_count += 1
+                self._sent_bytes += size
+
+        self._put_count += 1
+        self._put_bytes += size
+        self.submit(run)
+        return True
+
+    def count_failure(self, error: Exception) -> None:
+        """Count what the network refused; log the first."""
+        self.failures += 1
+        if self.failures == 1:
+            log.warning("%s: the network refused, further times are only counted: %s", self.name, error)
 
     def _run(self) -> None:
         """Body of the bus's own thread."""
@@ -376,15 +405,21 @@ class ZenohBus:
             try:
                 task()
             except zenoh.ZError as error:
-                log.warning("the network refused: %s", error)
+                self.count_failure(error)
+            except Exception as error:  # this thread sends everything that is reliable
+                log.exception("%s: an error in the thread of the bus", self.name)
+                self.count_failure(error)
 
     def close(self) -> None:
         work = getattr(self, "_work", None)
         if work is not None:
             work.put(None)
             self._worker.join(timeout=CONNECT_TIMEOUT)
-        for session in (self._pose_session, self._session):
-            close_session(session)
+        if self._probe is not None:
+            self._probe.join(timeout=2.0 * CONNECT_TIMEOUT)
+        for session in (self._probed, self._pose_session, self._session):
+            if session is not None:
+                close_session(session)
 
     def __enter__(self) -> Self:
         return self

@@ -22,6 +22,7 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
+from vinesim.errors import checked_index
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
@@ -29,7 +30,7 @@ from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
-from vinesim.physics.plants.validation import validate
+from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -92,10 +93,10 @@ class ArticulationSolver:
         buffers = DeviceBuffers(device) if buffers is None else buffers
         if threads < 1 or (threads > 1 and not buffers.device.is_cpu):
             raise ValueError(f"{threads} threads on {device}: 1 or more on cpu; a GPU needs none, leave threads at 1")
-        if not dt > 0.0 or not 0.5 <= phi <= 1.0:
-            raise ValueError(f"dt {dt} s, phi {phi}: need dt above 0 and phi from 0.5 to 1")
+        if not 0.0 < dt < math.inf or not 0.5 <= phi <= 1.0:
+            raise ValueError(f"dt {dt} s, phi {phi}: need a finite dt above 0 and phi from 0.5 to 1")
         validate(model, state)
-        self.model, self.state, self.dt = model, state, dt
+        self.model, self.state, self._dt = model, state, dt
         self.fast_rate = p.fast_joint_rate if fast_rate is None else fast_rate
         self.max_rate = p.max_joint_rate if max_rate is None else max_rate
         self.fault_rate = p.fault_joint_rate if fault_rate is None else fault_rate
@@ -119,6 +120,11 @@ class ArticulationSolver:
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self._clusters = BerryClusters(self)
+
+    @property
+    def dt(self) -> float:
+        """[s] Duration of a step. Fixed: kernels, damping and counts of steps follow from it at the start."""
+        return self._dt
 
     def _allocate(self, phi: float) -> None:
         """Arrays of the solver beside model and state."""
@@ -206,8 +212,8 @@ class ArticulationSolver:
         return self._awake
 
     def wake(self, trees: np.ndarray | int) -> None:
-        """Let trees move from the next ``predict()`` on."""
-        trees = np.atleast_1d(trees)
+        """Let trees move from the next ``predict()`` on; :class:`ValueError` if there is no such tree."""
+        trees = checked_trees(trees, len(self.state.tree_awake))
         if not self.state.tree_awake[trees].all():
             self.state.tree_awake[trees] = True
             self._list_awake()
@@ -258,11 +264,10 @@ class ArticulationSolver:
     def cut(self, body: int) -> None:
         """Cut a body off its parent: it and what grows on it fall, from where they are and as fast as they are.
 
-        Its tree wakes; the rest of it goes on as before. Numbers never change.
+        Its tree wakes; the rest of it goes on as before. Numbers never change. :class:`ValueError` if it cannot be cut.
         """
-        model, state, body = self.model, self.state, int(body)
-        if not 0 <= body < len(model.body_mass):
-            raise ValueError(f"body {body} cannot be cut off: there are {len(model.body_mass)}, counted from 0")
+        model, state = self.model, self.state
+        body = checked_index("body", body, len(model.body_mass))
         tree = int(model.body_tree[body])
         if state.body_cut[body]:
             raise ValueError(f"body {body} of tree {tree} has been cut off already")
@@ -293,7 +298,7 @@ class ArticulationSolver:
 
         A bunch with clusters is meant as a whole, fine or coarse: head and clusters keep their shares.
         """
-        if not mass > 0.0:
+        if not 0.0 < mass < math.inf:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
         self._clusters.set_mass(body, mass)
 
@@ -466,8 +471,10 @@ class ArticulationSolver:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
 
         It pulls to ``tie_anchor`` of that tie, which starts where the point is; move it as you like.
-        :class:`ValueError` for a berry cluster, and if too many bodies are held, or this one in too many places.
+        :class:`TieLimitError` if too many bodies are held, or this one in too many places; :class:`ValueError` for a
+        berry cluster and for numbers that are not finite.
         """
+        body = checked_index("body", body, len(self.model.body_mass))
         if body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]:
             raise ValueError(f"body {body} is a berry cluster, which cannot be held; hold its bunch")
         self.forward_kinematics(np.array([tree]))

@@ -12,6 +12,7 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
+from vinesim.errors import checked_index
 from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
@@ -164,8 +165,7 @@ class DetachmentMonitor:
     def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
         """Detach one bunch; it keeps its pose and velocity. Call it between steps. :class:`ValueError` if it cannot
         be."""
-        if not 0 <= bunch < len(self._overloaded_steps):
-            raise ValueError(f"no bunch {bunch}; there are 0 to {len(self._overloaded_steps) - 1}")
+        bunch = checked_index("bunch", bunch, len(self._overloaded_steps))
         if not self.plants.state.bunch_attached[bunch]:
             raise ValueError(f"bunch {bunch} was picked already")
         body = self.plants.model.bunch_body[bunch]
@@ -199,9 +199,12 @@ class DetachmentMonitor:
         self._record(body, bunch, cause, actor, carried)
 
     def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
-        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between steps."""
-        plants = self.plants
-        if not 0 <= body < len(self._wood) or plants.model.body_organ[body] == int(Organ.BUNCH):
+        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between steps.
+
+        :class:`ValueError` if it cannot be cut.
+        """
+        plants, body = self.plants, checked_index("body", body, len(self._wood))
+        if plants.model.body_organ[body] == int(Organ.BUNCH):
             raise ValueError(f"body {body} is no piece of wood that can be cut")
         if self._bunch_of[body] >= 0:
             self.pick(int(self._bunch_of[body]), cause, actor)

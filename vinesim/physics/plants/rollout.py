@@ -15,6 +15,7 @@ itself damps that much, and asking for less changes nothing.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -107,10 +108,10 @@ class Rollout:
         fault_rate: float = _DEFAULTS.fault_joint_rate,
         geometric_stiffness: bool = True,
     ) -> None:
-        if ticks < 1 or checkpoint < 1 or not dt > 0.0 or not 0.5 <= phi <= 1.0:
+        if ticks < 1 or checkpoint < 1 or not 0.0 < dt < math.inf or not 0.5 <= phi <= 1.0:
             raise ValueError(
-                f"{ticks} ticks of {dt} s, a checkpoint every {checkpoint}, phi {phi}: need 1 or more, dt above 0, "
-                "phi from 0.5 to 1"
+                f"{ticks} ticks of {dt} s, a checkpoint every {checkpoint}, phi {phi}: need 1 or more, a finite dt "
+                "above 0, phi from 0.5 to 1"
             )
         self.model, self.ticks, self.dt, self.fault_rate, self.device = (
             model,

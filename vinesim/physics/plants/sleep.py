@@ -27,10 +27,11 @@ class SleepMonitor:
         return awake[self.quiet_steps[awake] < self.patience]
 
     def wake(self, trees: np.ndarray) -> None:
-        """Wake trees, or keep them awake, for at least ``patience`` steps from now."""
+        """Wake trees, or keep them awake, for at least ``patience`` steps from now. :class:`ValueError` as in
+        :meth:`ArticulationSolver.wake`."""
         trees = np.atleast_1d(trees)
-        self.quiet_steps[trees] = 0
         self.plants.wake(trees)
+        self.quiet_steps[trees] = 0
 
     def update(self, busy: np.ndarray | None = None) -> np.ndarray:
         """After a commit: the trees that have just been put to rest [k].

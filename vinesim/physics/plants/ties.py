@@ -7,10 +7,16 @@ that are held: a body gets one, its own ties are copied to the front of it, and 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vinesim import frames
 from vinesim.scene.model import Model
+
+
+class TieLimitError(ValueError):
+    """Too many bodies are held, or one of them in too many places."""
 
 
 class TieTable:
@@ -45,14 +51,19 @@ class TieTable:
     def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
         """Tie a body with world pose [7] at a point [3] m of its frame, where that is now; returns the tie.
 
-        :class:`ValueError` if too many bodies are held, or this one in too many places.
+        :class:`TieLimitError` if too many bodies are held, or this one in too many places.
         """
+        if not (np.isfinite(point).all() and 0.0 < stiffness < math.inf and 0.0 <= damping < math.inf):
+            raise ValueError(
+                f"tie of body {body} at {point}, stiffness {stiffness} N/m, damping {damping} N s/m; give a finite "
+                "point, a stiffness above 0 and a damping of 0 or more"
+            )
         if body not in self._slot_of:
             self._give_span(body)
         start = self._hands_start(body)
         spare = np.flatnonzero(self.stiffness[start : start + self._max_hands] == 0.0)
         if len(spare) == 0:
-            raise ValueError(f"body {body} is held in {self._max_hands} places already; let go of one")
+            raise TieLimitError(f"body {body} is held in {self._max_hands} places already; let go of one")
         tie = start + int(spare[0])
         self.anchor[tie] = pose[:3] + frames.rotate(pose[3:], np.asarray(point, float))
         self.point[tie], self.stiffness[tie], self.damping[tie] = point, stiffness, damping
@@ -72,7 +83,7 @@ class TieTable:
     def _give_span(self, body: int) -> None:
         free = [i for i in range(self._max_bodies) if i not in self._slot_of.values()]
         if not free:
-            raise ValueError(f"body {body} is one too many: {self._max_bodies} are held already, let go of one")
+            raise TieLimitError(f"body {body} is one too many: {self._max_bodies} are held already, let go of one")
         self._slot_of[body] = free[0]
         own = slice(*self._model_span[body].tolist())
         start = self._model_ties + self._span_size * free[0]

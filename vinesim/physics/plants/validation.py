@@ -2,10 +2,37 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 
+from vinesim.errors import checked_index
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+
+_log = logging.getLogger(__name__)
+
+
+def checked_trees(trees: np.ndarray | int, count: int) -> np.ndarray:
+    """Numbers of trees [k] as an array; :class:`ValueError` naming the first not from 0 to ``count`` - 1."""
+    trees = np.atleast_1d(trees)
+    if len(trees) and (trees.dtype.kind not in "iu" or trees.min() < 0 or trees.max() >= count):
+        for tree in trees.tolist():
+            checked_index("tree", tree, count)
+    return trees
+
+
+def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
+    """Log one warning if springs ask for less damping than the scheme has at ``dt`` [s] and ``phi``."""
+    floor = (2.0 * phi - 1.0) * dt
+    stiffness = model.joint_stiffness.astype(float)
+    raised = ((stiffness > 0.0) & (model.joint_damping < (1.0 - 1e-3) * floor * stiffness)).any(1)
+    if raised.any():
+        _log.warning(
+            "%d of %d joints ask for less damping than beta = (2 phi - 1) dt = %.2g ms, least of phi %g and dt %g s,"
+            " and have that; lower dt or phi (0.5 adds none), or raise their beta",
+            raised.sum(), len(model.body_mass), 1e3 * floor, phi, dt,
+        )  # fmt: skip
 
 
 def validate(model: Model, state: State) -> None:
@@ -35,6 +62,7 @@ def validate(model: Model, state: State) -> None:
     refuse(parent >= np.arange(count), "parent", parent, "a parent stands before its children (no cycles); reorder")
     refuse((parent < -1) | ((parent >= 0) & (parent < start[owner])), "parent", parent, "name a body of the same tree")
     refuse(~(model.body_length > 0.0), "length [m]", model.body_length, "give a positive length or leave the body out")
+    refuse(~(model.body_radius >= 0.0), "radius [m]", model.body_radius, "give radii of 0 or more")
     refuse(~(model.body_mass > 0.0), "mass [kg]", model.body_mass, "give a positive mass or leave the body out")
     refuse(~(model.body_inertia > 0.0), "inertia [kg m^2]", model.body_inertia, "give positive principal moments")
     refuse(

@@ -15,6 +15,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.ties import TieLimitError
 from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_body import HumanBody
 from vinesim.physics.rigid.human_shapes import GRASP_POINTS, HAND_HALF_THICKNESS
@@ -44,6 +45,8 @@ class GraspManager:
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.contacts: tuple[Contact, ...] = ()
         """Hands that held a plant in the last step, as contacts; their ``distance`` is 0."""
+        self.refused_grasps = 0
+        """Hands that closed on a plant in vain since the start: too many bodies were held, or one by too many hands."""
         self._grasps: dict[tuple[str, str], _PlantGrasp] = {}
         """Held plants, by person and side."""
         self._steps_to_grasp: dict[tuple[str, str], int] = {}
@@ -127,7 +130,12 @@ class GraspManager:
             pose = self.plants.state.body_q[body].astype(float)
             hand.grasp_pose = frames.compose(frames.inverse(pose), palm)
             bunch = np.flatnonzero(self.plants.model.bunch_body == body)
-            tie = self.plants.add_tie(body, hand.grasp_pose[:3], hand.stiffness, hand.damping)
+            try:
+                tie = self.plants.add_tie(body, hand.grasp_pose[:3], hand.stiffness, hand.damping)
+            except TieLimitError:  # the hand has closed on nothing, and does not try again before it opens
+                self.refused_grasps += 1
+                self._steps_to_grasp[key] = 0
+                return
             self._grasps[key] = _PlantGrasp(body, tie, hand.grasp_pose[:3].copy(), next(iter(bunch.tolist()), -1))
             self.rigid.grasp_plant(*key, body)
         elif rigid is not None:

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import threading
 
 import mujoco
@@ -26,6 +27,8 @@ from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidVisual
 
+_log = logging.getLogger(__name__)
+
 
 @dataclasses.dataclass(frozen=True)
 class CompiledWorld:
@@ -38,12 +41,18 @@ class CompiledWorld:
     mj_model: mujoco.MjModel
 
 
+def _log_mujoco_warnings() -> None:
+    """Let MuJoCo's warnings go to the log, unless the program handles them: MuJoCo itself would write a file
+    ``MUJOCO_LOG.TXT`` into the working folder. It warns once of each kind."""
+    if mujoco.get_mju_user_warning() is None:
+        mujoco.set_mju_user_warning(_log.warning)
+
+
 class WorldCore:
     """MuJoCo's model and data, and what they contain; compiled anew when an actor joins or leaves."""
 
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         self.model, self.parameters = model, parameters
-        self.dt = parameters.dt
         self._robots: dict[str, RobotBody] = {}
         self._humans: dict[str, HumanBody] = {}
         self._free_bunches: dict[int, FreeBunch] = {}
@@ -61,7 +70,13 @@ class WorldCore:
         self.owners: dict[int, tuple[str, str]] = {}
         """Actor and link of every MuJoCo body that can be added, removed or moved, as in :class:`RigidGeoms`."""
         self._link_sensors = LinkSensors()
+        _log_mujoco_warnings()
         self._recompile()
+
+    @property
+    def dt(self) -> float:
+        """[s] Duration of a step; fixed."""
+        return self.parameters.dt
 
     # ------------------------------------------------------------------ actors
 

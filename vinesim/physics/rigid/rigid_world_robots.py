@@ -9,20 +9,41 @@ import mujoco
 import numpy as np
 
 from vinesim.physics.rigid.mujoco_world import WorldCore
+from vinesim.physics.rigid.urdf import RobotError
+
+
+def _check_finite(name: str, what: str, given: object, size: int) -> None:
+    """:class:`RobotError` unless a command consists of ``size`` finite numbers."""
+    values = np.asarray(given, float)
+    if values.shape != (size,):
+        raise RobotError(f"robot {name!r}: {what} has the shape {values.shape}; give {size} numbers")
+    if not np.isfinite(values).all():
+        raise RobotError(f"robot {name!r}: {what} is {values.tolist()}; give finite numbers")
 
 
 class RobotAccess(WorldCore):
-    """Robots of a rigid world. Every method raises ``ValueError`` if no robot or link has the name given."""
+    """Robots of a rigid world. Every method raises ``ValueError`` if no robot or link has the name given, and
+    :class:`RobotError` for commands that are not finite or of another shape."""
 
     def place_robot(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
         """Put a robot at base ``pose`` [7] and joint ``position`` [joint], at rest, with its targets there."""
+        self._check_joints(name, position=position)
+        _check_finite(name, "pose", pose, 7)
         self.robot(name).place(self.mj_model, self.mj_data, np.asarray(pose, float), position)
         self._kinematics_current = False
+
+    def _check_joints(self, name: str, **commands: object) -> None:
+        """:class:`RobotError` unless each command that is given has one finite number for each drive."""
+        count = len(self.robot(name).spec.drives)
+        for what, given in commands.items():
+            if given is not None:
+                _check_finite(name, f"joint {what}", given, count)
 
     # ------------------------------------------------------------------ commands
 
     def command(self, name: str, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
         """Set the targets of the servos: ``position`` [joint] and ``velocity`` [joint] (zero unless given)."""
+        self._check_joints(name, position=position, velocity=velocity)
         self.robot(name).command(position, velocity)
 
     def set_gains(
@@ -47,11 +68,13 @@ class RobotAccess(WorldCore):
             times
                 stiffness, as stiff servos should be.
         """
+        self._check_joints(name, stiffness=stiffness, damping=damping, effort=effort)
         self.robot(name).set_gains(self.mj_model, self.mj_data, (stiffness, damping, effort), limit, exact)
 
     def command_base(self, name: str, velocity: tuple[float, float, float]) -> None:
         """Drive the base with (vx, vy, wz) [m/s, m/s, rad/s] in its own axes; zero holds it in place."""
         robot = self.robot(name)
+        _check_finite(name, "base velocity", velocity, 3)
         robot.base_velocity[:] = velocity
         robot.base_slip = self.parameters.base_slip
 
@@ -63,20 +86,26 @@ class RobotAccess(WorldCore):
         ``base_q`` [7], ``base_qd`` [6] world axes, ``position`` and ``velocity`` [joint].
         """
         self.command(name, position, velocity)
+        _check_finite(name, "base pose", base_q, 7)
+        _check_finite(name, "base velocity", base_qd, 6)
         self.robot(name).follow_remote(self.mj_data, np.asarray(base_q, float), np.asarray(base_qd, float))
 
     def apply_wrench(self, name: str, link: str, force: np.ndarray, moment: np.ndarray = np.zeros(3)) -> None:
         """Apply a force [3] N and a moment [3] N m at a link's centre of mass, world axes, until the next call."""
         wrench = self.mj_data.xfrc_applied[self._link_body(name, link)]
+        _check_finite(name, "force", force, 3)
+        _check_finite(name, "moment", moment, 3)
         wrench[:3], wrench[3:] = force, moment
 
     def set_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
         """Apply the wrenches [6] by link with which remote people push a robot, until the next call.
 
         Force [N] and moment about the link's centre of mass [N m], world axes. :meth:`joint_measurements` counts them
-        as contacts. Raises :class:`RobotError` if a link does not exist.
+        as contacts. Raises :class:`RobotError` if a link does not exist or a wrench is not finite.
         """
         robot = self.robot(name)
+        for link, wrench in wrenches.items():
+            _check_finite(name, f"wrench on {link!r}", wrench, 6)
         if wrenches or robot.remote_wrenches:
             robot.set_remote_wrenches(self.mj_data, wrenches)
 
