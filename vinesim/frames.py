@@ -159,6 +159,16 @@ def pose(position: npt.ArrayLike, quaternion: npt.ArrayLike = IDENTITY) -> np.nd
     return np.concatenate([np.broadcast_to(x, (*lead, 3)), np.broadcast_to(q, (*lead, 4))], -1)
 
 
+def checked_pose(what: str, given: npt.ArrayLike, error: type[ValueError] = ValueError) -> np.ndarray:
+    """A pose [7] as an array of floats; ``error`` naming ``what`` unless it is finite with a unit quaternion."""
+    values = np.asarray(given, float)
+    if values.shape != (7,) or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
+        raise error(
+            f"{what} is {values.tolist()}; give position [m] and unit quaternion (x, y, z, w), 7 finite numbers"
+        )
+    return values
+
+
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Pose ``b`` [..., 7], given in the frame ``a`` [..., 7], in the parent frame of ``a``."""
     a, b = np.asarray(a), np.asarray(b)

@@ -281,12 +281,7 @@ FAULTS = {
     "another format": ("<mujoco/>", "root is <mujoco>"),
     "nameless link": ("<robot name='x'><link/></robot>", "not a URDF"),
     "joint without parent": ("<robot name='x'><link name='a'/><joint name='j' type='fixed'/></robot>", "not a URDF"),
-    "no joints": ("<robot name='x'><link name='a'/></robot>", "no joints"),
-    "nothing moves": (
-        "<robot name='x'><link name='a'/><link name='b'/>"
-        "<joint name='j' type='fixed'><parent link='a'/><child link='b'/></joint></robot>",
-        "no joint moves",
-    ),
+    "no links": ("<robot name='x'></robot>", "no links"),
     "same name twice": (robot(links="<link name='arm'/>"), "'arm' is there twice"),
     "unknown link": (
         robot(joints="<joint name='j' type='fixed'><parent link='arm'/><child link='hand'/></joint>"),
@@ -317,7 +312,6 @@ FAULTS = {
     "half an axis": (robot().replace("0 0 1", "0 1"), "xyz=\"0 1\"> of joint 'shoulder_joint' has 2 of 3 numbers"),
     "not a number": (robot(arm_mass="nan"), "is not finite"),
     "a word": (robot(arm_mass="heavy"), "<mass value=\"heavy\"> of link 'arm' is no number"),
-    "no inertia": (robot().replace('"0.1"', '"0"'), "'base' moves but has no inertia"),
     "endless effort": (robot(arm_joint="<limit lower='0' upper='1' effort='inf' velocity='1'/>"), "is not finite"),
     "flat box": (
         robot(links="<link name='s'><collision><geometry><box size='1 0 1'/></geometry></collision></link>"),
@@ -327,23 +321,24 @@ FAULTS = {
         robot(links="<link name='s'><collision><geometry><cone radius='1'/></geometry></collision></link>"),
         "cone",
     ),
-    "name of the world": (robot().replace('"base"', '"world"'), "is called 'world'"),
-    "no limits": (robot(arm_joint="<dynamics damping='1'/>"), "moves without limits"),
-    "half a limit": (robot(arm_joint="<limit effort='1' velocity='1'/>"), "lower, upper"),
+    "name of the world": (robot().replace('"arm"', '"world"'), "'world' is not the root"),
+    "no limits": (robot(arm_joint="<dynamics damping='1'/>").replace("revolute", "prismatic"), "moves without limits"),
+    "half a limit": (robot(arm_joint="<limit lower='-1' effort='1' velocity='1'/>"), "upper"),
+    "document type": ("<!DOCTYPE robot SYSTEM 'robot.dtd'>" + robot(), "document type"),
     "upside-down limits": (robot(arm_joint="<limit lower='1' upper='0' effort='1' velocity='1'/>"), "limits 1 to 0"),
-    "no effort": (robot(arm_joint="<limit lower='0' upper='1' effort='0' velocity='1'/>"), "effort 0"),
-    "zero mass": (robot(arm_mass="0"), "no mass"),
-    "weightless base": (robot().replace('value="9"', 'value="0"'), "'base' moves but has no mass"),
+    "negative effort": (robot(arm_joint="<limit lower='0' upper='1' effort='-1' velocity='1'/>"), "effort -1"),
     "negative mass": (robot(arm_mass="-2"), "mass of -2"),
     "impossible inertia": (robot().replace('izz="0.1"', 'izz="-0.1"'), "positive definite"),
     "missing mesh": (
         robot(links="<link name='s'><visual><geometry><mesh filename='gone.stl'/></geometry></visual></link>"),
         "'gone.stl' is missing",
     ),
-    "unknown mimic source": (
+    "mimic of a mimic": (
         robot(
-            links="<link name='a'><inertial><mass value='1'/></inertial></link>",
-            joints="<joint name='j' type='revolute'><parent link='arm'/><child link='a'/><mimic joint='k'/></joint>",
+            links="<link name='a'/><link name='b'/>",
+            joints="<joint name='j' type='revolute'><parent link='arm'/><child link='a'/><mimic joint='k'/></joint>"
+            "<joint name='k' type='revolute'><parent link='a'/><child link='b'/>"
+            "<mimic joint='shoulder_joint'/></joint>",
         ),
         "mimics 'k'",
     ),

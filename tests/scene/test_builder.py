@@ -131,6 +131,20 @@ def test_invalid_trees_are_refused_with_the_reason():
             builder.TreeBuilder(POSE).add_body(-1, **fields)
     with pytest.raises(ValueError, match=r"body 0 has no field 'lenght'; it has: .*length"):
         builder.TreeBuilder(POSE).add_body(-1, lenght=0.1)
+    for pose in (np.zeros(7), np.full(7, np.nan), POSE[:3]):
+        with pytest.raises(ValueError, match=r"tree: pose is .*; give position"):
+            builder.TreeBuilder(pose)
+    tree = builder.TreeBuilder(POSE)
+    tree.add_rod(-1, 0.1, (0.01, 0.01), CANE, 1)
+    for options, finding in (
+        ({"parent": -1, "mass": 0.5}, "body -1 does not exist; give 0 to 0"),
+        ({"parent": 0, "mass": 0.5, "variety": 99}, "variety 99 does not exist"),
+        ({"parent": 0, "mass": -0.5}, "bunch of -0.5 kg, 90 berries; give a finite mass above 0 and 1 to 140"),
+        ({"parent": 0, "mass": 0.5, "count": 0}, "bunch of 0.5 kg, 0 berries"),
+    ):
+        with pytest.raises(ValueError, match=finding):
+            tree.add_bunch(**options)
+    assert len(tree.bodies) == 1
     without_springs = builder.TreeBuilder(POSE)
     without_springs.add_body(-1, mass=1.0)
     with pytest.raises(ValueError, match="body 0 has joint stiffness"):

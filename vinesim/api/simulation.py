@@ -102,6 +102,8 @@ class Simulation:
 
     def step(self, count: int = 1) -> None:
         """Advance by ``count`` steps of :attr:`dt`. Wrenches that were applied act in all of them, then end."""
+        if not isinstance(count, int | np.integer) or count < 0:
+            raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
         self._detachments = []
         for _ in range(count):
             for robot in self.robots.values():
@@ -298,7 +300,9 @@ def base_pose(pose: Sequence[float] | np.ndarray) -> np.ndarray:
     given = np.asarray(pose, float)
     if given.shape not in ((3,), (7,)) or not np.isfinite(given).all():
         raise UsageError(f"pose is {given.tolist()}; give (x, y, yaw) in m and rad, or position and quaternion [7]")
-    return given if len(given) == 7 else frames.pose(np.array([given[0], given[1], 0.0]), frames.from_yaw(given[2]))
+    if len(given) == 7:
+        return frames.checked_pose("pose", given, UsageError)
+    return frames.pose(np.array([given[0], given[1], 0.0]), frames.from_yaw(given[2]))
 
 
 def _model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]) -> Model:
@@ -308,7 +312,7 @@ def _model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneB
         return generate(source)
     if isinstance(source, (CaneBuilder, TreeBuilder)):
         return assemble([source])
-    canes = list(source)
+    canes = list(source) if isinstance(source, Iterable) else [source]
     if not all(isinstance(one, (CaneBuilder, TreeBuilder)) for one in canes):
         raise UsageError(f"cannot simulate a {type(source).__name__}; give a scene, a model or cane builders")
     return assemble(canes)

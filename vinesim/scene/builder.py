@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from vinesim import frames
+from vinesim.errors import checked_index
 from vinesim.scene import berries, plant_parameters
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -127,8 +128,11 @@ class TreeBuilder:
     """
 
     def __init__(self, pose: np.ndarray, vine: int = -1) -> None:
-        """``pose`` [7]: the root's joint frame in the world; ``vine``: number of the vine, -1 for none."""
-        self.pose = np.asarray(pose, float)
+        """``pose`` [7]: the root's joint frame in the world; ``vine``: number of the vine, -1 for none.
+
+        :class:`ValueError` if the pose is none.
+        """
+        self.pose = frames.checked_pose("tree: pose", pose)
         self.vine = vine
         self.bodies: list[dict[str, Any]] = []
         self.clusters: list[dict[str, Any]] = []
@@ -257,7 +261,14 @@ class TreeBuilder:
             clusters: whether it can be refined into berry clusters.
             parameters: of the rachis; ``data/plants/vine.toml`` unless given.
             **fields: further ``bunch_`` fields of the :class:`Model`.
+
+        :class:`ValueError` if the parent is not in the list, or for numbers that no bunch can have.
         """
+        parent = checked_index("body", parent, len(self.bodies))
+        variety = checked_index("variety", variety, len(berries.VARIETIES))
+        most = berries.PROTOTYPE_BERRIES[-1]
+        if not 0.0 < mass < np.inf or not 1 <= count <= most:
+            raise ValueError(f"bunch of {mass} kg, {count} berries; give a finite mass above 0 and 1 to {most} berries")
         parameters = plant_parameters.load_plant("vine") if parameters is None else parameters
         above = self.bodies[parent]
         berry = berries.VARIETIES[variety]

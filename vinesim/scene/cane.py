@@ -135,8 +135,8 @@ class CaneBuilder:
         for name, value in {"tip_mass": self.tip_mass, "damping_ratio": self.damping_ratio, "beta": self.beta}.items():
             if value is not None and not (np.isfinite(value) and value >= 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number of 0 or more")
-        if self.segments < 1:
-            raise ValueError(f"cane: segments is {self.segments}; give 1 or more")
+        if not isinstance(self.segments, int | np.integer) or self.segments < 1:
+            raise ValueError(f"cane: segments is {self.segments}; give a whole number, 1 or more")
         if self.damping_ratio is not None and self.beta is not None:
             raise ValueError(
                 f"cane: damping_ratio {self.damping_ratio} and beta {self.beta} are given; give one of them"
@@ -147,8 +147,7 @@ class CaneBuilder:
             raise ValueError(f"cane: shape is {self.shape!r}; give 'slack' or 'equilibrium'")
         if self.shape == "equilibrium" and self.base == "pinned":
             raise ValueError("cane: a base that is 'pinned' carries no moment; give shape 'slack'")
-        if np.shape(self.pose) != (7,):
-            raise ValueError(f"cane: pose has the shape {np.shape(self.pose)}; give position and quaternion [7]")
+        frames.checked_pose("cane: pose", self.pose)
         if self.bends is not None and np.shape(self.bends) != (self.segments, 3):
             raise ValueError(f"cane: bends has the shape {np.shape(self.bends)}; give [{self.segments}, 3]")
 

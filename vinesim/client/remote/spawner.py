@@ -106,4 +106,4 @@ def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDesc
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(hello.urdf)
-        return load_description(file)
+        return load_description(file, is_remote=True)

@@ -91,7 +91,7 @@ class ArticulationSolver:
         p = parameters
         dt, phi = p.dt if dt is None else dt, p.phi if phi is None else phi
         buffers = DeviceBuffers(device) if buffers is None else buffers
-        if threads < 1 or (threads > 1 and not buffers.device.is_cpu):
+        if not isinstance(threads, int) or threads < 1 or (threads > 1 and not buffers.device.is_cpu):
             raise ValueError(f"{threads} threads on {device}: 1 or more on cpu; a GPU needs none, leave threads at 1")
         if not 0.0 < dt < math.inf or not 0.5 <= phi <= 1.0:
             raise ValueError(f"dt {dt} s, phi {phi}: need a finite dt above 0 and phi from 0.5 to 1")

@@ -230,6 +230,8 @@ def _parse(given: RobotSpec, bit: int, friction: float) -> mujoco.MjSpec:
     for geom in child.geoms:
         geom.contype, geom.conaffinity = bit, ALL_BITS & ~bit & ~GROUND & ~REMOTE_HAND
         geom.friction = contact_friction(friction)
+    for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     for body in child.bodies[1:]:
         body.gravcomp = 1.0
     driven = {drive.joint: drive for drive in given.drives}

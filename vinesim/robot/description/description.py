@@ -57,6 +57,15 @@ class RobotDescription:
         order = {name: i for i, name in enumerate(self.joints)}
         return np.array([order[name] for name in self.groups[group].joints], int)
 
+    def finger_travel(self, fingers: np.ndarray) -> tuple[float, float]:
+        """By how much a gripper opens per position of its driven ``fingers`` [k] indices, all at one, and its opening
+        at position 0 [m or rad]. Sliding fingers that mimic a driven one count, turning ones are its linkage."""
+        moving = self.moving_joints
+        is_driven = np.isin(moving.names, self.joints)
+        counts = np.isin(moving.drive_index, fingers) & (is_driven | (moving.half_angle[:, 0] == 0.0))
+        sign = np.sign(moving.multiplier[counts])
+        return float(np.abs(moving.multiplier[counts]).sum()), float((sign * moving.offset[counts]).sum())
+
     def link_poses(self, position: np.ndarray) -> dict[str, np.ndarray]:
         """Pose [7] of every link in the root for drive positions; walks the tree: not for the real-time loop."""
         parents = dict(

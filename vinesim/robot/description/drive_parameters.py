@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.kinematics import joint_limits
+from vinesim.robot.description.repairs import some_names
 from vinesim.robot.description.sidecar import JointGroup
 from vinesim.robot.description.urdf_model import Joint, Robot
 from vinesim.scene.values import Drive
@@ -19,6 +21,8 @@ FULL_EFFORT_ANGLE = 0.05
 """[rad] Position error at which a servo gives full effort if its gains are not given. GUESSED"""
 FULL_EFFORT_DISTANCE = 0.005
 """[m] The same for a prismatic joint. GUESSED"""
+STANDARD_GRAVITY = 9.80665
+"""[m/s2]"""
 CENTRED_SHARE = 0.1
 """A range whose middle is nearer to 0 than this share of the range counts as centred about 0."""
 
@@ -43,9 +47,13 @@ def _default_home(joint: Joint) -> float:
 
 
 def make_drives(
-    robot: Robot, driven: list[Joint], description: RobotDescription, notes: list[str]
+    robot: Robot, driven: list[Joint], description: RobotDescription, notes: list[str], assumed: list[str]
 ) -> tuple[Drive, ...]:
-    """The drives of the driven joints: gains of their groups, else derived ones, which is added to ``notes``."""
+    """The drives of the driven joints: gains of their groups, else derived ones, which is added to ``notes``.
+
+    A drive too weak for the weight that it carries at home is taken to have a counterbalance: that weight is added to
+    its effort, and the joints to ``assumed``.
+    """
     gains: dict[str, tuple[float, float]] = {}
     armatures: dict[str, float] = {}
     springs: dict[str, tuple[float, float]] = {}
@@ -57,16 +65,22 @@ def make_drives(
                 armatures[joint] = group.armature[i]
             if group.series_stiffness is not None and group.series_damping is not None:
                 springs[joint] = group.series_stiffness[i], group.series_damping[i]
-    inertia = _carried_inertia(robot, description)
+    inertia, weight = _carried_loads(robot, description)
     derived = [joint.name for joint in driven if joint.name not in gains]
     if derived:
         notes.append(f"servo gains of {len(derived)} joints are derived from effort limits and inertia")
-    return tuple(
+    drives = [
         _make_drive(
             joint, gains.get(joint.name), armatures.get(joint.name), springs.get(joint.name), inertia[joint.name]
         )
         for joint in driven
-    )
+    ]
+    weak = [i for i, drive in enumerate(drives) if weight[drive.joint] >= drive.effort]
+    for i in weak:
+        drives[i] = dataclasses.replace(drives[i], effort=drives[i].effort + weight[drives[i].joint])
+    if weak:
+        assumed.append(f"{some_names([drives[i].joint for i in weak])} is too weak for its weight: counterbalanced")
+    return tuple(drives)
 
 
 def _make_drive(
@@ -97,8 +111,9 @@ def _make_drive(
     )
 
 
-def _carried_inertia(robot: Robot, description: RobotDescription) -> dict[str, float]:
-    """What each moving joint carries with the robot at home: mass [kg], or inertia about its origin [kg m2].
+def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[str, float], dict[str, float]]:
+    """What each moving joint carries with the robot at home: mass [kg], or inertia about its origin [kg m2]; and the
+    effort [N or N m] that the weight of it takes, without its sign.
 
     The inertia is the one about the worst axis through the joint, since arms bend: gains must suit any posture.
     """
@@ -112,16 +127,20 @@ def _carried_inertia(robot: Robot, description: RobotDescription) -> dict[str, f
         offset = inertial.origin[:3, 3] if inertial.origin is not None else np.zeros(3)
         centre[i] = frames.compose(poses[link], frames.pose(offset))[:3]
         own[i] = np.linalg.norm(inertial.inertia, 2) if inertial.inertia is not None else 0.0
-    joint_types = {joint.name: joint.type for joint in robot.joints}
-    carried = {}
+    joints = {joint.name: joint for joint in robot.joints}
+    carried, weight = {}, {}
     for name, (_, child) in zip(description.moving_joints.names, description.moving_joints.frames, strict=True):
         distal = np.array([_is_distal(description.link_anchors[link][0], child, above) for link, _ in bodies])
-        if joint_types[name] == "prismatic":
+        axis = frames.rotate(poses[child][3:], joints[name].axis / np.linalg.norm(joints[name].axis))
+        if joints[name].type == "prismatic":
             carried[name] = float(mass[distal].sum())
+            weight[name] = STANDARD_GRAVITY * carried[name] * abs(float(axis[2]))
         else:
             lever = centre[distal] - poses[child][:3]
             carried[name] = float(mass[distal] @ (lever**2).sum(axis=1) + own[distal].sum())
-    return carried
+            moment = mass[distal] @ lever
+            weight[name] = STANDARD_GRAVITY * abs(float(moment[1] * axis[0] - moment[0] * axis[1]))
+    return carried, weight
 
 
 def _is_distal(link: str, joint_child: str, above: dict[str, str]) -> bool:

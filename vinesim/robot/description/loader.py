@@ -3,9 +3,10 @@
     robot = load_description("vinebot")
     rigid.add_robot(robot.to_spec("robot_1", index=0, pose=frames.pose([2.0, 0.0, 0.0])))
 
-The text that physics and ROS receive differs from the file in three ways: meshes are
-named by absolute path, wheels and casters are fixed (the base is driven as a whole), and shapes whose mesh format
-physics cannot read are replaced; :attr:`RobotDescription.notes` lists each change.
+The text that physics and ROS receive differs from the file: meshes are named by absolute path, wheels and casters are
+fixed (the base is driven as a whole), a root link ``world`` is renamed and bolts the robot down, shapes whose mesh
+format physics cannot read are replaced, and what is missing or unfit is repaired. :attr:`RobotDescription.notes` lists
+each change; one warning a robot says what was assumed.
 """
 
 from __future__ import annotations
@@ -23,8 +24,15 @@ from vinesim.robot.description.drive_parameters import home_positions, make_driv
 from vinesim.robot.description.errors import DescriptionError, description_error
 from vinesim.robot.description.inferred_defaults import guess_cameras, guess_groups, guess_lidars
 from vinesim.robot.description.kinematics import joint_origin, link_anchors, moving_joints
-from vinesim.robot.description.meshes import resolve_meshes
+from vinesim.robot.description.meshes import replace_unopened_meshes, resolve_meshes
 from vinesim.robot.description.package_resources import find_installed
+from vinesim.robot.description.repairs import (
+    MOUNT,
+    add_missing_masses,
+    rename_world,
+    repair_inertias,
+    repair_joints,
+)
 from vinesim.robot.description.sidecar import Sidecar, check_sidecar, read_sidecar
 from vinesim.robot.description.urdf_checks import check_joints, check_masses, check_tree
 from vinesim.robot.description.urdf_model import Joint, Robot, parse_robot
@@ -33,35 +41,49 @@ from vinesim.scene import data_files
 
 log = logging.getLogger(__name__)
 
+BOLTED_EFFORT = (1e6, 1e6)
+"""[N], [N m] With which the base of a robot that is bolted down is held: a robot's pushes move it by micrometres."""
 
-def load_description(name: str | pathlib.Path) -> RobotDescription:
+
+def load_description(name: str | pathlib.Path, *, is_remote: bool = False) -> RobotDescription:
     """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
 
-    Raises :class:`DescriptionError` in one line if it cannot be simulated as it is.
+    ``is_remote``: its text came over the network, so no file that it names is opened.
+    Raises :class:`DescriptionError` in one line if it cannot be simulated.
     """
     file = _locate(str(name))
     root = read_xml(file)
     check_numbers(root, file)
     notes: list[str] = []
-    resolve_meshes(root, file, notes)
+    assumed: list[str] = []
+    if is_remote:
+        replace_unopened_meshes(root, assumed)
+    else:
+        resolve_meshes(root, file, notes)
     fix_wheels(root, notes)
+    rename_world(root, notes)
+    repair_joints(root, assumed)
+    repair_inertias(root, assumed)
     sidecar = read_sidecar(file.with_suffix(".toml"))
     cameras = sidecar.cameras if sidecar.cameras is not None else guess_cameras(root, notes)
     lidars = sidecar.lidars if sidecar.lidars is not None else guess_lidars(root, notes)
     sidecar = msgspec.structs.replace(sidecar, cameras=cameras, lidars=lidars)
-    urdf = etree.tostring(root, encoding="unicode")
     try:
         parsed = parse_robot(root)
     except ValueError as error:
         raise description_error(
             file, f"not a URDF: {error}", "give every link, joint and shape what URDF requires"
         ) from error
-    order = check_tree(parsed, file)
+    base, order = check_tree(parsed, file)
     check_joints(parsed, file)
-    check_masses(parsed, order, file, notes)
-    description = _assemble(parsed, order, file, urdf, sidecar, notes)
-    for note in description.notes:
+    check_masses(parsed, file, notes)
+    add_missing_masses(root, parsed, base, order, assumed)
+    urdf = etree.tostring(root, encoding="unicode")
+    description = _assemble(parse_robot(root), base, order, file, urdf, sidecar, notes, assumed)
+    for note in notes:
         log.info("%s: %s", file.name, note)
+    if assumed:
+        log.warning("%s: assumed: %s", file.name, "; ".join(assumed))
     return description
 
 
@@ -80,14 +102,15 @@ def _locate(name: str) -> pathlib.Path:
 
 def _assemble(
     robot: Robot,
+    base: str,
     order: list[Joint],
     file: pathlib.Path,
     urdf: str,
     sidecar: Sidecar,
     notes: list[str],
+    assumed: list[str],
 ) -> RobotDescription:
-    """The description of a checked ``robot``; ``order``: its joints from the root outwards."""
-    base = order[0].parent
+    """The description of a checked ``robot``; ``base``: its root link, ``order``: its joints outwards."""
     driven = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES and joint.mimic is None]
     names = [joint.name for joint in driven]
     anchors = link_anchors(base, order)
@@ -112,9 +135,11 @@ def _assemble(
         imus=sidecar.imus,
         wrenches=sidecar.wrenches,
         cutters=sidecar.cutters,
-        base_limits=sidecar.base,
+        base_limits=msgspec.structs.replace(sidecar.base, linear=0.0, angular=0.0, effort=BOLTED_EFFORT)
+        if base == MOUNT
+        else sidecar.base,
         mass=sum(link.inertial.mass or 0.0 for link in robot.links if link.inertial is not None),
         notes=(),
     )
-    drives = make_drives(robot, driven, description, notes)
-    return dataclasses.replace(description, drives=drives, notes=tuple(notes))
+    drives = make_drives(robot, driven, description, notes, assumed)
+    return dataclasses.replace(description, drives=drives, notes=(*notes, *assumed))

@@ -8,13 +8,13 @@ import pathlib
 import numpy as np
 
 from vinesim.robot.description.errors import description_error
-from vinesim.robot.description.kinematics import joint_limits, link_anchors
+from vinesim.robot.description.kinematics import joint_limits
 from vinesim.robot.description.urdf_model import Joint, Robot
 from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
 
 
-def check_tree(robot: Robot, file: pathlib.Path) -> list[Joint]:
-    """The joints from the root outwards; :class:`DescriptionError` if they are not one tree."""
+def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
+    """The root link, and the joints from it outwards; :class:`DescriptionError` if they are not one tree."""
     links = {link.name for link in robot.links}
     for kind, elements in (("link", robot.links), ("joint", robot.joints)):
         names = [element.name for element in elements]
@@ -22,9 +22,13 @@ def check_tree(robot: Robot, file: pathlib.Path) -> list[Joint]:
         if twice:
             raise description_error(file, f"{kind} {twice[0]!r} is there twice", "rename one")
     if "world" in links:
-        raise description_error(file, "a link is called 'world', which is the name of the world frame", "rename it")
-    if not robot.joints:
-        raise description_error(file, "no joints", "give a robot with at least one joint that moves")
+        raise description_error(
+            file,
+            "a link called 'world' is not the root",
+            "rename it, or make it the root to bolt the robot down",
+        )
+    if not robot.links:
+        raise description_error(file, "no links", "give a robot with at least one link")
     parent_of: dict[str, Joint] = {}
     children: dict[str, list[Joint]] = {}
     for joint in robot.joints:
@@ -53,13 +57,13 @@ def check_tree(robot: Robot, file: pathlib.Path) -> list[Joint]:
         joint = waiting.pop(0)
         order.append(joint)
         waiting.extend(children.get(joint.child, []))
-    if len(order) < len(robot.joints):
+    if not roots or len(order) < len(robot.joints):
         reached = {joint.name for joint in order}
         lost = next(joint.name for joint in robot.joints if joint.name not in reached)
         raise description_error(
             file, f"joint {lost!r} is part of a kinematic loop", "URDF is a tree: remove one joint of the loop"
         )
-    return order
+    return roots[0], order
 
 
 def check_joints(robot: Robot, file: pathlib.Path) -> None:
@@ -96,19 +100,13 @@ def check_joints(robot: Robot, file: pathlib.Path) -> None:
             raise description_error(
                 file, f"{where} has limits {limits.lower:g} to {limits.upper:g}", "give lower below upper"
             )
-    if not any(joint.type in MOVABLE_JOINT_TYPES and joint.mimic is None for joint in robot.joints):
-        raise description_error(file, "no joint moves", "give a robot with at least one joint that moves")
 
 
-def check_masses(robot: Robot, order: list[Joint], file: pathlib.Path, notes: list[str]) -> None:
-    """Raise :class:`DescriptionError` unless all that moves has mass and inertia, and every inertia is positive
-    definite.
+def check_masses(robot: Robot, file: pathlib.Path, notes: list[str]) -> None:
+    """Raise :class:`DescriptionError` unless masses are not negative and every inertia is positive definite.
 
     Inertias that violate the triangle inequality are added to ``notes``.
     """
-    carried: dict[str, float] = {}
-    turning: dict[str, float] = {}
-    anchors = link_anchors(order[0].parent, order)
     lopsided = []
     for link in robot.links:
         inertial = link.inertial
@@ -117,9 +115,6 @@ def check_masses(robot: Robot, order: list[Joint], file: pathlib.Path, notes: li
         mass, inertia = inertial.mass, inertial.inertia
         if mass < 0.0 or not math.isfinite(mass):
             raise description_error(file, f"link {link.name!r} has a mass of {mass:g} kg", "give it its mass")
-        carried[anchors[link.name][0]] = carried.get(anchors[link.name][0], 0.0) + mass
-        own = float(np.abs(inertia).max()) if inertia is not None else 0.0
-        turning[anchors[link.name][0]] = turning.get(anchors[link.name][0], 0.0) + own
         if inertia is not None and mass > 0.0:
             moments = np.linalg.eigvalsh(inertia)
             if moments[0] <= 0.0 and moments[2] > 0.0:
@@ -130,14 +125,5 @@ def check_masses(robot: Robot, order: list[Joint], file: pathlib.Path, notes: li
                 )
             if moments[0] + moments[1] < moments[2] * (1.0 - 1e-6):
                 lopsided.append(link.name)
-    for link in [order[0].parent, *(joint.child for joint in order if joint.type != "fixed")]:
-        if carried.get(link, 0.0) <= 0.0:
-            raise description_error(
-                file, f"link {link!r} moves but has no mass", "give it an <inertial> with a mass above 0"
-            )
-        if turning[link] <= 0.0:
-            raise description_error(
-                file, f"link {link!r} moves but has no inertia", "give it an <inertia> that is not all 0"
-            )
     if lopsided:
         notes.append(f"{len(lopsided)} inertias no real body has (triangle inequality), first {lopsided[0]!r}")

@@ -122,10 +122,11 @@ def _parse_link(element: etree._Element) -> Link:
             raise ValueError(f"a {shape.tag} of link {name!r} is a <{solids[0].tag}>")
         for attribute in _SHAPE_ATTRIBUTES[solids[0].tag]:
             _required(solids[0], attribute)
-    return Link(name, _parse_inertial(element.find("inertial")))
+    return Link(name, parse_inertial(element.find("inertial")))
 
 
-def _parse_inertial(element: etree._Element | None) -> Inertial | None:
+def parse_inertial(element: etree._Element | None) -> Inertial | None:
+    """The content of an ``<inertial>``; None if there is none."""
     if element is None:
         return None
     mass, inertia = element.find("mass"), element.find("inertia")

@@ -21,6 +21,7 @@ NUMBER_COUNTS = {
     **{("limit", key): 1 for key in ("lower", "upper", "effort", "velocity")},
     ("mimic", "multiplier"): 1, ("mimic", "offset"): 1, ("box", "size"): 3, ("sphere", "radius"): 1,
     **{(solid, key): 1 for solid in ("cylinder", "capsule") for key in ("radius", "length")}, ("mesh", "scale"): 3,
+    ("mesh", "bounds"): 6,
 }  # fmt: skip
 """Count of numbers in each attribute, by element and attribute."""
 
@@ -33,6 +34,8 @@ def read_xml(file: pathlib.Path) -> etree._Element:
         raise description_error(
             file, f"not well-formed XML: {error.msg}", "mend that line (is it a xacro? expand it)"
         ) from error
+    if root.getroottree().docinfo.internalDTD is not None:
+        raise description_error(file, "it declares a document type (DTD)", "remove <!DOCTYPE ...>: a URDF needs none")
     if root.tag != "robot":
         raise description_error(
             file, f"its root is <{root.tag}>, not <robot>", "give a URDF (MJCF and SDF are not read)"
@@ -59,7 +62,7 @@ def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
                 raise description_error(file, f"{where} has {len(numbers)} of {count} numbers", "give all of them")
             if not all(map(math.isfinite, numbers)):
                 raise description_error(file, f"{where} is not finite", "give a number")
-            if tag in SOLIDS and min(map(abs, numbers) if tag == "mesh" else numbers) <= 0.0:
+            if tag in SOLIDS and key != "bounds" and min(map(abs, numbers) if tag == "mesh" else numbers) <= 0.0:
                 raise description_error(file, f"{where} is no size", "give numbers above 0")
 
 

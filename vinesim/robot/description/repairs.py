@@ -1,0 +1,146 @@
+"""Repairs of URDFs as they are found in practice: what is missing or unfit is replaced, and each replacement is named.
+
+All functions change the XML of a URDF whose numbers were checked, and add what they assumed to ``assumed``, a line per
+kind. A repaired URDF needs no repair.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
+
+from vinesim.robot.description.kinematics import link_anchors
+from vinesim.robot.description.urdf_model import Joint, Robot, parse_inertial
+from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
+
+MOUNT = "world_mount"
+"""Name that the root link ``world`` gets: a robot with a root of this name is bolted down."""
+RANGE = ("lower", "upper")
+"""Attributes of a ``<limit>``; both at 0 or not given say nothing of a joint that turns."""
+DEFAULT_EFFORT = {"revolute": 10.0, "continuous": 10.0, "prismatic": 100.0}
+"""[N m or N] Effort of a joint that gives none or 0, beside the weight that it carries. GUESSED"""
+DEFAULT_VELOCITY = {"revolute": 1.0, "continuous": 1.0, "prismatic": 0.1}
+"""[rad/s or m/s] Velocity of a joint that gives none or 0. GUESSED"""
+DEFAULT_MASS = 1e-3
+"""[kg] Mass of a moving link without any. GUESSED"""
+GYRATION_RADIUS = 0.05
+"""[m] Radius of gyration of a moving link without inertia. GUESSED"""
+NEGLIGIBLE_MOMENT = 1e-6
+"""[kg m2] A principal moment below 0 by no more than this is a rounding error. GUESSED"""
+LEAST_MOMENT = 1e-12
+"""[kg m2] Principal moments up to this are none."""
+LEAST_MOMENT_SHARE = 1e-3
+"""Share of the largest principal moment to which rounding errors are raised."""
+
+
+def rename_world(root: etree._Element, notes: list[str]) -> None:
+    """Rename a root link ``world``, the name of the world frame, to :data:`MOUNT`; adds to ``notes``."""
+    links = [link for link in root.iterfind("link") if link.get("name") == "world"]
+    if not links or root.find("joint/child[@link='world']") is not None:
+        return
+    links[0].set("name", MOUNT)
+    for parent in root.iterfind("joint/parent[@link='world']"):
+        parent.set("link", MOUNT)
+    if links[0].find("inertial") is None:
+        _set_inertial(links[0], DEFAULT_MASS, np.identity(3) * DEFAULT_MASS * GYRATION_RADIUS**2)
+    notes.append(f"it is bolted down by its root link 'world', here called {MOUNT!r}")
+
+
+def repair_joints(root: etree._Element, assumed: list[str]) -> None:
+    """Give every joint that moves an effort and a velocity above 0 and a range, and mimics a source that is driven."""
+    joints = {joint.get("name"): joint for joint in root.iterfind("joint")}
+    moving = {name: joint for name, joint in joints.items() if joint.get("type") in MOVABLE_JOINT_TYPES}
+    freed, filled, unbounded = [], [], []
+    for name, joint in moving.items():
+        mimic = joint.find("mimic")
+        if mimic is not None and mimic.get("joint") not in moving:
+            joint.remove(mimic)
+            freed.append(name)
+        if joint.find("mimic") is not None:
+            continue
+        limit = joint.find("limit")
+        if limit is None:
+            limit = etree.SubElement(joint, "limit")
+        for key, defaults in (("effort", DEFAULT_EFFORT), ("velocity", DEFAULT_VELOCITY)):
+            if float(limit.get(key, 0.0)) == 0.0:
+                limit.set(key, f"{defaults[joint.get('type')]:g}")
+                filled.append(name)
+        if joint.get("type") == "revolute" and not any(float(limit.get(key, 0.0)) for key in RANGE):
+            limit.set("lower", f"{-math.pi:.9g}")
+            limit.set("upper", f"{math.pi:.9g}")
+            unbounded.append(name)
+    filled = list(dict.fromkeys(filled))
+    if freed:
+        assumed.append(f"{some_names(freed)} mimics no joint that moves: driven by itself")
+    if filled:
+        assumed.append(
+            f"{some_names(filled)} has no effort or no velocity above 0: "
+            f"{DEFAULT_EFFORT['revolute']:g} N m or {DEFAULT_EFFORT['prismatic']:g} N, "
+            f"{DEFAULT_VELOCITY['revolute']:g} rad/s or {DEFAULT_VELOCITY['prismatic']:g} m/s"
+        )
+    if unbounded:
+        assumed.append(f"{some_names(unbounded)} turns without lower and upper limits: half a turn to either side")
+
+
+def repair_inertias(root: etree._Element, assumed: list[str]) -> None:
+    """Raise principal moments that are not above 0 by a rounding error only."""
+    repaired = []
+    for link in root.iterfind("link"):
+        inertial = parse_inertial(link.find("inertial"))
+        if inertial is None or inertial.inertia is None or not inertial.inertia.any():
+            continue
+        moments, axes = np.linalg.eigh(inertial.inertia)
+        if moments[0] > LEAST_MOMENT or moments[0] < -NEGLIGIBLE_MOMENT:
+            continue
+        raised = np.maximum(moments, LEAST_MOMENT_SHARE * moments[2]) if moments[2] > LEAST_MOMENT else np.zeros(3)
+        _set_inertial(link, inertial.mass or 0.0, axes * raised @ axes.T)
+        repaired.append(link.get("name"))
+    if repaired:
+        assumed.append(f"inertia of {some_names(repaired)} is not positive definite: its smallest moments are raised")
+
+
+def add_missing_masses(root: etree._Element, robot: Robot, base: str, order: list[Joint], assumed: list[str]) -> None:
+    """Give a mass and an inertia to each moving body of ``robot``, parsed from ``root``, that has none.
+
+    ``base``: its root link, ``order``: its joints outwards. A body is a moving link and all that is fixed to it.
+    """
+    anchors = link_anchors(base, order)
+    mass = dict.fromkeys((base, *(joint.child for joint in order if joint.type != "fixed")), 0.0)
+    inertia = dict(mass)
+    for link in robot.links:
+        if link.inertial is not None:
+            anchor = anchors[link.name][0]
+            mass[anchor] += link.inertial.mass or 0.0
+            inertia[anchor] += 0.0 if link.inertial.inertia is None else float(np.abs(link.inertial.inertia).max())
+    lacking = [link for link in mass if mass[link] == 0.0 or inertia[link] == 0.0]
+    elements = {link.get("name"): link for link in root.iterfind("link")}
+    for link in lacking:
+        own = mass[link] or DEFAULT_MASS
+        existing = parse_inertial(elements[link].find("inertial"))
+        kept = existing.mass if existing is not None and existing.mass else (0.0 if mass[link] else DEFAULT_MASS)
+        _set_inertial(elements[link], kept, np.identity(3) * own * GYRATION_RADIUS**2)
+    if lacking:
+        assumed.append(
+            f"{some_names(lacking)} moves without mass or inertia: {1e3 * DEFAULT_MASS:g} g, "
+            f"radius of gyration {1e3 * GYRATION_RADIUS:g} mm"
+        )
+
+
+def some_names(names: list[str]) -> str:
+    """The first name, and how many more there are."""
+    return repr(names[0]) + (f" (and {len(names) - 1} more)" if len(names) > 1 else "")
+
+
+def _set_inertial(link: etree._Element, mass: float, inertia: np.ndarray) -> None:
+    """Give a link this mass [kg] and inertia [3, 3] kg m2; the centre of mass stays."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        inertial = etree.SubElement(link, "inertial")
+    for tag in ("mass", "inertia"):
+        for element in inertial.findall(tag):
+            inertial.remove(element)
+    etree.SubElement(inertial, "mass", value=f"{mass:.9g}")
+    keys = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    etree.SubElement(inertial, "inertia", {key: f"{inertia[at]:.9g}" for key, at in keys.items()})
