@@ -251,6 +251,15 @@ def test_no_file_that_a_text_from_the_network_names_is_opened(
     assert np.isfinite(yard.run(0.1)).all()
 
 
+@pytest.mark.parametrize("effort", ["1e16", "1e-300"])
+def test_extreme_limits_leave_the_physics_finite(effort: str, tmp_path: pathlib.Path) -> None:
+    limit = f'<limit lower="-1e16" upper="1e16" effort="{effort}" velocity="{effort}"/>'
+    file = write(tmp_path, link("base"), link("arm", 1.0, "1 0 0"), joint("j", "base", "arm", limit))
+    yard = Yard(load_description(file, is_remote=True))
+    assert np.isfinite(yard.run(0.2)).all()
+    assert np.isfinite(yard.rigid.base_state("anna")[0]).all()
+
+
 @pytest.mark.parametrize("declared", ["SYSTEM 'file:///dev/null'", "[<!ENTITY secret SYSTEM 'secret.txt'>]"])
 def test_a_text_with_a_document_type_is_refused(declared: str, tmp_path: pathlib.Path) -> None:
     """So no entity exists: neither one of a file nor one that grows."""
