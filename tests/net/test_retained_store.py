@@ -135,7 +135,8 @@ def test_records_stay_in_memory_while_the_disk_is_full_and_are_written_afterward
 
 
 @pytest.mark.parametrize(
-    "key", ["w/fact/ada", "w/fact/0/ada", "w/fact/x/0/ada", "w/fact/0/0/0/ada", "w/fact/99999999999/0/ada"]
+    "key",
+    ["w", "w/fact", "", "w/fact/ada", "w/fact/0/ada", "w/fact/x/0/ada", "w/fact/0/0/0/ada", "w/fact/99999999999/0/ada"],
 )
 def test_a_key_without_a_valid_cell_is_malformed(key):
     store = RetainedStore()
@@ -143,6 +144,42 @@ def test_a_key_without_a_valid_cell_is_malformed(key):
     store.submit(key, messages.encode_records([record()]))
     store.close()
     assert (store.counters.malformed, store.count()) == (1, 0)
+
+
+def test_a_message_that_ends_in_an_error_does_not_end_the_thread(monkeypatch, caplog):
+    store = RetainedStore(quota=UNLIMITED)
+    store.open("w", SCENE)
+    original = messages.decode_records
+    failing = [True, True, False]
+    monkeypatch.setattr(messages, "decode_records", lambda payload: 1 // 0 if failing.pop(0) else original(payload))
+    for _ in range(3):
+        submit(store, record())
+    wait(lambda: store.count() == 1, "the third to be kept")
+    store.close()
+    assert store.counters.errors == 2
+    assert len([line for line in caplog.messages if "ended in an error" in line]) == 1
+
+
+def test_a_thread_that_has_ended_is_reported(monkeypatch):
+    store = RetainedStore()
+    monkeypatch.setattr(store, "_ingest_guarded", lambda *_: 1 // 0)
+    submit(store, record())
+    wait(lambda: "has ended" in store.status_message, "the thread to end")
+
+
+def test_bytes_of_messages_that_wait_are_bounded(monkeypatch):
+    monkeypatch.setattr(retained_store, "MAX_EARLY_BYTES", 1000)
+    monkeypatch.setattr(retained_store, "MAX_QUEUED_BYTES", 5000)
+    store = RetainedStore(quota=UNLIMITED)
+    for _ in range(4):  # no actor was admitted to this world
+        store.submit("w/fact/0/0/ada", bytes(400))
+    wait(lambda: store.counters.rejected == 2, "the oldest to be discarded")
+    store.submit("w/fact/0/0/ada", bytes(5001))
+    assert store.counters.rejected == 3
+    store.open("w", SCENE)
+    wait(lambda: store.counters.malformed == 2, "those that waited")
+    store.close()
+    assert store._queued_bytes.value == 0
 
 
 def test_records_beyond_the_queue_limit_are_rejected(monkeypatch):

@@ -89,6 +89,22 @@ def test_a_step_of_the_time_of_day_does_not_move_the_network_time(monkeypatch, s
         assert abs(server_minus_own_time(ada) - before) < 60.0
 
 
+def test_questions_with_wildcards_or_missing_parts_are_counted_and_nothing_ends():
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        session = ada.session_for(reliable=True)
+        for key in ("vs/1/**", "vs/1/*/*/*/*", "**"):
+            for payload in (b"", messages.encode_time(1.0)):
+                assert [reply for reply in session.get(key, payload=payload, timeout=2.0) if reply.ok] == []
+        assert server.malformed >= 6
+        session.put("vs/1/vineyard/fact", b"")
+        session.put("vs/1/vineyard/fact/0/0/ada/more", b"")
+        wait(lambda: server.store.counters.malformed == 2, "the keys without a cell")
+        ada.join(hello("ada"))
+        publish(ada, (0, 0), box(1))
+        assert snapshot(ada, (0, 0), 1) == [box(1)]
+        assert server.figures()["trouble"] == ""
+
+
 def test_run_returns_when_stopped():
     with Server("tcp/127.0.0.1:0") as server:
         thread = threading.Thread(target=server.run)

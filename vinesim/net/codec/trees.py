@@ -226,7 +226,8 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> TreeSta
     if not cuts.any():
         return TreeStates(*known)
     roots = np.frombuffer(payload, _ROOT, int(cuts.sum()), after)
-    root, root_x = roots["body"].astype(np.int64), roots["position"].astype(float)
+    with np.errstate(invalid="ignore"):  # of signalling NaNs, which are refused below
+        root, root_x = roots["body"].astype(np.int64), roots["position"].astype(float)
     if (root >= np.repeat(bodies, cuts)).any() or not (np.abs(root_x) < MAX_COORDINATE).all():
         raise MessageError("a detached body that the tree does not have, or with a position out of range")
     if (np.diff(root)[np.diff(np.repeat(tree, cuts)) == 0] <= 0).any():

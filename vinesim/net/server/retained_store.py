@@ -39,6 +39,9 @@ RETRY_PERIOD = 5.0
 MAX_QUEUED = 10_000
 """Messages in the queue; further ones are dropped."""
 
+MAX_QUEUED_BYTES = 64 << 20
+"""Payload bytes of the same [B]."""
+
 
 class Quota(NamedTuple):
     """Sustained rate at which one actor may publish records; :data:`BURST_TIME` worth of it may arrive at once."""
@@ -52,8 +55,24 @@ class Quota(NamedTuple):
 MAX_EARLY = 1000
 """Messages that wait for the admission of their author, who may publish before it is admitted again."""
 
+MAX_EARLY_BYTES = 16 << 20
+"""Payload bytes of the same [B]."""
+
 BURST_TIME = 5.0
 """Time [s] of its quota that an actor may use at once."""
+
+
+class _Sum:
+    """A number that several threads add to."""
+
+    def __init__(self) -> None:
+        self.value = 0
+        self._lock = threading.Lock()
+
+    def add(self, amount: int) -> None:
+        """Add an amount, which may be negative."""
+        with self._lock:
+            self.value += amount
 
 
 class _TokenBucket:
@@ -88,6 +107,8 @@ class StoreCounters:
     """... of actors beyond their quota."""
     rejected: int = 0
     """... of worlds without an admitted actor, of too many objects, or beyond the queue."""
+    errors: int = 0
+    """... that ended in an unexpected error."""
     snapshots: int = 0
     """Queries for the records of a cell."""
 
@@ -105,6 +126,7 @@ class RetainedStore:
         self._scenes: dict[str, SceneId] = {world: journal.scene_id for world, journal in self._journals.items()}
         self._queue: collections.deque[tuple[str, bytes]] = collections.deque()
         self._early: collections.deque[tuple[str, bytes]] = collections.deque()
+        self._early_bytes, self._queued_bytes = 0, _Sum()
         self._buckets: dict[tuple[str, str], _TokenBucket] = {}
         self._warned: set[tuple[str, str]] = set()
         self._lock = threading.Lock()
@@ -131,8 +153,9 @@ class RetainedStore:
             if not self._states.get(world):
                 self._scenes[world] = scene
                 self._states.setdefault(world, RetainedState())
-            early, self._early = self._early, collections.deque()
+            early, self._early, early_bytes, self._early_bytes = self._early, collections.deque(), self._early_bytes, 0
             self._queue.extend(early)
+            self._queued_bytes.add(early_bytes)
         self._wakeup.set()
 
     def submit(self, key: str, payload: bytes) -> None:
@@ -140,9 +163,10 @@ class RetainedStore:
         self.counters.received += 1
         if len(payload) > messages.MAX_MESSAGE:
             payload = b""  # counted as malformed by the thread
-        if len(self._queue) >= MAX_QUEUED:
+        if len(self._queue) >= MAX_QUEUED or self._queued_bytes.value + len(payload) > MAX_QUEUED_BYTES:
             self.counters.rejected += 1
             return
+        self._queued_bytes.add(len(payload))
         self._queue.append((key, payload))
         self._wakeup.set()
 
@@ -171,6 +195,14 @@ class RetainedStore:
     # ------------------------------------------------------------ the store's own thread
 
     def _run(self) -> None:
+        """Body of the thread; if it ends by an error, :attr:`status_message` says so from then on."""
+        try:
+            self._keep_records()
+        except Exception as error:
+            log.exception("the thread that keeps records has ended")
+            self.status_message = f"the thread that keeps records has ended, restart the server: {error!r}"
+
+    def _keep_records(self) -> None:
         synced_at = time.monotonic()
         unsynced: set[str] = set()
         while True:
@@ -178,7 +210,7 @@ class RetainedStore:
             self._wakeup.clear()
             closing = self._closing
             while self._queue:
-                if world := self._ingest(*self._queue.popleft()):
+                if world := self._ingest_guarded(*self._queue.popleft()):
                     unsynced.add(world)
                 if time.monotonic() - synced_at >= SYNC_PERIOD:
                     break
@@ -210,9 +242,21 @@ class RetainedStore:
         else:
             log.warning("records are written again")
 
+    def _ingest_guarded(self, key: str, payload: bytes) -> str:
+        """As :meth:`_ingest`; a message that ends in an unexpected error is dropped, and only that."""
+        self._queued_bytes.add(-len(payload))
+        try:
+            return self._ingest(key, payload)
+        except Exception:
+            if self.counters.errors == 0:
+                log.exception("records under %r ended in an error; further ones are only counted", key)
+            self.counters.errors += 1
+            return ""
+
     def _ingest(self, key: str, payload: bytes) -> str:
         """Merge the records of one message; the name of the world if it must be synced, else empty."""
-        world, _, *where, actor = key.split("/")
+        chunks = key.split("/")
+        world, where, actor = chunks[0], chunks[2:-1], chunks[-1]
         try:
             cell = (int(where[0]), int(where[1])) if len(where) == 2 else None
             if cell is None or not all(-(1 << 31) <= number < 1 << 31 for number in cell):
@@ -224,8 +268,9 @@ class RetainedStore:
             state = self._states.get(world)
             if state is None:
                 self._early.append((key, payload))
-                if len(self._early) > MAX_EARLY:
-                    self._early.popleft()
+                self._early_bytes += len(payload)
+                while len(self._early) > MAX_EARLY or self._early_bytes > MAX_EARLY_BYTES:
+                    self._early_bytes -= len(self._early.popleft()[1])
                     self.counters.rejected += 1
                 return ""
         now = time.monotonic()

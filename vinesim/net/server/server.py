@@ -166,6 +166,7 @@ class Server:
                 "facts_heard": counters.received,
                 "facts_over_quota": counters.over_quota,
                 "facts_strange": counters.rejected,
+                "facts_failed": counters.errors,
                 "snapshots": counters.snapshots,
                 "trouble": self.store.status_message,
             }
@@ -213,15 +214,19 @@ class Server:
             except MessageError as error:
                 self._count_malformed(f"{_strip_root(query.key_expr)}", error)
                 return
+            if "*" in str(query.key_expr):
+                self._count_malformed(_strip_root(query.key_expr), MessageError("the question names no world"))
+                return
             self.pings += 1
             query.reply(str(query.key_expr), messages.encode_time(asked, self._clock_origin + time.monotonic()))
 
     def _on_join_query(self, query: zenoh.Query) -> None:
         with query:
             key = _strip_root(query.key_expr)
-            world, _, name, session = key.split("/")
-            if "*" in key or self.store is None:
+            if "*" in key or key.count("/") != 3 or self.store is None:
+                self._count_malformed(key, MessageError("an actor asks for itself alone"))
                 return
+            world, _, name, session = key.split("/")
             with self._lock:
                 if (kept := self.store.scene_of(world)) is not None:
                     self._admission.pin_scene(world, kept)
@@ -234,8 +239,10 @@ class Server:
 
     def _on_snapshot_query(self, query: zenoh.Query) -> None:
         with query:
-            world, _, x, y = _strip_root(query.key_expr).split("/")
-            if world == "*" or self.store is None:
+            key = _strip_root(query.key_expr)
+            world, *_, x, y = key.split("/") if key.count("/") == 3 else ("*", "", "")
+            if "*" in world or self.store is None:
+                self._count_malformed(key, MessageError("the question names no world and no cell"))
                 return
             cells: list[Cell]
             try:
