@@ -236,6 +236,7 @@ class Client:
                 grabbed=objects.with_trees(detached), detached=detached, detached_roots=objects.cut_roots,
                 is_changed=objects.is_changed,
                 pose_on_support=self.physics.support_tracker.pose_on_support,
+                has_body=self.physics.support_tracker.__contains__,
                 wrenches=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
             )  # fmt: skip
             for update in settled:
