@@ -8,6 +8,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 
 from tests.support.live_server import ServerProcess, wait
 from vinesim.bench import message_fuzz
@@ -16,31 +17,66 @@ from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, tre
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.codec import messages
-from vinesim.net.replication import dead_reckoning
+from vinesim.net.replication import dead_reckoning, interest
+from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.model_check import check_record
+from vinesim.net.replication.streams import object_counts
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.spec import load_scene
+from vinesim.scene.values import RobotUpdate
 
 
-def test_a_flood_of_malformed_messages_is_counted_logged_once_and_leaves_all_in_agreement(caplog):
+@pytest.mark.parametrize("kind", ["robot", "human"])
+def test_a_flood_of_malformed_messages_is_counted_logged_once_and_leaves_all_in_agreement(caplog, kind):
     """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
-    ada, bob, _, arrived = message_fuzz.run_storm(3_000, seed=11)
+    result = message_fuzz.run_storm(3_000, seed=11, kind=kind)
+    ada, bob = result.clients
     log_lines = [
         record.message for record in caplog.records if ATTACKER in record.message and "dropped" in record.message
     ]
     assert len(log_lines) == 2, "once by each of the two receivers"
     counters = ada.replicator.counters
-    assert arrived > 1_500
-    assert counters.malformed > 0.3 * arrived
-    assert counters.malformed + counters.dropped <= 2 * arrived
+    assert result.arrived > 1_500
+    assert counters.malformed > 0.3 * result.arrived
+    assert counters.retained.messages_in > 200
     for fake_client in (ada, bob):
         for tree in (1, 2):
             assert fake_client.replicator.owner(tree) == "ada"
-        for update in fake_client.robots.values():
-            assert np.isfinite(np.concatenate([update.base_q, update.base_qd, update.position, update.velocity])).all()
+        _assert_possible(fake_client)
     assert bob.heard[2] > 0.0
+
+
+def test_a_flood_from_a_stranger_changes_nothing():
+    """A program that was never admitted, under its own and other names."""
+    ada, bob = message_fuzz.run_storm(3_000, seed=12, is_stranger=True).clients
+    counters = ada.replicator.counters
+    assert counters.retained.messages_in > 200
+    assert counters.dropped > 1_000
+    for fake_client in (ada, bob):
+        assert fake_client.replicator.known == {1, 2}, "what ada touched, and nothing else"
+        assert fake_client.facts == {}
+        assert set(fake_client.robots) == {"ada", "bob"} - {fake_client.name}
+        assert fake_client.replicator.owner(1) == fake_client.replicator.owner(2) == "ada"
+
+
+def _assert_possible(fake_client: FakeClient) -> None:
+    """Nothing is believed that the model forbids."""
+    replicator, model = fake_client.replicator, fake_client.model
+    counts = object_counts(model)
+    for number in replicator.known:
+        messages.check_object_id(number, counts)
+    records = [record for record in map(replicator.record, sorted(fake_client.facts)) if record is not None]
+    assert records
+    for record in records:
+        check_record(record, model, counts)
+    for update in fake_client.robots.values():
+        assert np.isfinite(update.base_q).all()
+        if isinstance(update, RobotUpdate):
+            assert np.isfinite(np.concatenate([update.base_qd, update.position, update.velocity])).all()
 
 
 def test_a_message_from_the_far_future_does_not_block_its_sender():
@@ -117,6 +153,42 @@ def test_a_client_with_physics_survives_malformed_messages():
     assert np.linalg.norm(base[:3] - pose[:3]) < 0.5
     assert client.replicator.counters.malformed > 100
     assert client.replicator.peers == {}
+
+
+def test_a_hanging_bunch_that_is_claimed_by_an_actor_who_leaves_goes_on_hanging():
+    """Its claim passes to the nearest actor, in whose simulation the bunch is part of its tree."""
+    scene = load_scene("demo")
+    model = generate(scene)
+    hub = MemoryHub()
+    now = [10.0]
+    pose = spawn_pose(scene, 0)
+    client = Client(
+        scene, model, load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
+    )  # fmt: skip
+    other = FakeClient(hub.bus("bob"), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
+
+    def tick() -> None:
+        hub.advance(0.01)
+        now[0] += 0.01
+        client.tick()
+        other.tick(now[0])
+
+    for _ in range(60):
+        tick()
+    bunch = object_id(ObjectKind.BUNCH, 5)
+    x, y = interest.cell_of(pose[:3])
+    claims = messages.encode_claims([(bunch, Claim(1, 1, "bob"), True)])
+    assert other.bus.publisher(f"own/{x}/{y}/bob", reliable=True).put(claims)
+    tick()
+    assert client.replicator.owner(bunch) == "bob"
+    other.bus.close()
+    for _ in range(20):
+        hub.advance(0.01)
+        now[0] += 0.01
+        client.tick()
+    assert client.replicator.owner(bunch) is None
+    assert client.replicator.record(bunch) is None
+    assert client.physics.state.bunch_attached[5]
 
 
 def test_zenoh_sessions_and_the_server_survive_malformed_messages():

@@ -311,6 +311,7 @@ FAULTS = {
     "joint of no type": (robot().replace('type="revolute"', ""), "type None"),
     "half an axis": (robot().replace("0 0 1", "0 1"), "xyz=\"0 1\"> of joint 'shoulder_joint' has 2 of 3 numbers"),
     "not a number": (robot(arm_mass="nan"), "is not finite"),
+    "a mass that nothing has": (robot(arm_mass="1e300"), "is beyond 1e+06"),
     "a word": (robot(arm_mass="heavy"), "<mass value=\"heavy\"> of link 'arm' is no number"),
     "endless effort": (robot(arm_joint="<limit lower='0' upper='1' effort='inf' velocity='1'/>"), "is not finite"),
     "flat box": (

@@ -163,6 +163,7 @@ def test_a_gripper_with_a_mimic_finger_opens_as_far_as_asked(
     yard.run(1.0)
     left, right = (yard.rigid.link_pose("anna", name)[1] for name in ("left", "right"))
     assert left - right == pytest.approx(0.05, abs=1e-4)
+    assert yard.robot.gripper_opening("gripper_left") == pytest.approx(left - right, abs=1e-4)
 
 
 # ---------------------------------------------------------------------- the robots of example-robot-data
@@ -248,6 +249,15 @@ def test_no_file_that_a_text_from_the_network_names_is_opened(
     np.testing.assert_allclose(shape.size, [0.4, 0.2, 0.25])
     np.testing.assert_allclose(shape.pose[:3], [0.2, 0.0, 0.25], atol=1e-9)
     assert np.isfinite(yard.run(0.1)).all()
+
+
+@pytest.mark.parametrize("effort", ["1e16", "1e-300"])
+def test_extreme_limits_leave_the_physics_finite(effort: str, tmp_path: pathlib.Path) -> None:
+    limit = f'<limit lower="-1e16" upper="1e16" effort="{effort}" velocity="{effort}"/>'
+    file = write(tmp_path, link("base"), link("arm", 1.0, "1 0 0"), joint("j", "base", "arm", limit))
+    yard = Yard(load_description(file, is_remote=True))
+    assert np.isfinite(yard.run(0.2)).all()
+    assert np.isfinite(yard.rigid.base_state("anna")[0]).all()
 
 
 @pytest.mark.parametrize("declared", ["SYSTEM 'file:///dev/null'", "[<!ENTITY secret SYSTEM 'secret.txt'>]"])

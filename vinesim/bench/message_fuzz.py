@@ -1,17 +1,20 @@
 """``vinesim bench fuzz``: a hundred thousand corrupted messages from an admitted actor, and their effect.
 
-Every message begins as a valid one of any kind and is then corrupted: bits flipped, cut off, extended, spliced with
-another, filled with extreme values, sent again later, sent under the key of another kind, or replaced by noise or by a
-megabyte.
+Every message begins as a well-formed one of any kind, whose content may be impossible (records with cuts, parents and
+states of trees, objects that there are not), and is then corrupted: bits flipped, cut off, extended, spliced with
+another, filled with extreme values, sent again later, sent under the key of another kind or under an odd key, or
+replaced by noise or by a megabyte. It comes from an admitted actor, or from a stranger under any name.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import random
 import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
+import msgspec
 import numpy as np
 
 from vinesim import frames
@@ -22,6 +25,7 @@ from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.streams import object_counts
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
@@ -39,24 +43,22 @@ _EXTREMES = (
 
 
 def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Random) -> tuple[str, bytes]:
-    """A family of keys and a message as ``actor`` might send it."""
-    kind = chance.choice(("a", "c", "things", "own", "fact", "force", "hello"))
-    tree = chance.randrange(len(model.tree_first))
-    claim = Claim(chance.randrange(3), chance.randrange(1 << 16), ATTACKER)
+    """A family of keys and a well-formed message as ``actor`` might send it; what it says may be impossible."""
+    kind = chance.choice(("a", "c", "things", "own", "fact", "force", "control"))
+    claim = Claim(chance.randrange(3), chance.randrange(1 << 16), actor.name)
     if kind == "a":
         return kind, encode_pose(actor.pose(now))
     if kind == "force":
-        return kind, encode_wrenches(WrenchMessage(now, {"base_link": np.array([chance.uniform(-50.0, 50.0)] * 6)}))
+        links = chance.sample(
+            ("base_link", "arm_left_1_link", "arm_left_7_link", "no such link", ""), chance.randint(0, 3)
+        )
+        return kind, encode_wrenches(
+            WrenchMessage(now, {link: np.array([chance.uniform(-1, 1) for _ in range(6)]) * 2000.0 for link in links})
+        )
     if kind == "c":
-        q, qd = swinging_state(model, tree, now)
-        flags = np.array([chance.choice((0, messages.TOUCHED, messages.RESTING))])
-        record = messages.TreeStates(
-            now, np.array([tree]), np.array([claim.ownership]), np.array([claim.authority]), flags,
-            np.array([len(q)]), q, qd,
-        )  # fmt: skip
-        return kind, messages.encode_trees(record)[0][0]
+        return kind, _trees_message(model, chance.randrange(len(model.tree_first)), claim, now, chance)
     if kind == "things":
-        number = np.array([object_id(ObjectKind.BOX, tree)])
+        number = np.array([_object_id(model, chance.choice((ObjectKind.BUNCH, ObjectKind.BOX)), chance)])
         flags = np.array([messages.TOUCHED])
         record = messages.ObjectStates(
             now, number, np.array([claim.ownership]), np.array([claim.authority]), flags,
@@ -64,11 +66,87 @@ def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Ra
         )  # fmt: skip
         return "c", messages.encode_objects(record, (0, 0))[0][0]
     if kind == "own":
-        return kind, messages.encode_claims([(tree, claim, chance.random() < 0.5)])
+        number = _object_id(model, chance.choice(tuple(ObjectKind)), chance)
+        return kind, messages.encode_claims([(number, claim, chance.random() < 0.5)])
     if kind == "fact":
-        fact = RetainedRecord(object_id(ObjectKind.BUNCH, tree), claim.ownership, claim.authority, ATTACKER)
-        return kind, messages.encode_records([fact])
-    return "own", messages.encode_hello(Hello(ATTACKER, scene="fake_clients", digest="fake_clients"))
+        records = [_record(model, claim, now, chance) for _ in range(chance.randint(1, 3))]
+        return kind, messages.encode_records(records)
+    return chance.choice(("own", "fact", "c")), chance.choice((
+        messages.encode_hello(Hello(actor.name, scene="fake_clients", digest="fake_clients")),
+        messages.encode_time(now, chance.uniform(-1e9, 1e9)),
+        messages.encode_welcome(messages.Welcome("go away")),
+    ))  # fmt: skip
+
+
+def _object_id(model: Model, kind: ObjectKind, chance: random.Random) -> int:
+    """Id of an object, now and then of one more than there are."""
+    return object_id(kind, chance.randrange(object_counts(model)[kind] + (chance.random() < 0.1) or 1))
+
+
+def _trees_message(model: Model, tree: int, claim: Claim, now: float, chance: random.Random) -> bytes:
+    """A state of one tree, now and then with bodies that were cut off it."""
+    q, qd = swinging_state(model, tree, now)
+    flags = chance.choice((0, messages.TOUCHED, messages.RESTING))
+    count = chance.randint(1, min(3, len(q))) if chance.random() < 0.3 else 0
+    states = messages.TreeStates(
+        now, np.array([tree]), np.array([claim.ownership]), np.array([claim.authority]), np.array([flags]),
+        np.array([len(q)]), q, qd,
+        roots=np.array([count]), root=np.array(sorted(chance.sample(range(len(q)), count)), np.int64),
+        root_x=np.array([[chance.uniform(-3.0, 3.0) for _ in range(3)] for _ in range(count)]).reshape(-1, 3),
+        root_xd=np.array([[chance.uniform(-30.0, 30.0) for _ in range(3)] for _ in range(count)]).reshape(-1, 3),
+    )  # fmt: skip
+    return messages.encode_trees(states)[0][0]
+
+
+def _record(model: Model, claim: Claim, now: float, chance: random.Random) -> RetainedRecord:
+    """A retained record of any object: parents, cuts and states, true or impossible."""
+    kind = chance.choice(tuple(ObjectKind))
+    number = _object_id(model, kind, chance)
+    x, y, z = (chance.choice((chance.uniform(-3.0, 3.0), chance.uniform(-1e5, 1e5))) for _ in range(3))
+    pose = (x, y, z, 0.0, 0.0, 0.0, 1.0)
+    record = RetainedRecord(
+        number, claim.ownership, claim.authority, claim.owner, pose=pose, moving=chance.random() < 0.3,
+        parent=chance.choice(_PARENTS) if kind != ObjectKind.TREE or chance.random() < 0.1 else "",
+    )  # fmt: skip
+    if kind != ObjectKind.TREE and chance.random() < 0.9:
+        return record
+    tree = min(number, len(model.tree_first) - 1) if kind == ObjectKind.TREE else 0
+    first, size = int(model.tree_first[tree]), int(model.tree_size[tree])
+    bodies = range(first, first + size + (chance.random() < 0.1))
+    cut = tuple(sorted(chance.sample(bodies, chance.randint(0, min(3, len(bodies))))))
+    other = tree if chance.random() < 0.8 else chance.randrange(len(model.tree_first))
+    state = chance.choice((b"", _trees_message(model, other, claim, now, chance), chance.randbytes(30)))
+    return msgspec.structs.replace(record, cut=cut, trees=state)
+
+
+_PARENTS = (
+    "", "box/0", "box/1", "box/2", "bunch/0", "ada/base_link", "evil/hand", "nobody/link", "box/-1", "box/1e9",
+    "box/" + "9" * 40, "tree/0", "box/", "/", "box/\u0661", "\x00",
+)  # fmt: skip
+"""Parents of records: boxes that lie in each other, links, and names of nothing."""
+
+
+def key_of(family: str, name: str, cells: list[interest.Cell], chance: random.Random) -> str:
+    """Key of a message of ``name``; one in ten is of another family, of another cell, too short or too long."""
+    if chance.random() < 0.1:
+        family = chance.choice(("a", "c", "own", "fact", "force"))
+    x, y = chance.choice(cells)
+    if chance.random() < 0.05:
+        odd = (
+            f"{family}",
+            f"{family}/{x}",
+            f"{family}/{x}/{y}",
+            f"{family}/{x}/{y}/{name}/more",
+            f"{family}/x/y/{name}",
+            f"{family}/{1 << 70}/{y}/{name}",
+            f"{family}/{x}/{y}/{'n' * 60}",
+            f"{family}/{x}/{y}/\u00e9",
+            name,
+        )
+        return chance.choice(odd)
+    if family == "a":
+        return chance.choice((f"a/{name}", f"a/{name}/far"))
+    return f"force/ada/{name}" if family == "force" else f"{family}/{x}/{y}/{name}"
 
 
 def corrupt(payload: bytes, other: bytes, chance: random.Random) -> bytes:
@@ -98,8 +176,11 @@ def corrupt(payload: bytes, other: bytes, chance: random.Random) -> bytes:
     return bytes(data)
 
 
-def storm(model: Model, actor: FakeClient, seed: int, now: float = 0.0) -> Iterator[tuple[str, bytes]]:
-    """Corrupted messages without end, each with the key it is sent under."""
+def storm(
+    model: Model, actor: FakeClient, seed: int, now: float = 0.0, names: Sequence[str] = ()
+) -> Iterator[tuple[str, bytes]]:
+    """Corrupted messages without end, each with the key it is sent under; ``names`` of senders instead of the actor's
+    own."""
     chance = random.Random(seed)
     cells = sorted({interest.cell_of(pose[:3]) for pose in model.tree_pose.astype(float)})
     earlier = [encode_pose(actor.pose(now))]
@@ -110,41 +191,46 @@ def storm(model: Model, actor: FakeClient, seed: int, now: float = 0.0) -> Itera
             earlier = [*earlier[-50:], bad]
         if chance.random() < 0.1:
             bad = chance.choice(earlier)
-        if chance.random() < 0.1:
-            family = chance.choice(("a", "c", "own", "fact", "force"))
-        x, y = chance.choice(cells)
-        if family == "a":
-            key = chance.choice((f"a/{ATTACKER}", f"a/{ATTACKER}/far"))
-        else:
-            key = f"force/ada/{ATTACKER}" if family == "force" else f"{family}/{x}/{y}/{ATTACKER}"
         now += 0.001
-        yield key, bad
+        yield key_of(family, chance.choice(names or (actor.name,)), cells, chance), bad
 
 
-def run_storm(count: int, seed: int = 0) -> tuple[FakeClient, FakeClient, np.ndarray, int]:
-    """A storm against two clients: both, the time of each step of the first [s], and how many messages reached it."""
+@dataclasses.dataclass(frozen=True, slots=True)
+class Storm:
+    """What is left of a storm against two clients."""
+
+    clients: tuple[FakeClient, FakeClient]
+    step_times: np.ndarray
+    """Time of each step of the first client [s]."""
+    arrived: int
+    """Messages that reached the first client."""
+
+
+def run_storm(count: int, seed: int = 0, *, is_stranger: bool = False, kind: str = "robot") -> Storm:
+    """A storm against two clients from an admitted actor of ``kind``, or from a program that never was admitted."""
     hub = MemoryHub(delay=0.005, seed=seed)
     server = hub.bus("server")
     server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
     model = tree_row()
-    ada, bob, evil = (
-        FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0), (ATTACKER, 3.0))
-    )
-    clients = (ada, bob, evil)
+    ada, bob = (FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0)))
+    evil = FakeClient((MemoryHub() if is_stranger else hub).bus(ATTACKER), model, (3.0, 0.0), kind=kind)
+    bus = hub.bus("stranger", live=False) if is_stranger else evil.bus
+    names = (ATTACKER, *(f"nobody_{number}" for number in range(200))) if is_stranger else ()
     for _ in range(100):
         hub.advance(0.01)
-        for fake_client in clients:
+        for fake_client in (ada, bob) if is_stranger else (ada, bob, evil):
             fake_client.tick(hub.time)
     before = received_count(ada)
     ada.touching = {1}
-    wild = storm(model, evil, seed, hub.time)
+    wild = storm(model, evil, seed, hub.time, names)
     publishers = {}
     spent = []
     for _ in range(-(-count // MESSAGES_PER_STEP)):
         for _ in range(MESSAGES_PER_STEP):
             key, payload = next(wild)
-            publisher = publishers.setdefault(key, evil.bus.publisher(key, reliable=True))
-            publisher.put(payload)
+            if key not in publishers:
+                publishers[key] = bus.publisher(key, reliable=True)
+            publishers[key].put(payload)
         hub.advance(0.01)
         begin = time.thread_time()
         ada.tick(hub.time)
@@ -155,19 +241,20 @@ def run_storm(count: int, seed: int = 0) -> tuple[FakeClient, FakeClient, np.nda
         hub.advance(0.01)
         for fake_client in (ada, bob):
             fake_client.tick(hub.time)
-    return ada, bob, np.array(spent), received_count(ada) - before
+    return Storm((ada, bob), np.array(spent), received_count(ada) - before)
 
 
 def received_count(fake_client: FakeClient) -> int:
     """Messages that arrived."""
     counters = fake_client.replicator.counters
-    return counters.actor.messages_in + counters.environment.messages_in + counters.event.messages_in
+    families = (counters.actor, counters.environment, counters.event, counters.retained, counters.force)
+    return sum(family.messages_in for family in families)
 
 
 def fuzz() -> Iterator[Measurement]:
     """Rows of the benchmark."""
-    ada, _, spent, arrived = run_storm(MESSAGE_COUNT)
-    counters = ada.replicator.counters
+    result = run_storm(MESSAGE_COUNT)
+    counters, spent, arrived = result.clients[0].replicator.counters, result.step_times, result.arrived
     for case, value, unit in (
         ("broken messages sent", MESSAGE_COUNT, ""),
         ("arrived where somebody listens, newest poses only", arrived, ""),

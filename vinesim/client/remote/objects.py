@@ -290,14 +290,19 @@ class ObjectSync:
         return tree in self._changed_trees
 
     def supported_by(self, name: str) -> list[int]:
-        """Objects at rest, by their records, on the links of an actor."""
+        """Objects with a body here that rest, by their records, on the links of an actor."""
+        tracker = self.physics.support_tracker
         return sorted(
-            number for parent, objects in self._supported.items() if parent.startswith(f"{name}/") for number in objects
-        )  # fmt: skip
+            number
+            for parent, objects in self._supported.items()
+            if parent.startswith(f"{name}/")
+            for number in objects
+            if number in tracker
+        )
 
     def mark_resting(self, record: RetainedRecord | None) -> None:
         """A record of an object at rest was sent: from now on it rests here as for all other clients."""
-        if record is not None and not record.moving and not is_tree(record.object):
+        if record is not None and not record.moving and record.object in self.physics.support_tracker:
             self._set_resting(record.object, record)
             self.physics.support_tracker.set_at_rest(record.object, record.parent, np.array(record.pose))
 

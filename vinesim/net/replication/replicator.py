@@ -130,6 +130,7 @@ class Replicator:
         pose_on_support: Callable[[int], tuple[str, np.ndarray]] | None = None,
         is_changed: Callable[[int], bool] = lambda _: False,
         wrenches: dict[str, dict[str, np.ndarray]] | None = None,
+        has_body: Callable[[int], bool] = lambda _: True,
     ) -> list[TreeUpdate]:
         """Publish one step; return the states of trees at rest that left, as all copies hold them.
 
@@ -142,6 +143,7 @@ class Replicator:
         their plant. ``detached_roots(tree)``: bodies that were cut off a tree.
         ``pose_on_support(object_id)``: parent frame and pose [7] in it of an object at rest.
         ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
+        ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
         ``wrenches``: wrench [6] of this actor's hands on other clients' robots in this step, by robot and link.
         """
         state = self._state
@@ -155,6 +157,7 @@ class Replicator:
         )
         return self._sender.send(
             LocalStep(
-                now, time, touched, moving, grabbed, detached, read, detached_roots, pose_on_support, is_changed
+                now, time, touched, moving, grabbed, detached, read, detached_roots, pose_on_support, is_changed,
+                has_body,
             )
         )  # fmt: skip

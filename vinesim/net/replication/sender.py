@@ -55,6 +55,7 @@ class LocalStep:
     detached_roots: Callable[[int], DetachedRoots]
     pose_on_support: Callable[[int], tuple[str, np.ndarray]] | None
     is_changed: Callable[[int], bool]
+    has_body: Callable[[int], bool]
 
 
 class Sender:
@@ -203,8 +204,15 @@ class Sender:
         return update
 
     def _publish_object_at_rest(self, object_id: int, step: LocalStep) -> None:
-        """Publish where an object rests in the frame of its support, as a retained record."""
+        """Publish where an object rests in the frame of its support, as a retained record.
+
+        One without a body here was taken over from an actor that left: that is undone, for nothing new is known of it.
+        """
         state = self._state
+        if not step.has_body(object_id):
+            state.ownership.release(object_id)
+            state.ownership.rollback(object_id)
+            return
         assert step.pose_on_support is not None, f"object {object_id} rests, but no pose_on_support was given"
         state.ownership.increment(object_id)
         claim = state.ownership.release(object_id)

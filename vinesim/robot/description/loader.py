@@ -83,7 +83,7 @@ def load_description(name: str | pathlib.Path, *, is_remote: bool = False) -> Ro
     for note in notes:
         log.info("%s: %s", file.name, note)
     if assumed:
-        log.warning("%s: assumed, mend the URDF if it is not so: %s", file.name, "; ".join(assumed))
+        log.warning("%s: assumed: %s", file.name, "; ".join(assumed))
     return description
 
 

@@ -25,6 +25,11 @@ NUMBER_COUNTS = {
 }  # fmt: skip
 """Count of numbers in each attribute, by element and attribute."""
 
+MAX_NUMBER = 1e6
+"""Largest number of a URDF [m, kg, kg m2, rad]: more makes the numbers of all that touches the robot inexact."""
+MAX_LIMIT = 1e17
+"""Largest limit: files give 1e16 where there is none."""
+
 
 def read_xml(file: pathlib.Path) -> etree._Element:
     """The root element; :class:`DescriptionError` if the file is not XML or its root is not ``<robot>``."""
@@ -44,7 +49,7 @@ def read_xml(file: pathlib.Path) -> etree._Element:
 
 
 def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
-    """Raise :class:`DescriptionError` unless all numbers are complete and finite, and all sizes above 0."""
+    """Raise :class:`DescriptionError` unless all numbers are complete and bounded, and all sizes above 0."""
     for element in root.iter(*{tag for tag, _ in NUMBER_COUNTS}):
         for (tag, key), count in NUMBER_COUNTS.items():
             text = element.get(key) if element.tag == tag else None
@@ -62,6 +67,9 @@ def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
                 raise description_error(file, f"{where} has {len(numbers)} of {count} numbers", "give all of them")
             if not all(map(math.isfinite, numbers)):
                 raise description_error(file, f"{where} is not finite", "give a number")
+            largest = MAX_LIMIT if tag == "limit" else MAX_NUMBER
+            if max(map(abs, numbers)) > largest:
+                raise description_error(file, f"{where} is beyond {largest:g}", "give what a robot can have")
             if tag in SOLIDS and key != "bounds" and min(map(abs, numbers) if tag == "mesh" else numbers) <= 0.0:
                 raise description_error(file, f"{where} is no size", "give numbers above 0")
 

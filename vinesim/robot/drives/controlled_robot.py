@@ -140,7 +140,7 @@ class Robot(RobotInstance):
 
     def command_gripper(self, group: str, opening: float, effort: float | None = None) -> None:
         """Open a gripper's fingers to ``opening`` [m] between them (sum over prismatic fingers, those that mimic a
-        driven one included) or [rad].
+        driven one included) or [rad]; at most as far as they can.
 
         ``effort`` [N or N m]: the most that each finger may give, the drives' own unless given. Objects between the
         fingers are held by friction alone.
@@ -154,6 +154,12 @@ class Robot(RobotInstance):
         travel, offset = self.description.finger_travel(fingers)
         self.command_position(np.full(len(fingers), (opening - offset) / travel), fingers)
         self._servos.group_fingers(group, fingers, effort)
+
+    def gripper_opening(self, group: str) -> float:
+        """How far a gripper is open [m or rad], as :meth:`command_gripper` counts; KeyError for an unknown group."""
+        fingers = self.description.joint_indices(group)
+        travel, offset = self.description.finger_travel(fingers)
+        return travel * float(self.rigid.joint_measurements(self.name)[0][fingers].mean()) + offset
 
     def command_cutter(self, group: str) -> None:
         """Close the cutter of a gripper and open it again: what is between its blades in the next step is cut."""

@@ -152,7 +152,7 @@ class PickBunch(Task):
         """See :class:`Task`."""
         ahead = frames.rotate(self._base_pose()[3:], np.array([1.0, 0.0, 0.0]))
         self.arm.reset()
-        self._open_gripper(2.0 * (self._radius + OPENING_MARGIN))
+        self.robot.command_gripper(self.arm.gripper, 2.0 * (self._radius + OPENING_MARGIN))
         yield from self._move_hand(
             "reach", lambda: self._grasp_point() - APPROACH_DISTANCE * ahead, ahead, timeout=12.0
         )
@@ -219,8 +219,8 @@ class PickBunch(Task):
         self._tool_z = along
         yield from self._move_hand("turn", lambda: over, down, timeout=6.0)
         yield from self._move_hand("lower", lambda: low, down, speed=0.15, timeout=8.0, near=0.03)
-        opening = self.robot.rigid.joint_measurements(self.robot.name)[0][self._fingers].sum()
-        self._open_gripper(float(opening) + RELEASE_OPENING)
+        opening = self.robot.gripper_opening(self.arm.gripper)
+        self.robot.command_gripper(self.arm.gripper, opening + RELEASE_OPENING)
         yield from self.wait(0.8, "let go")
         yield from self._move_hand("rise", lambda: over, down, speed=0.2, timeout=8.0, near=0.05)
 
@@ -261,11 +261,6 @@ class PickBunch(Task):
     def _grasp_point(self) -> np.ndarray:
         """Where the bunch is to be grasped [3] m."""
         return frames.compose(self.bunch_pose, frames.pose([self._grasp_depth, 0.0, 0.0]))[:3]
-
-    def _open_gripper(self, opening: float) -> None:
-        """Open to ``opening`` [m], at most as wide as the fingers can."""
-        widest = float(self.robot.upper_limit[self._fingers].sum())
-        self.robot.command_gripper(self.arm.gripper, min(opening, widest))
 
     def _base_pose(self) -> np.ndarray:
         """Pose [7] of the base in the world."""
