@@ -18,8 +18,8 @@ import msgspec
 from mcap.writer import Writer
 
 from vinesim import __version__
-from vinesim.net.codec import messages
 from vinesim.errors import WriteError
+from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.recording.mcap_reader import METADATA_NAME
 from vinesim.net.recording.mcap_schemas import schema_of
