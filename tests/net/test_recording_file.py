@@ -256,7 +256,7 @@ def test_a_disk_that_is_full_from_the_start_leaves_no_file_and_the_same_command_
     path = tmp_path / "run.mcap"
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        with pytest.raises(RecordingStopped, match="No space left on device.*nothing is recorded; make room") as said:
+        with pytest.raises(RecordingStopped, match=r"No space left on device.*nothing is recorded; make room") as said:
             RecordingWriter(path).close()
     assert "\n" not in str(said.value)
     assert not path.exists()
