@@ -139,7 +139,7 @@ def test_recording_needs_a_server_and_a_writable_file(tmp_path):
     assert_refused(vinesim("record", "run.mcap", "--connect", endpoint, cwd=tmp_path), 4, endpoint, "vinesim server")
     assert list(tmp_path.iterdir()) == []
     with Server("tcp/127.0.0.1:0") as server:
-        assert_refused(vinesim("record", "no/run.mcap", "--connect", server.endpoint, cwd=tmp_path), 4, "no/run.mcap")
+        assert_refused(vinesim("record", "no/run.mcap", "--connect", server.endpoint, cwd=tmp_path), 5, "no/run.mcap")
 
 
 def test_a_second_actor_of_one_name_is_refused():

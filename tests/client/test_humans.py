@@ -23,7 +23,7 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.ids import Organ, label
+from vinesim.scene.ids import Organ, label, unlabel
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.values import HumanPose
 from vinesim.sensors.camera.camera import Camera, CameraSpec
@@ -75,6 +75,13 @@ def parts_of(client: Client, name: str) -> np.ndarray:
 
 
 # ---------------------------------------------------------------------- poses of remote humans
+
+
+def test_actors_have_labels_of_their_own():
+    for pattern in ("robot_%d", "vinebot-%d", "p%d"):
+        names = [pattern % number for number in range(1000)]
+        assert len({label(Organ.ROBOT, label_index(name)) for name in names}) == len(names)
+        assert all(unlabel(label(Organ.ROBOT, label_index(name)))[0] is Organ.ROBOT for name in names)
 
 
 def test_humans_and_robots_join_and_leave(vinebot):

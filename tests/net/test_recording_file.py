@@ -6,6 +6,7 @@ import base64
 import contextlib
 import errno
 import json
+import os
 import pathlib
 import time
 
@@ -238,7 +239,7 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path):
             break
         file._thread.join(0.0005)
     assert stopped is not None
-    assert stopped.exit_code == 4
+    assert stopped.exit_code == 5
     assert "No space left on device" in str(stopped)
     assert str(path) in str(stopped)
     with pytest.raises(RecordingStopped):
@@ -246,6 +247,42 @@ def test_a_full_disk_stops_the_recording_and_keeps_what_was_written(tmp_path):
     assert path.stat().st_size == file.size <= 3000
     recording = read_recording(path)
     assert [int.from_bytes(e.payload, "little") for e in recording.messages] == list(range(len(recording.messages)))
+
+
+def test_a_disk_that_is_full_from_the_start_leaves_no_file_and_the_same_command_goes_on(tmp_path, monkeypatch):
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "run.mcap"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(RecordingStopped, match=r"No space left on device.*nothing is recorded; make room") as said:
+            RecordingWriter(path).close()
+    assert "\n" not in str(said.value)
+    assert not path.exists()
+    assert free_path(path) == path
+    RecordingWriter(path).close()
+    assert read_recording(path).messages == []
+
+
+@pytest.mark.parametrize("key", ["live", "hello", "a", "own", "fact", "snap", "c", "", "/", "fact/x/y/ada", "c/1/2"])
+def test_a_key_that_lacks_parts_is_recorded_like_any_other(tmp_path, key):
+    path = tmp_path / "run.mcap"
+    with RecordingWriter(path) as file:
+        for number, payload in enumerate((b"", b"\xff", b"\x01" * 50)):
+            file.put(number, key, payload)
+    assert [one.payload for one in read_recording(path).messages] == [b"", b"\xff", b"\x01" * 50]
+
+
+def test_a_writer_that_fails_ends_the_recording_instead_of_losing_messages(tmp_path, monkeypatch):
+    def broken(*_: object) -> None:
+        raise ArithmeticError("a defect")
+
+    file = RecordingWriter(tmp_path / "run.mcap")
+    monkeypatch.setattr(file, "_write", broken)
+    file.put(1, "live/ada", b"")
+    with pytest.raises(RecordingStopped, match="ArithmeticError: a defect"):
+        file.close()
 
 
 def test_a_recording_is_readable_while_it_is_written(tmp_path):

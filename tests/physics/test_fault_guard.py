@@ -29,6 +29,19 @@ def row(count: int) -> ArticulationSolver:
     return ArticulationSolver(model, State.at_rest(model))
 
 
+@pytest.mark.parametrize(("force", "slowed"), [(10.0, 0), (1000.0, 1)])
+def test_a_tree_slowed_to_the_largest_rate_is_counted(force: float, slowed: int) -> None:
+    """The integrator takes energy from a tree beyond ``max_rate``, 50 rad/s; it goes on, and the count says so."""
+    plants = row(2)
+    guard = FaultGuard(plants)
+    plants.wake(np.arange(2))
+    plants.predict()
+    plants.integrate(np.array([11]), np.array([[0.0, force, 0.0, 0.0, 0.0, 0.0]]))
+    assert guard.stop_faulty_trees().size == 0
+    assert (plants.tree_rate[1] > plants.max_rate) == bool(slowed)
+    assert guard.slowed == slowed
+
+
 @pytest.mark.parametrize("bad_value", [np.nan, np.inf, 1e9])
 def test_a_faulty_tree_is_rolled_back_and_the_others_continue(
     bad_value: float, caplog: pytest.LogCaptureFixture

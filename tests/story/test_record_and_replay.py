@@ -300,7 +300,7 @@ def test_a_full_disk_ends_a_recording_with_one_line(tmp_path):
         with terminated(process):
             TickedClients(*clients).until(lambda: process.poll() is not None, "its end")
             output = process.stderr.read().splitlines()
-    assert process.returncode == 4, output
+    assert process.returncode == 5, output
     assert [line for line in output if line.startswith("vinesim: ")] == output[1:]
     assert str(path) in output[1]
     recording = read_recording(path)

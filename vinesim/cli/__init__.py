@@ -4,7 +4,8 @@
 that ``vinesim --help`` opens at once.
 
 Exit codes: 0 done; 2 wrong use or bad input; 3 a part is missing on this machine; 4 the network or the server;
-5 a job was not done; 130 stopped by Ctrl-C or SIGTERM where stopping is not the ordinary end.
+5 a job was not done, or its files could not be written; 130 stopped by Ctrl-C or SIGTERM where stopping is not the
+ordinary end.
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 
 def sender_of(key: str) -> str:
-    """Name of the actor that published under a key; empty for the server."""
-    chunks = key.split("/")
-    return "" if chunks[0] == "snap" else chunks[1] if chunks[0] in ("a", "hello", "live") else chunks[-1]
+    """Name of the actor that published under a key; empty for the server and for a key that names nobody."""
+    family, *rest = key.split("/")
+    if not rest or family == "snap":
+        return ""
+    return rest[0] if family in ("a", "hello", "live") else rest[-1]

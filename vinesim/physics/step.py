@@ -117,6 +117,7 @@ class Physics:
         """How often something was stopped or left out so far, by what it was."""
         return {
             "trees_stopped": int(self.fault_guard.count.sum()),
+            "trees_slowed": self.fault_guard.slowed,
             "robots_stopped": self.rigid.faults,
             "contacts_dropped": self.contact_solver.dropped_contacts,
             "grasps_refused": self.grasp_manager.refused_grasps,

@@ -18,6 +18,7 @@ import msgspec
 from mcap.writer import Writer
 
 from vinesim import __version__
+from vinesim.errors import WriteError
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.recording.mcap_reader import METADATA_NAME
@@ -28,10 +29,8 @@ FLUSH_PERIOD = 0.5
 """Time after which recorded messages are on the disk [s]: a recorder that is killed loses no more."""
 
 
-class RecordingStopped(RuntimeError):
+class RecordingStopped(WriteError):
     """Nothing more can be written; the text gives the reason and what was kept."""
-
-    exit_code = 4
 
 
 def free_path(path: pathlib.Path) -> pathlib.Path:
@@ -123,7 +122,9 @@ class RecordingWriter:
             self._flush()
             self._file.close()
         except OSError as error:
-            self._error = RecordingStopped(self._truncate(error))
+            self._error = RecordingStopped(self._truncate(error.strerror or str(error)))
+        except Exception as error:  # else the recorder would go on without a file
+            self._error = RecordingStopped(self._truncate(f"{type(error).__name__}: {error}"))
 
     def _write(self, work: _Work) -> None:
         if isinstance(work, dict):
@@ -152,13 +153,18 @@ class RecordingWriter:
         os.fsync(self._file.fileno())
         self.size = self._file.tell()
 
-    def _truncate(self, error: OSError) -> str:
-        """Cut the file to its last complete state; the text of the error."""
+    def _truncate(self, reason: str) -> str:
+        """Cut the file to its last complete state, or remove it if there is none; the text of the error."""
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):
-            os.truncate(self.path, self.size)
+            if self.size:
+                os.truncate(self.path, self.size)
+            else:
+                self.path.unlink()
+        if not self.size:
+            return f"{self.path} cannot be written ({reason}), nothing is recorded; make room and record again"
         return (
-            f"recording stopped, {self.path} cannot be written any more ({error.strerror}): "
+            f"recording stopped, {self.path} cannot be written any more ({reason}): "
             f"its {self.size} B stay readable; make room and record into another file"
         )

@@ -37,6 +37,8 @@ class FaultGuard:
         self.plants = plants
         self.count = np.zeros(len(plants.model.tree_first), np.int32)
         """Faults of each tree so far [tree]."""
+        self.slowed = 0
+        """How often a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from it."""
         self._faults: list[Fault] = []
 
     def stop_faulty_trees(self) -> np.ndarray:
@@ -45,6 +47,7 @@ class FaultGuard:
         awake = plants.awake
         rate = plants.tree_rate[awake]
         stopped = awake[~(rate <= plants.fault_rate)]
+        self.slowed += int(np.count_nonzero(rate > plants.max_rate)) - int(np.count_nonzero(rate > plants.fault_rate))
         if len(stopped) == 0:
             return stopped
         self.count[stopped] += 1
