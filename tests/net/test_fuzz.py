@@ -116,7 +116,8 @@ def _fields(value: object) -> dict:
     return {name: getattr(value, name) for name in value.__slots__}  # type: ignore[attr-defined]
 
 
-def test_a_client_with_physics_survives_malformed_messages():
+@pytest.mark.parametrize("kind", ["robot", "human"])
+def test_a_client_with_physics_survives_malformed_messages(kind):
     """Valid messages may still be absurd (trees turned inside out, boxes in the sky): the state stays finite."""
     scene = load_scene("demo")
     model = generate(scene)
@@ -126,7 +127,9 @@ def test_a_client_with_physics_survives_malformed_messages():
     client = Client(
         scene, model, load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
     )  # fmt: skip
-    attacker = FakeClient(hub.bus(ATTACKER), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
+    attacker = FakeClient(
+        hub.bus(ATTACKER), model, (float(pose[0]) + 0.7, float(pose[1])), digest=model.digest(), kind=kind
+    )  # fmt: skip
 
     def tick() -> None:
         hub.advance(0.01)
@@ -152,6 +155,7 @@ def test_a_client_with_physics_survives_malformed_messages():
     base, _ = client.physics.rigid.base_state("ada")
     assert np.linalg.norm(base[:3] - pose[:3]) < 0.5
     assert client.replicator.counters.malformed > 100
+    assert (client.replicator.counters.wrenches_limited > 0) == (kind == "human")
     assert client.replicator.peers == {}
 
 
