@@ -102,3 +102,14 @@ def test_a_log_that_is_full_keeps_the_newest_in_order(clock):
     starts = run(loop, clock, [0.001] * 11)
     log = loop.log()
     assert log.begins - log.begins[0] == pytest.approx(starts[3:] - starts[3])
+
+
+def test_there_is_no_rate_before_the_second_step():
+    """In the first step its begin lies after the start, and no period has passed."""
+    loop = RateLoop(0.01)
+    assert loop.hz == 0.0
+    loop.begin()
+    assert loop.hz == 0.0
+    loop.end()
+    loop.begin()
+    assert 0.0 <= loop.hz <= 100.5

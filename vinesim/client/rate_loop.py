@@ -101,7 +101,7 @@ class RateLoop:
     def hz(self) -> float:
         """Steps per second of wall time, over the whole run."""
         span = self._began - self._start
-        return (self.ticks - 1) / span if span > 0.0 else 0.0
+        return (self.ticks - 1) / span if span > 0.0 and self.ticks > 1 else 0.0
 
     @property
     def real_time_factor(self) -> float:
