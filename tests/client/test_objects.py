@@ -1,4 +1,4 @@
-"""Shared objects of a client: what retained records may say of boxes, whoever wrote them."""
+"""Shared objects of a client: retained records of boxes by several authors, contradictory ones included."""
 
 from __future__ import annotations
 

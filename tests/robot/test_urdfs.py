@@ -95,7 +95,7 @@ def test_missing_limits_masses_and_mimic_sources_are_assumed_with_one_warning(
         joint("ja", "base", "a", '<limit effort="0" velocity="0" lower="0" upper="1"/>'),
         joint("jb", "a", "b", ""),
         joint("jc", "b", "c", '<limit effort="5" velocity="1"/>', kind="continuous"),
-        joint("jd", "c", "d", LIMIT + '<mimic joint="nobody"/>'),
+        joint("jd", "c", "d", LIMIT + '<mimic joint="missing"/>'),
     )  # fmt: skip
     description = load_description(write(tmp_path, *text))
     (warning,) = warnings_of(caplog)

@@ -120,7 +120,7 @@ def _record(model: Model, claim: Claim, now: float, chance: random.Random) -> Re
 
 
 _PARENTS = (
-    "", "box/0", "box/1", "box/2", "bunch/0", "ada/base_link", "evil/hand", "nobody/link", "box/-1", "box/1e9",
+    "", "box/0", "box/1", "box/2", "bunch/0", "ada/base_link", "evil/hand", "unknown/link", "box/-1", "box/1e9",
     "box/" + "9" * 40, "tree/0", "box/", "/", "box/\u0661", "\x00",
 )  # fmt: skip
 """Parents of records: boxes that lie in each other, links, and names of nothing."""
@@ -215,7 +215,7 @@ def run_storm(count: int, seed: int = 0, *, is_stranger: bool = False, kind: str
     ada, bob = (FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0)))
     evil = FakeClient((MemoryHub() if is_stranger else hub).bus(ATTACKER), model, (3.0, 0.0), kind=kind)
     bus = hub.bus("stranger", live=False) if is_stranger else evil.bus
-    names = (ATTACKER, *(f"nobody_{number}" for number in range(200))) if is_stranger else ()
+    names = (ATTACKER, *(f"stranger_{number}" for number in range(200))) if is_stranger else ()
     for _ in range(100):
         hub.advance(0.01)
         for fake_client in (ada, bob) if is_stranger else (ada, bob, evil):

@@ -64,7 +64,7 @@ def _tell(
             server = stack.enter_context(Server(listen))
             connect = server.endpoint
             print(f"listening on {connect}", flush=True)
-            while not (server.actors or stop.wait(POLL)):  # begin when somebody is there to see it
+            while not (server.actors or stop.wait(POLL)):  # begin when the first client has joined
                 pass
         assert connect is not None
         endpoint = connect

@@ -20,7 +20,9 @@ Seconds = Annotated[float | None, typer.Option(help="Stop after so long [s]; unt
 StatusFormat = Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")]
 Insecure = Annotated[
     bool,
-    typer.Option(help="Listen on a network without certificates: whoever reaches it may send anything under any name."),
+    typer.Option(
+        help="Listen on a network without certificates: any program that reaches it may publish under any name."
+    ),
 ]
 World = Annotated[str, typer.Option(help="Which of the server's worlds.")]
 Pose = tuple[float, float, float]

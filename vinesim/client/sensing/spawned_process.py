@@ -21,7 +21,7 @@ ROS_MODULES = ("vinesim.client.sensing.ros_worker", "vinesim.ros.robot_node")
 """What a ROS process needs."""
 CONTEXT = multiprocessing.get_context("spawn")
 _started_early: dict[tuple[str, ...], SpawnedProcess] = {}
-"""Processes that nobody has taken yet, by their modules."""
+"""Processes that :func:`spawn` has not returned yet, by their modules."""
 
 
 def _import_and_run(modules: Sequence[str], pipe: Connection) -> None:

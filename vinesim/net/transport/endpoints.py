@@ -89,7 +89,7 @@ def check_exposure(listen: Sequence[str], *, secured: bool = False, insecure: bo
         endpoint = parse(text, secured=secured)
         if not (endpoint.secured or endpoint.loopback or insecure):
             raise UsageError(
-                f"--listen {endpoint}: whoever reaches it may send anything under any name; give certificates "
+                f"--listen {endpoint}: any program that reaches it may publish under any name; give certificates "
                 "(--tls DIR, see vinesim certs new), or --insecure if everyone on that network is trusted"
             )
 

@@ -32,7 +32,7 @@ from vinesim.sensors.raster.primitive_arrays import (
 MAX_DEPTH = 500.0
 """Nothing is drawn beyond this depth [m]."""
 BANDS_PER_THREAD = 2
-"""Bands of a picture that one thread draws on average: what costs more gets more time from whoever is free."""
+"""Bands of a picture that one thread draws on average: a thread that has finished its band takes the next."""
 _KERNELS = (
     (camera_raster_plants.raster_cones, (CONE,)),
     (camera_raster_plants.raster_spheroids, (SPHEROID,)),
