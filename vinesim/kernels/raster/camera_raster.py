@@ -7,6 +7,7 @@ and keeps the nearest hit (:mod:`vinesim.kernels.raster.pinhole`).
 import warp as wp
 
 from vinesim.kernels.raster.intersections import hit_box, hit_cylinder, hit_sphere, hit_triangle
+from vinesim.kernels.raster.oriented_box import OrientedBox, oriented_box
 from vinesim.kernels.raster.pinhole import (
     EMPTY_KEY,
     NEAR_DEPTH,
@@ -44,36 +45,6 @@ def cull_clusters(
     seen = seen and bound[1] > -1.0 and bound[0] < float(lens.width)
     seen = seen and bound[3] > float(lens.first_row) - 1.0 and bound[2] < float(lens.end_row)
     distance_out[i] = wp.where(seen, wp.max(distance, 0.0), FAR)
-
-
-@wp.struct
-class OrientedBox:
-    """A box around a solid, in the optical frame: its centre and its half axes [m]."""
-
-    centre: wp.vec3
-    x: wp.vec3
-    y: wp.vec3
-    z: wp.vec3
-
-
-@wp.func
-def oriented_box(lens: Pinhole, a: wp.vec4, b: wp.vec4, c: wp.vec4, kind: int) -> OrientedBox:
-    """The box around a box, ellipsoid or cylinder."""
-    o = OrientedBox()
-    o.centre = lens.rotation * (xyz(a) - lens.eye)
-    if kind == CYLINDER:
-        o.z = lens.rotation * (xyz(b) - xyz(a)) * 0.5
-        o.centre += o.z
-        axis = wp.normalize(o.z)
-        other = wp.where(wp.abs(axis[2]) < 0.7, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
-        o.x = wp.normalize(wp.cross(axis, other)) * a[3]
-        o.y = wp.cross(axis, o.x)
-    else:
-        q = as_quat(b)
-        o.x = lens.rotation * wp.quat_rotate(q, wp.vec3(a[3], 0.0, 0.0))
-        o.y = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, c[0], 0.0))
-        o.z = lens.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, c[1]))
-    return o
 
 
 @wp.func
@@ -138,7 +109,7 @@ def raster_solids(
         a4 = shapes.a[i]
         b4 = shapes.b[i]
         c4 = shapes.c[i]
-        hull = oriented_box(lens, a4, b4, c4, kind)
+        hull = oriented_box(shapes, i, kind, lens.eye, lens.rotation)
         h = hull_tangents(hull, 0)
         v = hull_tangents(hull, 1)
         bound = wp.vec4(

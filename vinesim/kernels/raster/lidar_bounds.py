@@ -7,6 +7,7 @@ a box.
 import warp as wp
 
 from vinesim.kernels.raster.leaf_surface import leaf_extent, leaf_heights
+from vinesim.kernels.raster.oriented_box import OrientedBox
 from vinesim.kernels.raster.pinhole import circle_tangents
 from vinesim.kernels.raster.primitives import (
     BOX,
@@ -17,7 +18,6 @@ from vinesim.kernels.raster.primitives import (
     SPHEROID,
     TRIANGLE,
     Shapes,
-    as_quat,
     xyz,
 )
 
@@ -166,47 +166,6 @@ class AngularBound:
     low: float
     high: float
     """Tangents of the elevations."""
-
-
-@wp.struct
-class OrientedBox:
-    """A box around a primitive, in the head's frame: its centre and its half axes [m]."""
-
-    centre: wp.vec3
-    x: wp.vec3
-    y: wp.vec3
-    z: wp.vec3
-
-
-@wp.func
-def oriented_box(shapes: Shapes, i: int, kind: int, head: LidarHead) -> OrientedBox:
-    """The box around a box, cylinder or leaf."""
-    a4 = shapes.a[i]
-    b4 = shapes.b[i]
-    o = OrientedBox()
-    o.centre = head.rotation * (xyz(a4) - head.eye)
-    if kind == BOX:
-        q = as_quat(b4)
-        o.x = head.rotation * wp.quat_rotate(q, wp.vec3(a4[3], 0.0, 0.0))
-        o.y = head.rotation * wp.quat_rotate(q, wp.vec3(0.0, shapes.c[i][0], 0.0))
-        o.z = head.rotation * wp.quat_rotate(q, wp.vec3(0.0, 0.0, shapes.c[i][1]))
-    elif kind == CYLINDER:
-        o.z = 0.5 * (head.rotation * (xyz(b4) - xyz(a4)))
-        o.centre += o.z
-        axis = o.z / wp.max(wp.length(o.z), 1.0e-9)
-        other = wp.where(wp.abs(axis[2]) < 0.7, wp.vec3(0.0, 0.0, 1.0), wp.vec3(1.0, 0.0, 0.0))
-        o.x = wp.normalize(wp.cross(axis, other)) * a4[3]
-        o.y = wp.cross(axis, o.x)
-    else:
-        rib = head.rotation * xyz(b4)
-        up = head.rotation * xyz(shapes.c[i])
-        heights = leaf_heights(shapes.d[i])
-        extent = leaf_extent(shapes.hull, int(b4[3]))
-        o.centre += (rib * (extent[1] + extent[2]) + up * (heights[0] + heights[1])) * (0.5 * a4[3])
-        o.x = wp.cross(rib, up) * (extent[0] * a4[3])
-        o.y = rib * (0.5 * (extent[2] - extent[1]) * a4[3])
-        o.z = up * (0.5 * (heights[1] - heights[0]) * a4[3])
-    return o
 
 
 @wp.func

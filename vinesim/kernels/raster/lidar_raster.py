@@ -18,8 +18,8 @@ from vinesim.kernels.raster.lidar_bounds import (
     half_angle,
     holds_eye,
     may_intersect,
-    oriented_box,
 )
+from vinesim.kernels.raster.oriented_box import oriented_box
 from vinesim.kernels.raster.pinhole import (
     BATCH,
     EMPTY_KEY,
@@ -176,7 +176,7 @@ def raster_clusters(
         bound = AngularBound()
         is_boxed = kind == BOX or kind == LEAF or (kind == CYLINDER and pieces == 1)
         if is_boxed:
-            box = oriented_box(shapes, i, kind, head)
+            box = oriented_box(shapes, i, kind, head.eye, head.rotation)
             if kind != LEAF and holds_eye(box, kind, a4[3]):
                 continue
             bound = angular_bound(box)
