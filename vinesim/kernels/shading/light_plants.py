@@ -3,13 +3,12 @@
 
 import warp as wp
 
-from vinesim.kernels.raster.pinhole import BATCH, FloatBatch, Pinhole
+from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.raster.primitives import scale_along
 from vinesim.kernels.shading.deferred import Light, ambient_light
 from vinesim.kernels.shading.light_points import (
     BERRIES,
     BLADES,
-    CLASS_COUNT,
     GROUND,
     INLINE_ALL,
     FloatTables,
@@ -17,10 +16,10 @@ from vinesim.kernels.shading.light_points import (
     ShadowMaps,
     falling_exp,
     haze,
+    point_kernel,
     point_ray,
     sun_share,
     unit,
-    write_light,
 )
 from vinesim.kernels.shading.materials import GRASS, Materials, mix, row_greenness, smoothstep
 
@@ -343,51 +342,6 @@ def berry_light(
     return haze(light, colour, z * scale)
 
 
-def _kernel(name: str, kind: int, light_point: wp.Function) -> wp.Kernel:
-    """A kernel that lights the points of one class with ``light_point``."""
-    kind = wp.constant(kind)
-
-    def light_list(
-        # model
-        tables: FloatTables,
-        materials: Materials,
-        # in
-        light: Light,
-        maps: ShadowMaps,
-        lens: Pinhole,
-        points: Points,
-        first_list: int,
-        # out
-        radiance_out: wp.array(dtype=wp.vec3),
-    ):
-        """One thread lights the points of one list.
-
-        first_list: of the first thread; radiance: [pixel] linear RGB.
-        """
-        number = first_list + wp.tid()
-        start = (number * CLASS_COUNT + kind) * points.capacity
-        end = start + points.count[number, kind]
-        back = wp.transpose(lens.rotation)
-        red = FloatBatch()
-        green = FloatBatch()
-        blue = FloatBatch()
-        for first in range(start, end, BATCH):
-            count = wp.min(end - first, BATCH)
-            whole = (count + 7) // 8 * 8
-            m = wp.int32(0)
-            while m < whole:
-                slot = first + wp.min(m, count - 1)
-                colour = light_point(tables, materials, light, maps, lens, back, points, slot)
-                red[m] = colour[0]
-                green[m] = colour[1]
-                blue[m] = colour[2]
-                m += 1
-            for k in range(count):
-                write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
-
-    return wp.Kernel(light_list, key=name, module=wp.get_module(__name__))
-
-
-light_ground = _kernel("light_ground", GROUND, ground_light)
-light_blades = _kernel("light_blades", BLADES, blade_light)
-light_berries = _kernel("light_berries", BERRIES, berry_light)
+light_ground = point_kernel(__name__, "light_ground", GROUND, ground_light)
+light_blades = point_kernel(__name__, "light_blades", BLADES, blade_light)
+light_berries = point_kernel(__name__, "light_berries", BERRIES, berry_light)

@@ -282,53 +282,84 @@ def light_others(
         write_light(points.pixels[slot], lens.width, colour, radiance_out)
 
 
-@wp.kernel
-def light_sky(
-    # model
-    tables: FloatTables,
-    # in
-    light: Light,
-    lens: Pinhole,
-    points: Points,
-    first_list: int,
-    # out
-    radiance_out: wp.array(dtype=wp.vec3),
-):
-    """One thread lights the points of one list that show the sky.
+def point_kernel(module: str, name: str, kind: int, light_point: wp.Function) -> wp.Kernel:
+    """A kernel of a ``module`` that lights the points of one class with ``light_point``, eight at a time."""
+    kind = wp.constant(kind)
 
-    first_list: of the first thread; radiance: [pixel] linear RGB.
-    """
-    number = first_list + wp.tid()
-    start = (number * CLASS_COUNT + SKY) * points.capacity
-    end = start + points.count[number, SKY]
-    back = wp.transpose(lens.rotation)
+    def light_list(
+        # model
+        tables: FloatTables,
+        materials: Materials,
+        # in
+        light: Light,
+        maps: ShadowMaps,
+        lens: Pinhole,
+        points: Points,
+        first_list: int,
+        # out
+        radiance_out: wp.array(dtype=wp.vec3),
+    ):
+        """One thread lights the points of one list.
+
+        first_list: of the first thread; radiance: [pixel] linear RGB.
+        """
+        number = first_list + wp.tid()
+        start = (number * CLASS_COUNT + kind) * points.capacity
+        end = start + points.count[number, kind]
+        back = wp.transpose(lens.rotation)
+        red = FloatBatch()
+        green = FloatBatch()
+        blue = FloatBatch()
+        for first in range(start, end, BATCH):
+            count = wp.min(end - first, BATCH)
+            whole = (count + 7) // 8 * 8
+            m = wp.int32(0)
+            while m < whole:
+                slot = first + wp.min(m, count - 1)
+                colour = light_point(tables, materials, light, maps, lens, back, points, slot)
+                red[m] = colour[0]
+                green[m] = colour[1]
+                blue[m] = colour[2]
+                m += 1
+            for k in range(count):
+                write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
+
+    return wp.Kernel(light_list, key=name, module=wp.get_module(module))
+
+
+@wp.func
+def sky_light(
+    tables: FloatTables,
+    materials: Materials,
+    light: Light,
+    maps: ShadowMaps,
+    lens: Pinhole,
+    back: wp.mat33,
+    points: Points,
+    slot: int,
+) -> wp.vec3:
+    """Light of one point of the sky."""
     rows = light.sky_table.shape[0]
     columns = light.sky_table.shape[1]
-    red = FloatBatch()
-    green = FloatBatch()
-    blue = FloatBatch()
-    for first in range(start, end, BATCH):
-        count = wp.min(end - first, BATCH)
-        whole = (count + 7) // 8 * 8
-        m = wp.int32(0)
-        while m < whole:
-            d = unit(point_ray(lens, back, points.u[first + m], points.v[first + m]))
-            x = (fast_atan2(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
-            y = wp.sqrt(wp.max(d[2], 0.0)) * float(rows - 1)
-            i = wp.clamp(int(x), 0, columns - 2)
-            j = wp.clamp(int(y), 0, rows - 2)
-            fx = x - float(i)
-            fy = y - float(j)
-            at = j * columns + i
-            a = (1.0 - fx) * (1.0 - fy)
-            b = fx * (1.0 - fy)
-            c = (1.0 - fx) * fy
-            e = fx * fy
-            under = at + columns
-            t = tables.sky_table
-            red[m] = t[at, 0] * a + t[at + 1, 0] * b + t[under, 0] * c + t[under + 1, 0] * e
-            green[m] = t[at, 1] * a + t[at + 1, 1] * b + t[under, 1] * c + t[under + 1, 1] * e
-            blue[m] = t[at, 2] * a + t[at + 1, 2] * b + t[under, 2] * c + t[under + 1, 2] * e
-            m += 1
-        for k in range(count):
-            write_light(points.pixels[first + k], lens.width, wp.vec3(red[k], green[k], blue[k]), radiance_out)
+    d = unit(point_ray(lens, back, points.u[slot], points.v[slot]))
+    x = (fast_atan2(d[1], d[0]) * 0.15915494 + 0.5) * float(columns - 1)
+    y = wp.sqrt(wp.max(d[2], 0.0)) * float(rows - 1)
+    i = wp.clamp(int(x), 0, columns - 2)
+    j = wp.clamp(int(y), 0, rows - 2)
+    fx = x - float(i)
+    fy = y - float(j)
+    at = j * columns + i
+    a = (1.0 - fx) * (1.0 - fy)
+    b = fx * (1.0 - fy)
+    c = (1.0 - fx) * fy
+    e = fx * fy
+    under = at + columns
+    t = tables.sky_table
+    return wp.vec3(
+        t[at, 0] * a + t[at + 1, 0] * b + t[under, 0] * c + t[under + 1, 0] * e,
+        t[at, 1] * a + t[at + 1, 1] * b + t[under, 1] * c + t[under + 1, 1] * e,
+        t[at, 2] * a + t[at + 1, 2] * b + t[under, 2] * c + t[under + 1, 2] * e,
+    )
+
+
+light_sky = point_kernel(__name__, "light_sky", SKY, sky_light)

@@ -73,9 +73,9 @@ class LiveLight:
 
         seen = [self._seen.primitive, self._seen.keys, _ROWS, first, points]
         launch(light_points.sort_points, [primitives.shapes, materials, lens, *seen], arrays)
-        launch(light_points.light_sky, [tables, light, lens, points, first], [radiance])
         where = [light, maps, lens, points, first]
-        for kernel in (light_plants.light_ground, light_plants.light_blades, light_plants.light_berries):
+        plants = light_plants.light_ground, light_plants.light_blades, light_plants.light_berries
+        for kernel in (light_points.light_sky, *plants):
             launch(kernel, [tables, materials, *where], [radiance])
         solid = [light, maps.near, maps.far, lens, points, first]
         launch(light_points.light_others, [primitives.shapes, materials, *solid], [radiance])
