@@ -116,17 +116,22 @@ def _fields(value: object) -> dict:
     return {name: getattr(value, name) for name in value.__slots__}  # type: ignore[attr-defined]
 
 
+def robot_client(hub: MemoryHub, now: list[float]) -> tuple[Client, np.ndarray]:
+    """A client in the demo scene whose clock reads ``now[0]`` [s], and the pose at which its robot starts."""
+    scene = load_scene("demo")
+    pose = spawn_pose(scene, 0)
+    client = Client(
+        scene, generate(scene), load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
+    )  # fmt: skip
+    return client, pose
+
+
 @pytest.mark.parametrize("kind", ["robot", "human"])
 def test_a_client_with_physics_survives_malformed_messages(kind):
     """Valid messages may still be absurd (trees turned inside out, boxes in the sky): the state stays finite."""
-    scene = load_scene("demo")
-    model = generate(scene)
-    hub = MemoryHub()
-    now = [10.0]
-    pose = spawn_pose(scene, 0)
-    client = Client(
-        scene, model, load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
-    )  # fmt: skip
+    hub, now = MemoryHub(), [10.0]
+    client, pose = robot_client(hub, now)
+    model = client.model
     attacker = FakeClient(
         hub.bus(ATTACKER), model, (float(pose[0]) + 0.7, float(pose[1])), digest=model.digest(), kind=kind
     )  # fmt: skip
@@ -161,14 +166,9 @@ def test_a_client_with_physics_survives_malformed_messages(kind):
 
 def test_a_hanging_bunch_that_is_claimed_by_an_actor_who_leaves_goes_on_hanging():
     """Its claim passes to the nearest actor, in whose simulation the bunch is part of its tree."""
-    scene = load_scene("demo")
-    model = generate(scene)
-    hub = MemoryHub()
-    now = [10.0]
-    pose = spawn_pose(scene, 0)
-    client = Client(
-        scene, model, load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
-    )  # fmt: skip
+    hub, now = MemoryHub(), [10.0]
+    client, pose = robot_client(hub, now)
+    model = client.model
     other = FakeClient(hub.bus("bob"), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
 
     def tick() -> None:

@@ -115,7 +115,10 @@ def test_records_stay_in_memory_while_the_disk_is_full_and_are_written_afterward
     wait(lambda: store.count() == 1 and (tmp_path / "w.facts").exists(), "a record on disk")
     original = journal._packed
 
+    attempts = []
+
     def fail(content):
+        attempts.append(content)
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(journal, "_packed", fail)
@@ -124,6 +127,7 @@ def test_records_stay_in_memory_while_the_disk_is_full_and_are_written_afterward
     assert "No space left" in store.status_message
     submit(store, record(2))
     wait(lambda: store.count() == 3, "all in memory")
+    wait(lambda: len(attempts) >= 3, "attempts to write everything while the disk is still full")
     monkeypatch.setattr(journal, "_packed", original)
     wait(lambda: not store.status_message, "the disk to be writable")
     submit(store, record(3))

@@ -131,10 +131,9 @@ class Journal:
     def rewrite(self) -> None:
         """Write the state to a new file and replace the old one."""
         head = _encoder.encode(_Header(self.world, *self.scene_id))
-        parts = [MAGIC + bytes((VERSION,)), _packed(head)]
-        parts += [_packed(_CELL.pack(*cell) + messages.encode_records([retained])) for cell, retained in self.state]
+        records = [_CELL.pack(*cell) + messages.encode_records([retained]) for cell, retained in self.state]
         try:
-            _write(self.path, b"".join(parts))
+            _write(self.path, MAGIC + bytes((VERSION,)) + b"".join(map(_packed, [head, *records])))
             if self._file is not None:
                 self._file.close()
             self._file = self.path.open("ab")
