@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 def label_index(name: str) -> int:
     """Index of an actor's label in images: the same on every client, from the name alone.
 
-    With 25 actors the chance that two have the same is 0.03 %.
+    With 64 actors the chance that two have the same is 0.2 %.
     """
     return zlib.crc32(name.encode()) % LABEL_STRIDE
 

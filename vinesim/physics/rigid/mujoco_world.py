@@ -181,7 +181,7 @@ class WorldCore:
             for robot in robots:
                 robot.add_to(spec)
             for human in humans:
-                human.add_to(spec, sum(1 << robot.bit for robot in robots))
+                human.add_to(spec)
             for slot in range(slots):
                 free_bunch.add_slot(spec, slot)
             mj_model = recompile.compile_without_contacts(spec)

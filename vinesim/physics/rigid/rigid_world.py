@@ -78,10 +78,10 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         """
         robots, humans = tuple(self._robots.values()), tuple(self._humans.values())
         if isinstance(spec, HumanSpec):
-            bit = self._free_collision_bit("human", spec.name, HumanError)
-            human = HumanBody(spec, bit, self.parameters, is_remote=is_remote)
+            code = self._free_code("human", spec.name, HumanError)
+            human = HumanBody(spec, code, self.parameters, is_remote=is_remote)
             return self._compile_world(robots, (*humans, human))
-        robot = RobotBody(spec, self._free_collision_bit("robot", spec.name, RobotError), self.parameters)
+        robot = RobotBody(spec, self._free_code("robot", spec.name, RobotError), self.parameters)
         try:
             return self._compile_world((*robots, robot), humans)
         except ValueError as error:
@@ -125,17 +125,19 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             found.append((names[0], names[1], -float(contact.dist)))
         return found
 
-    def _free_collision_bit(self, kind: str, name: str, error: type[ValueError]) -> int:
-        """A collision bit that no actor has, for one that is added; ``error`` if there is none or the name is taken."""
+    def _free_code(self, kind: str, name: str, error: type[ValueError]) -> int:
+        """A collision code that no actor has, for one that is added; ``error`` if there is none or the name is taken."""
         if name in self.actors:
             raise error(f"{kind} {name!r} is already here; give the newcomer another name")
         if "/" in name or not name:
             raise error(f"{kind} name {name!r} must not be empty nor contain '/', which parts actor and link")
-        used = {actor.bit for actor in (*self._robots.values(), *self._humans.values())}
-        free = [bit for bit in range(static_world.FIRST_ACTOR, static_world.LAST_ACTOR + 1) if bit not in used]
-        if not free:
-            raise error(f"{kind} {name!r} is one too many: {len(used)} robots and people share this world, remove one")
-        return free[0]
+        robots, humans = (static_world.ROBOT_CODES, self._robots), (static_world.HUMAN_CODES, self._humans)
+        codes, actors = robots if kind == "robot" else humans
+        used = {actor.code for actor in actors.values()}
+        free = next((code for code in codes if code not in used), None)
+        if free is None:
+            raise error(f"{kind} {name!r} is one too many: {len(used)} of that kind share this world, remove one")
+        return free
 
     # ------------------------------------------------------------------ the step, in two halves
 

@@ -24,13 +24,13 @@ _PLANAR = ("x", "y", "yaw")
 class RobotBody:
     """One robot: targets and gains of its drives, and its indices in MuJoCo's arrays."""
 
-    def __init__(self, spec: RobotSpec, bit: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``bit``: collision bit. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
+    def __init__(self, spec: RobotSpec, code: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        """``code``: of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
         check(spec)
         joints, pose = len(spec.drives), np.asarray(spec.pose, float)
-        self.spec, self.bit, self.parameters = spec, bit, parameters
+        self.spec, self.code, self.parameters = spec, code, parameters
         try:
-            self._parsed = _parse(spec, 1 << bit, parameters.friction)
+            self._parsed = _parse(spec, code, parameters.friction)
         except ValueError as error:
             raise build_error(spec, error) from error
         self.shapes = shapes_of(spec.urdf)
@@ -224,11 +224,11 @@ class RobotBody:
         return joints
 
 
-def _parse(given: RobotSpec, bit: int, friction: float) -> mujoco.MjSpec:
-    """A robot without base and servos from its URDF; its shapes carry the collision ``bit``."""
+def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
+    """A robot without base and servos from its URDF; its shapes carry the collision ``code``."""
     child = mujoco.MjSpec.from_string(collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives)))
     for geom in child.geoms:
-        geom.contype, geom.conaffinity = bit, ALL_BITS & ~bit & ~GROUND & ~REMOTE_HAND
+        geom.contype, geom.conaffinity = code, ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
         geom.friction = contact_friction(friction)
     for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
