@@ -21,6 +21,7 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_posture import PostureSolver
 from vinesim.physics.rigid.human_shapes import BODY_PARTS, SIDES, body_shapes, hand_shapes
+from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROBOTS, contact_friction
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
 
@@ -145,16 +146,16 @@ class HumanBody:
                 name1=f"{name}/{hand.link}", active=False, solref=[0.02, 1.0], solimp=_SOLIMP,
             )  # fmt: skip
 
-    def find_indices(self, m: mujoco.MjModel) -> None:
+    def find_indices(self, m: mujoco.MjModel, names: WorldNames) -> None:
         """Find the person's bodies and joints in a world that was compiled anew."""
         name = self.spec.name
-        self.part_bodies = np.array([m.body(f"{name}/{part}").id for part in BODY_PARTS], int)
-        joints = [m.joint(f"{name}/{part}") for part in BODY_PARTS]
-        self._part_q = np.array([j.qposadr[0] for j in joints])[:, None] + np.arange(7)
-        self.part_dofs = np.array([j.dofadr[0] for j in joints])[:, None] + np.arange(6)
+        self.part_bodies = np.array([names.body[f"{name}/{part}"] for part in BODY_PARTS], int)
+        joints = [names.joint[f"{name}/{part}"] for part in BODY_PARTS]
+        self._part_q = m.jnt_qposadr[joints].astype(int)[:, None] + np.arange(7)
+        self.part_dofs = m.jnt_dofadr[joints].astype(int)[:, None] + np.arange(6)
         self.bodies = dict(zip(BODY_PARTS, self.part_bodies.tolist(), strict=True))
         for hand in self.hands:
-            hand.find_indices(m, name)
+            hand.find_indices(m, names, name)
             self.bodies[hand.link] = hand.body
         self._hand_q = np.stack([np.arange(hand.qpos.start, hand.qpos.stop) for hand in self.hands])
         self.update_hand_collisions(m)

@@ -93,20 +93,18 @@ class RobotBody:
         for i, axis in enumerate(_PLANAR):
             _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
 
-    def find_indices(self, m: mujoco.MjModel) -> None:
+    def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames) -> None:
         """Find the robot's bodies and joints in a world that was compiled anew."""
         name = self.spec.name
-        joints = [m.joint(f"{name}/{drive.joint}") for drive in self.spec.drives]
-        planar = [m.joint(f"{name}:{axis}") for axis in _PLANAR]
-        self.q = np.array([j.qposadr[0] for j in joints], int)
-        self.v = np.array([j.dofadr[0] for j in joints], int)
+        driven, planar = [f"{name}/{drive.joint}" for drive in self.spec.drives], [f"{name}:{axis}" for axis in _PLANAR]
+        joints, base = ([names.joint[joint] for joint in some] for some in (driven, planar))
+        self.q, self.v = m.jnt_qposadr[joints].astype(int), m.jnt_dofadr[joints].astype(int)
         self.inertia_index = (m.M_rowadr + m.M_rownnz - 1)[self.v]
-        self.actuator = np.array([m.actuator(f"{name}/{drive.joint}").id for drive in self.spec.drives], int)
-        self.base_q = np.array([j.qposadr[0] for j in planar], int)
-        self.base_v = np.array([j.dofadr[0] for j in planar], int)
-        self.base_actuator = np.array([m.actuator(f"{name}:{axis}").id for axis in _PLANAR], int)
-        names = recompile.object_names(m, m.name_bodyadr)
-        self.bodies = {n.removeprefix(name + "/"): i for i, n in enumerate(names) if n.startswith(name + "/")}
+        self.actuator = np.array([names.actuator[joint] for joint in driven], int)
+        self.base_q, self.base_v = m.jnt_qposadr[base].astype(int), m.jnt_dofadr[base].astype(int)
+        self.base_actuator = np.array([names.actuator[joint] for joint in planar], int)
+        mine = name + "/"
+        self.bodies = {n.removeprefix(mine): i for i, n in enumerate(names.bodies) if n.startswith(mine)}
         self._set_gains(m)
 
     def place(self, m: mujoco.MjModel, d: mujoco.MjData, pose: np.ndarray, position: np.ndarray) -> None:
