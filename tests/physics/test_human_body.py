@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import mujoco
 import numpy as np
@@ -615,7 +616,7 @@ def test_more_than_twenty_five_actors_touch_each_other_and_never_themselves():
     rigid.predict()
     pairs = {tuple(sorted((a, b))) for a, b, _ in rigid.penetrations()}
     assert all(a != b for a, b in pairs)
-    assert {tuple(sorted(pair)) for pair in zip(names[:-1], names[1:], strict=True)} <= pairs
+    assert {tuple(sorted(pair)) for pair in itertools.pairwise(names)} <= pairs
 
 
 def test_codes_of_actors_tell_each_from_all_others():

@@ -1,10 +1,10 @@
-"""``vinesim bench actors``: 64 robots and people with bodies in one world, and whether all clients agree at the end.
+"""``vinesim bench actors``: 64 robots and people with bodies in one world, compared between all clients at the end.
 
-Each actor is a client of its own with the whole physics, and a copy of every other actor in it. All stand in one window of
-cells, in rows 1.2 m apart, each with a bunch above it and a box before it. Each picks its bunch, which falls to the
-ground, and pushes its box: robots with their base, people with their shins. When all is at rest, the retained objects and
-their owners are compared between all clients. The bus is in memory, the clock simulated: the figures do not depend on the
-machine.
+Each actor is a client of its own with the whole physics, and a copy of every other actor in it. All stand in one
+window of cells, in rows 1.2 m apart, each with a bunch above it and a box before it. Each picks its bunch, which falls
+to the ground, and pushes its box: robots with their base, people with their shins. When all is at rest, the retained
+objects and their owners are compared between all clients. The bus is in memory, the clock simulated: the figures do not
+depend on the machine.
 """
 
 from __future__ import annotations
@@ -86,9 +86,7 @@ def yard(count: int) -> Model:
         tree.add_bunch(tip, 0.4, clusters=False)
         trees.append(tree)
         boxes.append(frames.pose([x + 0.55, y, 0.001]))
-    return assemble(
-        trees, box_pose=boxes, box_size=np.tile([0.2, 0.3, 0.2], (count, 1)), box_mass=np.full(count, 1.0)
-    )
+    return assemble(trees, box_pose=np.array(boxes), box_size=np.tile([0.2, 0.3, 0.2], (count, 1)), box_mass=np.full(count, 1.0))
 
 
 class Crowd:
@@ -186,7 +184,9 @@ class Crowd:
         bunches = [object_id(ObjectKind.BUNCH, number) for number in range(self.count)]
         for client in self.clients:
             records = [client.replicator.record(number) for number in bunches]
-            if any(replicator.owned for replicator in client.replicators.values()) or any(record is None or record.moving for record in records):
+            if any(replicator.owned for replicator in client.replicators.values()) or any(
+                record is None or record.moving for record in records
+            ):
                 return False
         return all(self._is_known_alike(number) for number in self.moved())
 

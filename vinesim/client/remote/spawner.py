@@ -21,6 +21,7 @@ from vinesim.scene.values import HumanSpec, HumanUpdate, RobotSpec, RobotUpdate
 
 log = logging.getLogger(__name__)
 
+
 @dataclasses.dataclass(frozen=True)
 class Prepared:
     """A compiled world with actors that have joined."""
@@ -63,7 +64,9 @@ class RemoteSpawner:
         """
         if self._compiling is None:
             arrived = [(hello, updates[name]) for name, hello in self._enqueued.items() if name in updates]
-            room_is_short = self._executor is not None and 2 * self.rigid.bunch_room < self.rigid.parameters.bunch_pool_size
+            room_is_short = (
+                self._executor is not None and 2 * self.rigid.bunch_room < self.rigid.parameters.bunch_pool_size
+            )
             if not arrived and not room_is_short:
                 return {}
             self._compiling = self._submit(lambda: self._prepare(arrived))
@@ -125,9 +128,7 @@ class RemoteSpawner:
             loaded, world = fine, self._compile(fine) if fine else None
         return Prepared(tuple((hello, description) for hello, description, _ in loaded), tuple(refused), world)
 
-    def _compile(
-        self, loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]]
-    ) -> CompiledWorld:
+    def _compile(self, loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]]) -> CompiledWorld:
         return self.rigid.compile_with(*(spec for _, _, spec in loaded), is_remote=True)
 
     def _load(

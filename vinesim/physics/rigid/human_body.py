@@ -52,7 +52,10 @@ class HumanBody:
         *,
         is_remote: bool = False,
     ) -> None:
-        """``code``: of :data:`HUMAN_CODES`; ``is_remote``: another client moves the person and computes what the hands hold."""
+        """``code``: of :data:`HUMAN_CODES`.
+
+        ``is_remote``: another client moves the person and computes what the hands hold.
+        """
         stiffness = parameters.hand_stiffness if spec.stiffness is None else spec.stiffness
         force = parameters.hand_force if spec.force is None else spec.force
         for name, value in (("height", spec.height), ("stiffness", stiffness), ("force", force)):

@@ -200,7 +200,7 @@ class WorldCore:
         mj_model.stat.meaninertia = 1.0
         for slot in range(slots):
             free_bunch.disable_collision(mj_model, slot)
-        for bunch, (slot, body) in bunches.items():
+        for slot, body in bunches.values():
             free_bunch.activate(mj_model, slot, body, self._derive(body))
         return CompiledWorld(robots, humans, slots, mj_model, WorldNames.of(mj_model), bunches)
 

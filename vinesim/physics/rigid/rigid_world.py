@@ -90,9 +90,10 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         try:
             return self._compile_world(tuple(robots), tuple(humans))
         except ValueError as error:
-            if not specs:
+            added = [spec for spec in specs if isinstance(spec, RobotSpec)]
+            if not added:
                 raise
-            raise build_error(specs[-1], error) from error
+            raise build_error(added[-1], error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
         """Use a world that was compiled with more actors or more room for free bunches; between steps.
