@@ -1,4 +1,4 @@
-"""A child process of the client that is started again when it fails or dies, and never ends the client's loop.
+"""A child process of the client that is started again when it fails, dies or hangs, and never ends the client's loop.
 
 Its threads here start it, send it messages and take its messages, so that the loop never waits for it. What the two
 share in memory is made anew for every run of the process: a process that dies while it holds a lock leaves no trace.
@@ -28,6 +28,11 @@ EXIT_TIMEOUT = 1.2
 """How long a process may take to end [s]."""
 STABLE_TIME = 60.0
 """A process that ran this long before it failed is started again at once [s]; else there is a pause before."""
+HANG_TIMEOUT = 15
+"""A process that was ready and then sends nothing for this long hangs, and is started again [s]. It reports to the
+client five times a second, unless it renders a picture or writes files."""
+START_TIMEOUT = 300
+"""The same for a process that is not ready: a first run may compile kernels [s]."""
 LONGEST_PAUSE = 60.0
 """Pauses double with every failure, up to this [s]."""
 
@@ -112,6 +117,7 @@ class WorkerProcess(Generic[S]):
 
     ``target(config, shared, pipe)`` runs in the process when that has imported ``modules``; it sends ("ready", None)
     when it is, ("failed", text) before it ends with an error, and ends at ("stop", None) or when the pipe is closed.
+    While it is ready it sends some message at least every :data:`HANG_TIMEOUT`, else it is killed and started again.
     ``share(context)`` makes what is shared with one run. ``receive(kind, value)`` takes all other messages, and
     ("restarted", None) before those of a further run, in a thread.
     """
@@ -211,10 +217,11 @@ class WorkerProcess(Generic[S]):
             log.error("%s failed again: %s; further attempts follow without a message", self.title, reason)
 
     def _serve(self, run: Run[S]) -> str:
-        """Take the messages of a run until it ends; why it did."""
+        """Take the messages of a run until it ends or hangs; why it did."""
         reason = ""
-        while True:
-            connection.wait([run.pipe, run.process.sentinel])
+        silent = 0  # seconds, counted one by one: when both processes were stopped for long, only one has passed
+        while silent < (START_TIMEOUT if run.ready_since is None else HANG_TIMEOUT):
+            silent = 0 if connection.wait([run.pipe, run.process.sentinel], 1.0) else silent + 1
             try:
                 while run.pipe.poll():
                     kind, value = run.pipe.recv()
@@ -230,3 +237,5 @@ class WorkerProcess(Generic[S]):
                 return reason or f"it ended with exit code {run.process.exitcode}"
             if not run.process.is_alive():
                 return reason or f"it ended with exit code {run.process.exitcode}"
+        run.process.kill()
+        return reason or f"it hung: nothing came from it for {silent} s"
