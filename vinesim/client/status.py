@@ -15,7 +15,7 @@ from vinesim.robot.tasks.task import Task
 
 _WITHOUT_SENSORS = {
     "sensors_ready": True, "sensors_awaited": [], "frames_dropped": 0, "messages_dropped": 0, "sensor_restarts": 0,
-    "ros_restarts": 0,
+    "ros_restarts": 0, "sensor_restart_s": 0.0, "processes": {},
 }  # fmt: skip
 """Status of sensors of a client that has none."""
 
@@ -76,6 +76,7 @@ class Status:
             "environment_bytes_out": traffic.environment.bytes_out,
             "faults": faults,
             "recent_faults": recent_faults,
+            "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "phase": "" if self._task is None else self._task.phase,
             "others": sorted(client.remote_actors),
             "topics": rates,
@@ -91,7 +92,6 @@ class Status:
         values |= {
             "environment_bytes_when_far": client.interest_audit.bytes,
             "ticks_touching_when_far": client.interest_audit.ticks_touching,
-            "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "malformed": client.replicator.counters.malformed,
             "network": client.replicator.counters.to_report(),
             "deadlines_dropped": self.rate_loop.dropped,

@@ -75,8 +75,11 @@ class RobotProcesses:
         return self.sensors.awaited() + ros
 
     def status(self) -> dict[str, Any]:
-        """Whether the sensors are ready, and what was lost so far; for the status of a client."""
+        """Whether the sensors are ready, what was lost so far, and process ids; for the status of a client."""
         report, awaited = self.sensors.report(), self.awaited()
+        pids = {f"sensors of {self.sensors.name}": self.sensors.worker.pid}
+        if self.ros is not None:
+            pids[f"ROS node of {self.sensors.name}"] = self.ros.worker.pid
         return {
             "sensors_ready": not awaited,
             "sensors_awaited": awaited,
@@ -84,6 +87,8 @@ class RobotProcesses:
             "messages_dropped": sum(self.dropped_messages().values()),
             "sensor_restarts": report["sensor_restarts"],
             "ros_restarts": 0 if self.ros is None else self.ros.worker.restarts,
+            "sensor_restart_s": self.sensors.worker.restart_time,
+            "processes": pids,
         }
 
     def report(self) -> dict[str, Any]:

@@ -129,9 +129,13 @@ class WorkerProcess(Generic[S]):
         self.title = title
         self.restarts = 0
         """How often the process was started again."""
+        self.restart_time = 0.0
+        """From the end of the last run that failed to a new one that was ready, pauses included [s]."""
         self._modules, self._target, self._config = modules, target, config
         self._share, self._receive = share, receive
         self._closing = threading.Event()
+        self._ended = 0.0
+        """When the last run ended [s]."""
         self._first_result = threading.Event()
         self._failure = ""
         """Why the first run failed before it was ready."""
@@ -147,6 +151,11 @@ class WorkerProcess(Generic[S]):
             former, self._current = self._current, self._newest
             former.shared.close()
         return self._current
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the newest run."""
+        return self._newest.process.pid
 
     @property
     def is_ready(self) -> bool:
@@ -193,6 +202,8 @@ class WorkerProcess(Generic[S]):
             run = self._newest
             reason = self._serve(run)
             was_ready, run.ready_since = run.ready_since, None
+            if was_ready is not None:
+                self._ended = time.monotonic()
             run.end()
             if self._closing.is_set():
                 return
@@ -227,6 +238,8 @@ class WorkerProcess(Generic[S]):
                     kind, value = run.pipe.recv()
                     if kind == "ready":
                         run.ready_since = time.monotonic()
+                        if self._first_result.is_set():
+                            self.restart_time = run.ready_since - self._ended
                         self._first_result.set()
                     elif kind == "failed":
                         reason = value
