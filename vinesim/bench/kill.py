@@ -23,7 +23,7 @@ ROS_KINDS = ("ROS node", "ROS listener")
 """These are there only where ROS 2 is."""
 LONGEST_PAUSE = 1.5
 """A kill comes at a random moment within this time after a bunch was picked [s]."""
-GO_ON_TIMEOUT = 90.0
+GO_ON_TIMEOUT = 180.0
 """All must go on within this time after a kill [s]; a client that is started again takes most of it."""
 RESTART_BOUND = 3.0
 """The sensors of a robot are back within this time [s]."""

@@ -43,16 +43,13 @@ class WorkerError(RuntimeError):
     exit_code = 3
 
 
-def serve(title: str, pipe: Connection, work: Callable[[], None], niceness: int) -> NoReturn:
+def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
     """The whole life of a process: ``work``, until it returns, fails, or the client's process has ended.
 
-    ``title`` names the process in its log: "sensor process". With its ``niceness`` and class it does not take the core
-    of the loop that wakes it (docs/decisions/sensor-process.md).
+    ``title`` names the process in its log: "sensor process".
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    if hasattr(os, "nice"):
-        os.nice(niceness)
     if hasattr(os, "SCHED_BATCH"):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     code = 0
@@ -69,6 +66,21 @@ def serve(title: str, pipe: Connection, work: Callable[[], None], niceness: int)
     logging.shutdown()
     sys.stdout.flush()
     os._exit(code)
+
+
+def report_ready(pipe: Connection, niceness: int) -> None:
+    """Tell the client that this process is ready, and let the client's loop come before it from now on.
+
+    With its ``niceness`` and class it does not take the core of the loop that wakes it (docs/decisions/
+    sensor-process.md). Until it is ready it has the niceness of the client: what is missed is urgent then.
+    """
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+    if os.path.isdir("/proc/self/task"):  # Linux, where every thread has a niceness of its own
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(OSError):  # it may have ended by now
+                os.setpriority(os.PRIO_PROCESS, int(thread), os.getpriority(os.PRIO_PROCESS, 0))
+    pipe.send(("ready", None))
 
 
 class Shared(Protocol):
