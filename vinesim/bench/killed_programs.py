@@ -153,8 +153,8 @@ class Vineyard:
             self._start(name, *program.arguments)
         return now
 
-    def missing(self, killed: str, moment: float) -> list[str]:
-        """What does not go on after the kill of a program, or of a worker of it, at a ``moment`` [s, monotonic]."""
+    def missing(self, moment: float) -> list[str]:
+        """What does not go on after a kill at a ``moment`` [s, monotonic]."""
         missing = []
         for name in ROBOTS:
             missing += [f"{name}: {what}" for what in self._missing_of_robot(name, moment)]

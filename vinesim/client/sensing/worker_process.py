@@ -142,12 +142,12 @@ class WorkerProcess(Generic[S]):
         self.restarts = 0
         """How often the process was started again."""
         self.restart_time = 0.0
-        """From the end of the last run that failed to a new one that was ready, pauses included [s]."""
+        """From the start of the last further run until it was ready [s]."""
         self._modules, self._target, self._config = modules, target, config
         self._share, self._receive = share, receive
         self._closing = threading.Event()
-        self._ended = 0.0
-        """When the last run ended [s]."""
+        self._started = 0.0
+        """When the newest run started [s]."""
         self._first_result = threading.Event()
         self._failure = ""
         """Why the first run failed before it was ready."""
@@ -214,8 +214,6 @@ class WorkerProcess(Generic[S]):
             run = self._newest
             reason = self._serve(run)
             was_ready, run.ready_since = run.ready_since, None
-            if was_ready is not None:
-                self._ended = time.monotonic()
             run.end()
             if self._closing.is_set():
                 return
@@ -231,6 +229,7 @@ class WorkerProcess(Generic[S]):
                 return
             self.restarts += 1
             self._receive("restarted", None)
+            self._started = time.monotonic()
             self._newest = self._start()
 
     def _log_failure(self, failures: int, reason: str) -> None:
@@ -251,7 +250,7 @@ class WorkerProcess(Generic[S]):
                     if kind == "ready":
                         run.ready_since = time.monotonic()
                         if self._first_result.is_set():
-                            self.restart_time = run.ready_since - self._ended
+                            self.restart_time = run.ready_since - self._started
                         self._first_result.set()
                     elif kind == "failed":
                         reason = value
