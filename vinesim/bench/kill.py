@@ -53,20 +53,23 @@ def kill(
     ends that was not killed.
     """
     random = np.random.default_rng(seed)
-    with own_processes() as group, tempfile.TemporaryDirectory() as folder:
-        with Vineyard(group, pathlib.Path(folder), ros=ros, seed=seed) as vineyard:
-            possible = [kind for kind in kinds if vineyard.ros or kind not in ROS_KINDS]
-            missing = _wait_until_all_go_on(vineyard, START_TIMEOUT)[1]
-            if missing:
-                raise ProcessFailed(f"not ready after {START_TIMEOUT:.0f} s: {', '.join(missing)}")
-            order = random.permutation([possible[i % len(possible)] for i in range(times)])
-            kills = []
-            for number, kind in enumerate(order, 1):
-                kills.append(_kill_one(vineyard, str(kind), random))
-                last = kills[-1]
-                effect = f"MISSING {', '.join(last.missing)}" if last.missing else f"all go on after {last.took:.1f} s"
-                announce(f"{number} of {times}: {last.victim} killed; {effect}")
-            picked = len(vineyard.picked)
+    with (
+        own_processes() as group,
+        tempfile.TemporaryDirectory() as folder,
+        Vineyard(group, pathlib.Path(folder), ros=ros, seed=seed) as vineyard,
+    ):
+        possible = [kind for kind in kinds if vineyard.ros or kind not in ROS_KINDS]
+        missing = _wait_until_all_go_on(vineyard, START_TIMEOUT)[1]
+        if missing:
+            raise ProcessFailed(f"not ready after {START_TIMEOUT:.0f} s: {', '.join(missing)}")
+        order = random.permutation([possible[i % len(possible)] for i in range(times)])
+        kills = []
+        for number, kind in enumerate(order, 1):
+            kills.append(_kill_one(vineyard, str(kind), random))
+            last = kills[-1]
+            effect = f"MISSING {', '.join(last.missing)}" if last.missing else f"all go on after {last.took:.1f} s"
+            announce(f"{number} of {times}: {last.victim} killed; {effect}")
+        picked = len(vineyard.picked)
     yield from _rows(kills, possible, picked)
 
 

@@ -1,4 +1,4 @@
-"""A vineyard of real programs, each of which may be killed: two linked servers, two robots, a person, a ROS listener."""
+"""A vineyard of real programs that may be killed: two linked servers, two robots, a person, a ROS listener."""
 
 from __future__ import annotations
 

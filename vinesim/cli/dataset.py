@@ -25,6 +25,7 @@ from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.export.files import remove_partial_files
 from vinesim.sensors.raster import renderer_selection
 
+
 class WorkerDied(RuntimeError):
     """A worker was killed or crashed before its images were written; the text says what to do."""
 

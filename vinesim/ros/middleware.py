@@ -60,7 +60,8 @@ def unavailable_reason() -> str | None:
 def configure(*, large_messages: bool = True) -> None:
     """Set the environment for the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
 
-    Shared memory that killed processes left is removed. ``large_messages``: whether the process sends pictures or clouds. A profile that the user has chosen stays.
+    Shared memory that killed processes left is removed.
+    ``large_messages``: whether the process sends pictures or clouds. A profile that the user has chosen stays.
     """
     reason = unavailable_reason()
     if reason is not None:
