@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -34,7 +34,7 @@ def report_until_stopped(start_time: float, _shared: Nothing, pipe) -> None:
 
 
 @pytest.fixture
-def start(monkeypatch) -> Callable[..., WorkerProcess]:
+def start(monkeypatch) -> Iterator[Callable[[float], WorkerProcess]]:
     monkeypatch.setattr(worker_process, "HANG_TIMEOUT", HANG_TIMEOUT)
     workers = []
 

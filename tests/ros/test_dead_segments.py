@@ -33,7 +33,7 @@ def segment(folder: pathlib.Path, name: str, size: int = SMALLEST, age: float = 
     for one, length in ((path, size), (folder / f"{path.name}_el", 0)):
         with one.open("wb") as file:
             file.truncate(length)
-        os.utime(one, (time.time() - age,) * 2)
+        os.utime(one, (time.time() - age, time.time() - age))
     return path
 
 

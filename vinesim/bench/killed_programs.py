@@ -125,9 +125,9 @@ class Vineyard:
         """Let the person pick a bunch, unless half of all are picked."""
         places = bunch_centres(self._model)[:, :2]
         x0, x1, y0, y1 = REACH
-        near = (places > (x0, y0)).all(1) & (places < (x1, y1)).all(1)
+        near = np.logical_and((places > (x0, y0)).all(1), (places < (x1, y1)).all(1))
         left = np.flatnonzero(near & self.witness.physics.state.bunch_attached)
-        if len(left) > len(near) // 2:
+        if len(left) > len(places) // 2:
             bunch = int(self._random.choice(left))
             self.witness.physics.pick(bunch)
             self.picked.add(bunch)
