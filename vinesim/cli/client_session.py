@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
 
+from vinesim import allocator
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
@@ -142,7 +143,7 @@ def run_loop(
     is_done: Callable[[], bool] = lambda: False,
 ) -> None:  # fmt: skip
     """Step in real time until ``stop`` (set by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until done."""
-    gc.collect()
+    allocator.release_free_memory()
     gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
     gc.enable()
     # until here Ctrl-C simply interrupts; from now on it ends the run in order
