@@ -35,7 +35,7 @@ SWITCH_INTERVAL = 2e-4
 STATUS_PERIOD = 1.0
 """Wall time between two status lines [s]."""
 FIRST_STATUS = 0.1
-"""Wall time from the first step to the first status line [s]: whoever waits for a client learns that it runs."""
+"""Wall time from the first step to the first status line [s]: shows early that the client runs."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -186,6 +186,6 @@ def status_line(values: dict[str, Any]) -> str:
         f"{values['time']:7.1f} s  {values['tick_hz']:6.2f} Hz  p99 {values['tick_p99_ms']:5.2f} ms  "
         f"awake {values['awake']:3d}  force {values['force']:6.2f} N  "
         f"dropped {values['frames_dropped']} frames {values['messages_dropped']} messages  "
-        f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'nobody'}"
+        f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'no others'}"
         f"{'  FAULTS: ' if faults else ''}{faults}"
     )
