@@ -120,6 +120,12 @@ def _announce(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
+def _soak(minutes: float | None = None) -> Iterator[Measurement]:
+    from vinesim.bench.soak import MINUTES, soak
+
+    return soak(MINUTES if minutes is None else minutes, _announce)
+
+
 RAISED = {
     "torso_lift_joint": 0.45,
     **{f"arm_{side}_{i}_joint": q for side in ("left", "right") for i, q in ((1, 0.6), (2, 0.1), (4, 1.8))},
@@ -142,6 +148,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "load": _load,
     "fuzz": _fuzz,
     "kill": _kill,
+    "soak": _soak,
 }
 
 
@@ -150,12 +157,14 @@ class NoSuchBench(ValueError):
 
 
 def _measurements(
-    name: str, plot: pathlib.Path | None, rows: Sequence[str], times: int, seed: int
+    name: str, plot: pathlib.Path | None, rows: Sequence[str], minutes: float | None, times: int, seed: int
 ) -> Iterator[Measurement]:
     drawn = {"sync": _sync, "sensors": _sensors}.get(name)
     try:
         if name == "live":
             yield from _live(rows)
+        elif name == "soak":
+            yield from _soak(minutes)
         elif name == "kill":
             yield from _kill(times, seed)
         else:
@@ -169,21 +178,23 @@ def _measurements(
 
 
 def run(
-    names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = (), times: int = 50,
-    seed: int = 1,
+    names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = (),
+    minutes: float | None = None, times: int = 50, seed: int = 1,
 ) -> int:  # fmt: skip
     """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
     ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none;
-    ``times`` and ``seed`` of kill.
+    ``minutes`` of soak; ``times`` and ``seed`` of kill.
     """
     if rows and "live" not in names:
         raise NoSuchBench("--row chooses rows of the bench live; leave it out")
+    if minutes is not None and "soak" not in names:
+        raise NoSuchBench("--minutes is how long the bench soak runs; leave it out")
     for name in names:
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in _measurements(name, plot, rows, times, seed):
+        for m in _measurements(name, plot, rows, minutes, times, seed):
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import pathlib
 import queue
 import signal
 import sys
@@ -46,10 +47,12 @@ class WorkerError(RuntimeError):
 def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
     """The whole life of a process: ``work``, until it returns, fails, or the client's process has ended.
 
-    ``title`` names the process in its log: "sensor process".
+    ``title`` names the process in its log and in ``ps -o comm``: "sensor process".
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    with contextlib.suppress(OSError):  # where there is no /proc, the process keeps Python's name
+        pathlib.Path("/proc/self/comm").write_text(title)
     if hasattr(os, "SCHED_BATCH"):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     code = 0
