@@ -8,6 +8,7 @@ from vinesim.net.codec.messages import Hello
 from vinesim.net.counters import Counters, Traffic
 from vinesim.net.replication import authority, interest
 from vinesim.net.replication.cell_channels import CellChannels
+from vinesim.net.replication.couplings import CouplingSync
 from vinesim.net.replication.hand_forces import WrenchSync
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.ownership import Ownership
@@ -31,6 +32,7 @@ class ReplicationState:
         self.counters = Counters()
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
         self.wrench_sync = WrenchSync(bus, hello.name, self.counters)
+        self.coupling_sync = CouplingSync(bus, hello.name, model, self.counters)
         self.ownership = Ownership(hello.name, self.peers.known)
         self.retained = RetainedSync(bus, self.counters)
         self.tree_stream = TreeStream(model)

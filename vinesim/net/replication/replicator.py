@@ -27,7 +27,7 @@ from vinesim.net.replication.sender import LocalStep, Sender
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots, StateReader
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.model import Model
-from vinesim.scene.values import HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values import Coupling, HumanUpdate, RobotUpdate, TreeUpdate
 
 
 class Replicator:
@@ -131,6 +131,7 @@ class Replicator:
         is_changed: Callable[[int], bool] = lambda _: False,
         wrenches: dict[str, dict[str, np.ndarray]] | None = None,
         has_body: Callable[[int], bool] = lambda _: True,
+        couplings: Iterable[Coupling] = (),
     ) -> list[TreeUpdate]:
         """Publish one step; return the states of trees at rest that left, as all copies hold them.
 
@@ -145,12 +146,15 @@ class Replicator:
         ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
         ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
         ``wrenches``: wrench [6] of this actor's hands on other clients' robots in this step, by robot and link.
+        ``couplings``: of this actor's contacts with trees; sent if other actors touch them, too.
         """
         state = self._state
         time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
         state.cells.position = np.asarray(pose.base_q[:3], float)
         state.peers.publish_pose(pose, now, time)
         for payload in state.wrench_sync.publish(wrenches or {}, now, time):
+            state.counters.force.count_out(payload)
+        for payload in state.coupling_sync.publish(self._by_partner(couplings, now), now, time):
             state.counters.force.count_out(payload)
         touched, moving, grabbed, detached = (
             {int(object_id) for object_id in ids} for ids in (touched, moving, grabbed, detached)
@@ -161,3 +165,15 @@ class Replicator:
                 has_body,
             )
         )  # fmt: skip
+
+    def _by_partner(self, couplings: Iterable[Coupling], now: float) -> dict[str, list[Coupling]]:
+        """Couplings by the peer that gets them: the owner of the tree, or who touches the own tree, too."""
+        found: dict[str, list[Coupling]] = {}
+        for coupling in couplings:
+            tree = int(self.model.body_tree[coupling.body])
+            owner = self.owner(tree)
+            partners = self._state.coupling_sync.partners(tree, now) if owner == self.hello.name else [owner]
+            for name in partners:
+                if name is not None and name in self._state.peers.known:
+                    found.setdefault(name, []).append(coupling)
+        return found
