@@ -73,6 +73,11 @@ class CouplingSync:
         self._counters.couplings_refused += len(message.couplings) - len(used)
         self._received[sender.name] = now, CouplingMessage(message.time, used)
 
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+        for sender, (arrived, message) in self._received.items():
+            self._received[sender] = arrived, dataclasses.replace(message, time=message.time + step)
+
     def partners(self, tree: int, now: float) -> list[str]:
         """Actors whose couplings to a tree hold now."""
         return [

@@ -108,6 +108,11 @@ class WrenchSync:
         self._counters.wrenches_limited += is_limited
         self._received[sender.name] = now, WrenchMessage(message.time, reached)
 
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+        for sender, (arrived, message) in self._received.items():
+            self._received[sender] = arrived, dataclasses.replace(message, time=message.time + step)
+
     def net_wrenches(self, now: float) -> dict[str, np.ndarray]:
         """Sum of the wrenches [6] of all people on each own link, by link name; limited as a whole."""
         links: dict[str, np.ndarray] = {}

@@ -65,6 +65,15 @@ class ReplicationState:
         """The actor that takes over an object whose owner has left."""
         return authority.choose_successor(self.position_of(object_id), self.owner_candidates())
 
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]: times that were noted by it follow."""
+        for peer in self.peers.known.values():
+            peer.shift_time(step)
+        self.ownership.shift_time(step)
+        self.object_stream.shift_time(step)
+        self.wrench_sync.shift_time(step)
+        self.coupling_sync.shift_time(step)
+
     def count_listeners(self, positions: np.ndarray) -> np.ndarray:
         """Number of peers within the interest radius of each position [k, 3] m: [k] int."""
         others = np.array(list(self.peers.positions().values())).reshape(-1, 3)

@@ -20,6 +20,7 @@ from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.counters import Counters
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.clock_sync import STEP_THRESHOLD
 from vinesim.net.replication.hand_forces import LinkCentre
 from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
@@ -54,6 +55,7 @@ class Replicator:
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
         self._last_sent = -1e9
+        self._offset = self.offset
 
     @property
     def counters(self) -> Counters:
@@ -114,6 +116,7 @@ class Replicator:
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
         self._state.peers.clock.advance(now)
+        self._follow_clock()
         return self._receiver.receive(now, self.offset, link_centre)
 
     def send(
@@ -149,6 +152,7 @@ class Replicator:
         ``couplings``: of this actor's contacts with trees; sent if other actors touch them, too.
         """
         state = self._state
+        self._follow_clock()
         time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
         state.cells.position = np.asarray(pose.base_q[:3], float)
         state.peers.publish_pose(pose, now, time)
@@ -177,3 +181,14 @@ class Replicator:
                 if name is not None and name in self._state.peers.known:
                     found.setdefault(name, []).append(coupling)
         return found
+
+    def _follow_clock(self) -> None:
+        """Shift all times of peers and objects when the network clock was set, as by a server that was restarted.
+
+        Otherwise everything that arrives after a step back would count as older than what is known.
+        """
+        step = self.offset - self._offset
+        self._offset = self.offset
+        if abs(step) >= STEP_THRESHOLD:
+            self._last_sent += step
+            self._state.shift_time(step)

@@ -211,6 +211,11 @@ class ObjectStream:
         """Forget the received state of an object that is at rest or has lost its owner."""
         self._received.pop(object_id, None)
 
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+        for object_id, update in self._received.items():
+            self._received[object_id] = dataclasses.replace(update, time=update.time + step)
+
     def extrapolated(self, remote: set[int], now: float, time: float) -> list[ObjectUpdate]:
         """All objects that peers move, extrapolated to now; after 150 ms without a message they stand still."""
         received = [self._received[object_id] for object_id in sorted(self._received.keys() & remote)]
