@@ -86,7 +86,9 @@ def yard(count: int) -> Model:
         tree.add_bunch(tip, 0.4, clusters=False)
         trees.append(tree)
         boxes.append(frames.pose([x + 0.55, y, 0.001]))
-    return assemble(trees, box_pose=np.array(boxes), box_size=np.tile([0.2, 0.3, 0.2], (count, 1)), box_mass=np.full(count, 1.0))
+    return assemble(
+        trees, box_pose=np.array(boxes), box_size=np.tile([0.2, 0.3, 0.2], (count, 1)), box_mass=np.full(count, 1.0)
+    )
 
 
 class Crowd:
