@@ -16,6 +16,7 @@ from vinesim.cli.demo.progress import PICKER, VISITOR
 from vinesim.client.rate_loop import TickLog
 from vinesim.client.recording import contact_force_plot
 from vinesim.client.recording.bunch_trace import Rows, remote_error
+from vinesim.errors import writing
 
 SMALL_TOPICS = ("/clock", "/joint_states", "/tf")
 """Topics that every step publishes, and every ROS program needs."""
@@ -46,11 +47,12 @@ class Window:
 
 def write_summary(out: pathlib.Path, summary: dict[str, Any]) -> None:
     """Write ``summary.json``, whole or not at all, and copy the picker's pictures beside it."""
-    for picture in (out / PICKER).glob("*.png"):
-        shutil.copyfile(picture, out / picture.name)
-    partial = out / "summary.json.part"
-    partial.write_text(json.dumps(summary, indent=2) + "\n")
-    partial.replace(out / "summary.json")
+    with writing(out):
+        partial = out / "summary.json.part"
+        partial.write_text(json.dumps(summary, indent=2) + "\n")
+        partial.replace(out / "summary.json")
+        for picture in (out / PICKER).glob("*.png"):
+            shutil.copyfile(picture, out / picture.name)
 
 
 def report_of(out: pathlib.Path, name: str) -> dict[str, Any]:
