@@ -15,6 +15,7 @@ DESCRIPTIONS = {
     "robots_stopped": "robots or boxes moved by a number that is not finite and were put back",
     "contacts_dropped": "contacts were left out, as there were more than there is room for",
     "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",
+    "couplings_refused": "forces of other actors on plants were refused, as too many bodies of plants were held",
     "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",
     "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
     "deadlines_dropped": "steps were skipped after the process had stood still",
@@ -26,6 +27,7 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
     """How often each fault of :data:`DESCRIPTIONS` occurred; faults that did not are left out."""
     counters = [replicator.counters for replicator in client.replicators.values()]
     counts = client.physics.faults | {
+        "couplings_refused": client.couplings.refused,
         "messages_refused": sum(one.malformed for one in counters),
         "wrenches_refused": sum(one.wrenches_refused for one in counters),
         "deadlines_dropped": deadlines_dropped,
