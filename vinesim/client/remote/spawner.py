@@ -28,7 +28,7 @@ class Prepared:
 
     actors: tuple[tuple[Hello, RobotDescription | None], ...]
     """Those in it, each with its description; None for a human."""
-    refused: tuple[tuple[Hello, ValueError], ...]
+    refused: tuple[tuple[Hello, ValueError | OSError], ...]
     """Those that cannot be compiled, each with the reason."""
     world: CompiledWorld | None
     """None if all were refused."""
@@ -108,12 +108,12 @@ class RemoteSpawner:
 
     def _prepare(self, arrived: list[tuple[Hello, RobotUpdate | HumanUpdate]]) -> Prepared:
         """Compile a world with all actors that can be compiled."""
-        refused: list[tuple[Hello, ValueError]] = []
+        refused: list[tuple[Hello, ValueError | OSError]] = []
         loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]] = []
         for hello, update in arrived:
             try:
                 loaded.append((hello, *self._load(hello, update)))
-            except ValueError as error:
+            except (ValueError, OSError) as error:  # OSError: no room for the file of its URDF
                 refused.append((hello, error))
         try:
             world = self._compile(loaded)
