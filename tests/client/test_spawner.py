@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import errno
 from collections.abc import Callable
 
 import msgspec
@@ -207,3 +208,18 @@ def test_a_sidecar_from_the_network_names_no_sensor_file(vinebot):
     sidecar = '{"cameras": [{"name": "x", "frame": "base_link", "type": "../../etc/passwd"}], "groups": {}}'
     found = resolve_description(hello(vinebot, sidecar=sidecar), vinebot)
     assert all("passwd" not in camera.type for camera in found.cameras)
+
+
+def test_a_full_disk_costs_the_robot_that_joins_and_not_the_tick(vinebot, monkeypatch, caplog):
+    physics = world(vinebot)
+    spawner = RemoteSpawner(physics.rigid, None)
+    spawner.enqueue(hello(vinebot, robot="other", urdf=vinebot.urdf.replace("vinebot", "other")))
+
+    def full(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    assert spawner.spawn("guest", update_at(vinebot, 2.0)) is None
+    assert "guest" not in spawner
+    assert "the robot of guest cannot be shown" in caplog.text
+    physics.step()
