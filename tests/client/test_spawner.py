@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import errno
 from collections.abc import Callable
 
 import numpy as np
@@ -154,3 +155,18 @@ def test_a_robot_name_from_the_network_is_not_a_path(vinebot, tmp_path, monkeypa
     found = resolve_description(hello(vinebot, urdf=text, robot="../escaped"), vinebot)
     assert found.joints == vinebot.joints
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_full_disk_costs_the_robot_that_joins_and_not_the_tick(vinebot, monkeypatch, caplog):
+    physics = world(vinebot)
+    spawner = RemoteSpawner(physics.rigid, None)
+    spawner.enqueue(hello(vinebot, robot="other", urdf=vinebot.urdf.replace("vinebot", "other")))
+
+    def full(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    assert spawner.spawn("guest", update_at(vinebot, 2.0)) is None
+    assert "guest" not in spawner
+    assert "the robot of guest cannot be shown" in caplog.text
+    physics.step()

@@ -60,7 +60,7 @@ class RemoteSpawner:
             return None
         try:
             description, draft = self._compiling.pop(name).result()
-        except ValueError as error:
+        except (ValueError, OSError) as error:  # OSError: no room for the file of its URDF
             log.warning("the %s of %s cannot be shown: %s", hello.kind, name, error)
             self.cancel(name)
             return None
@@ -79,7 +79,7 @@ class RemoteSpawner:
         done: concurrent.futures.Future[Prepared] = concurrent.futures.Future()
         try:
             done.set_result(work())
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             done.set_exception(error)
         return done
 
