@@ -20,6 +20,7 @@ from vinesim.kernels.contact.structs import (
     Islands,
     PlantBodies,
     RigidBodies,
+    TouchedBodies,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -86,25 +87,72 @@ def insert_sorted(body: int, count: int, bodies_out: wp.array(dtype=wp.int32)):
 
 
 @wp.func
-def link_contacts(c: int, contacts_out: Contacts, bodies: PlantBodies, geoms: Geoms, rigid: RigidBodies):
-    """Join the islands of all contacts before ``c`` that interact with it."""
-    tree = bodies.tree[contacts_out.body[c]]
-    other_tree = int(-1)  # noqa: RUF046
-    if contacts_out.other_body[c] >= 0:
-        other_tree = bodies.tree[contacts_out.other_body[c]]
-    label = rigid_island(contacts_out.other[c], geoms, rigid)
-    for d in range(c):
-        tree_d = bodies.tree[contacts_out.body[d]]
-        linked = tree_d == tree or tree_d == other_tree
-        if contacts_out.other_body[d] >= 0:
-            other_tree_d = bodies.tree[contacts_out.other_body[d]]
-            linked = linked or other_tree_d == tree or other_tree_d == other_tree
-        if not linked and label >= 0:
-            linked = label == rigid_island(contacts_out.other[d], geoms, rigid)
-        if linked:
-            one = island_root(contacts_out.island, c)
-            two = island_root(contacts_out.island, d)
-            contacts_out.island[wp.max(one, two)] = wp.min(one, two)
+def slot_of(body: int, count: int, sorted_bodies: wp.array(dtype=wp.int32)):
+    """Place of a body in a sorted list of ``count`` that contains it; 0 for none (negative)."""
+    low = int(0)  # noqa: RUF046
+    high = int(count) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if sorted_bodies[middle] < body:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def bound_trees(count: int, bodies: PlantBodies, touched_out: TouchedBodies):
+    """Find where the touched bodies of each tree begin and end."""
+    for slot in range(count):
+        touched_out.last_contact[slot] = -1
+        touched_out.tree_start[slot] = slot
+        if slot > 0 and bodies.tree[touched_out.body[slot]] == bodies.tree[touched_out.body[slot - 1]]:
+            touched_out.tree_start[slot] = touched_out.tree_start[slot - 1]
+    for k in range(count):
+        slot = count - 1 - k
+        touched_out.tree_end[slot] = slot + 1
+        if slot + 1 < count and touched_out.tree_start[slot + 1] == touched_out.tree_start[slot]:
+            touched_out.tree_end[slot] = touched_out.tree_end[slot + 1]
+
+
+@wp.func
+def link_contacts(c: int, last_contact_out: wp.array(dtype=wp.int32), place: int, label_out: wp.array(dtype=wp.int32)):
+    """Join contact ``c`` with the island of the last contact that was linked at this place, and note it there."""
+    if last_contact_out[place] >= 0:
+        one = island_root(label_out, c)
+        two = island_root(label_out, last_contact_out[place])
+        label_out[wp.max(one, two)] = wp.min(one, two)
+    last_contact_out[place] = c
+
+
+@wp.func
+def list_islands(contact_count: int, contacts_out: Contacts, islands_out: Islands):
+    """Number the islands by their first contacts and list their contacts; returns the number of islands."""
+    count = int(0)  # noqa: RUF046
+    for c in range(contact_count):
+        contacts_out.island[c] = island_root(contacts_out.island, c)
+    for c in range(contact_count):  # roots come first: a number replaces each root before others look it up
+        root = contacts_out.island[c]
+        if root == c:
+            contacts_out.island[c] = count
+            islands_out.start[count] = 0
+            count = count + 1
+        else:
+            contacts_out.island[c] = contacts_out.island[root]
+        islands_out.start[contacts_out.island[c]] = islands_out.start[contacts_out.island[c]] + 1
+    listed = int(0)  # noqa: RUF046
+    for i in range(count):  # from sizes to the places of the first contacts
+        size = islands_out.start[i]
+        islands_out.start[i] = listed
+        listed = listed + size
+    for c in range(contact_count):
+        i = contacts_out.island[c]
+        islands_out.contact[islands_out.start[i]] = c
+        islands_out.start[i] = islands_out.start[i] + 1
+    for k in range(count):  # each start was moved to the next one's
+        islands_out.start[count - k] = islands_out.start[count - k - 1]
+    islands_out.start[0] = 0
+    return count
 
 
 @wp.kernel
@@ -118,7 +166,7 @@ def build_islands(
     candidates: Candidates,
     # out
     counters_out: wp.array(dtype=wp.int32),
-    touched_bodies_out: wp.array(dtype=wp.int32),
+    touched_out: TouchedBodies,
     contacts_out: Contacts,
     islands_out: Islands,
 ):
@@ -135,33 +183,24 @@ def build_islands(
         contacts_out.other_body[c] = -1
         if contacts_out.other[c] < 0:
             contacts_out.other_body[c] = capsules.body[-1 - contacts_out.other[c]]
-        body_count = insert_sorted(contacts_out.body[c], body_count, touched_bodies_out)
-        body_count = insert_sorted(contacts_out.other_body[c], body_count, touched_bodies_out)
-    for c in range(contact_count):
-        contacts_out.body_slot[c] = 0
-        contacts_out.other_slot[c] = 0
-        for k in range(body_count):
-            if touched_bodies_out[k] == contacts_out.body[c]:
-                contacts_out.body_slot[c] = k
-            if touched_bodies_out[k] == contacts_out.other_body[c]:
-                contacts_out.other_slot[c] = k
+        body_count = insert_sorted(contacts_out.body[c], body_count, touched_out.body)
+        body_count = insert_sorted(contacts_out.other_body[c], body_count, touched_out.body)
     counters_out[BODIES] = body_count
+    bound_trees(body_count, bodies, touched_out)
+    for label in range(islands_out.rigid_last_contact.shape[0]):
+        islands_out.rigid_last_contact[label] = -1
 
     for c in range(contact_count):
         contacts_out.island[c] = c
-        link_contacts(c, contacts_out, bodies, geoms, rigid)
-    islands = int(0)  # noqa: RUF046
-    listed = int(0)  # noqa: RUF046
-    for c in range(contact_count):
-        if contacts_out.island[c] == c:
-            islands_out.start[islands] = listed
-            for d in range(c, contact_count):
-                if island_root(contacts_out.island, d) == c:
-                    islands_out.contact[listed] = d
-                    listed = listed + 1
-            islands = islands + 1
-    islands_out.start[islands] = listed
-    for i in range(islands):
-        for m in range(islands_out.start[i], islands_out.start[i + 1]):
-            contacts_out.island[islands_out.contact[m]] = i
-    counters_out[ISLANDS] = islands
+        contacts_out.body_slot[c] = slot_of(contacts_out.body[c], body_count, touched_out.body)
+        contacts_out.other_slot[c] = slot_of(contacts_out.other_body[c], body_count, touched_out.body)
+        link_contacts(
+            c, touched_out.last_contact, touched_out.tree_start[contacts_out.body_slot[c]], contacts_out.island
+        )
+        if contacts_out.other_body[c] >= 0:
+            place = touched_out.tree_start[contacts_out.other_slot[c]]
+            link_contacts(c, touched_out.last_contact, place, contacts_out.island)
+        label = rigid_island(contacts_out.other[c], geoms, rigid)
+        if label >= 0:
+            link_contacts(c, islands_out.rigid_last_contact, label, contacts_out.island)
+    counters_out[ISLANDS] = list_islands(contact_count, contacts_out, islands_out)

@@ -42,9 +42,8 @@ def write_newton_rows(
             row = n + axis
             fixed = normal <= zero or (axis > 0 and slides)
             for q in range(last - first):
-                i = 3 * island_contact[first + q]
                 for k in range(3):
-                    entry = delassus[row, i + k]
+                    entry = delassus[row, 3 * q + k]
                     if fixed:
                         entry = zero
                     system_out[row, 3 * q + k] = entry

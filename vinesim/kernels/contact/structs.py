@@ -53,6 +53,8 @@ class Parameters:
     """[m/s] Boxes and free bunches that are slower wake no plant."""
     plant_friction: wp.float64
     """[1] Coulomb coefficient between plants."""
+    dense_contacts: int
+    """Islands of at most so many contacts have a Delassus matrix and take Newton steps."""
 
 
 @wp.struct
@@ -286,6 +288,21 @@ class Contacts:
 
 
 @wp.struct
+class TouchedBodies:
+    """Plant bodies in contact [slot], sorted, each once: those of one tree are neighbours."""
+
+    body: wp.array(dtype=wp.int32)
+    tree_start: wp.array(dtype=wp.int32)
+    """[slot] first slot of the same tree."""
+    tree_end: wp.array(dtype=wp.int32)
+    """[slot] slot after the last of the same tree."""
+    last_contact: wp.array(dtype=wp.int32)
+    """[slot] scratch: the contact of the tree that begins here that was linked last."""
+    velocity: wp.array2d(dtype=wp.float64)
+    """[slot, 6] m/s, rad/s by which impulses change its velocity, linear first; of large islands only."""
+
+
+@wp.struct
 class Islands:
     """Islands: sets of contacts that do not affect each other within the step."""
 
@@ -295,6 +312,8 @@ class Islands:
     """[contact] contacts, island by island."""
     sweeps: wp.array(dtype=wp.int32)
     """[island] Gauss-Seidel sweeps of the last solve."""
+    rigid_last_contact: wp.array(dtype=wp.int32)
+    """[label of rigid bodies] scratch: the contact with these rigid bodies that was linked last."""
 
 
 @wp.struct
@@ -306,11 +325,16 @@ class Rows:
     rigid_jacobian: wp.array2d(dtype=wp.float64)
     """[row, dof]"""
     plant_response: wp.array2d(dtype=wp.float64)
-    """[row, 6 * body in contact] M^-1 J^T: change of velocity of plant bodies for a unit impulse along the row."""
+    """[row, 6 * touched body of the tree] M^-1 J^T: change of velocity of the touched bodies of the tree of ``body``
+    for a unit impulse along the row."""
+    other_response: wp.array2d(dtype=wp.float64)
+    """The same for the tree of ``other_body``, if that is another tree."""
     rigid_response: wp.array2d(dtype=wp.float64)
     """[row, dof] the same for the rigid world."""
+    rigid_velocity: wp.array(dtype=wp.float64)
+    """[dof] by which impulses change the velocities of the rigid world; of large islands only."""
     delassus: wp.array2d(dtype=wp.float64)
-    """[row, row] J M^-1 J^T, within islands only."""
+    """[row, row of the island] J M^-1 J^T; of a large island the contact's own three columns only."""
     velocity_free: wp.array(dtype=wp.float64)
     """[row] m/s along the row at the end of the step without contacts."""
     bias: wp.array(dtype=wp.float64)
@@ -318,7 +342,7 @@ class Rows:
     impulse: wp.array(dtype=wp.float64)
     """[row] N s"""
     newton_system: wp.array2d(dtype=wp.float64)
-    """[row, row + 2] scratch of Newton steps; the last column keeps the impulses from before the first of them."""
+    """[row, row of the island + 2] scratch of Newton steps; the last column keeps the impulses from before them."""
 
 
 @wp.struct

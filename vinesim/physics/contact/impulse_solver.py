@@ -36,20 +36,24 @@ class ImpulseSolver:
         self.plants, self.rigid, self.arrays, self.parameters = plants, rigid, arrays, parameters
         self._kernel_parameters = kernel_parameters
         n = self.capacity = parameters.contact_capacity
+        dense = parameters.solver_newton_contacts
         self.contacts = SharedArrays.zeros(structs.Contacts, n)
         self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
-        self.islands = SharedArrays.zeros(structs.Islands, n, start=np.zeros(n + 1, np.int32))
+        self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1, velocity=np.zeros((2 * n, 6)))
+        tree_size = plants.buffers.max_tree_size
+        self._island_arrays = {name: np.zeros(n + 1, np.int32) for name in ("start", "contact", "sweeps")}
         self._row_arrays = {
             "plant_jacobian": np.zeros((3 * n, 12)),
-            "plant_response": np.zeros((3 * n, 12 * n)),
-            "delassus": np.zeros((3 * n, 3 * n)),
-            "newton_system": np.zeros((3 * n, 3 * n + 2)),
+            "plant_response": np.zeros((3 * n, 6 * tree_size)),
+            "other_response": np.zeros((3 * n, 6 * tree_size)),
+            "delassus": np.zeros((3 * n, 3 * max(1, dense))),
+            "newton_system": np.zeros((3 * n, 3 * dense + 2)),
             "velocity_free": np.zeros(3 * n),
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
         }
-        self._touched_bodies, self._wrench = np.zeros(2 * n + 1, np.int32), np.zeros((2 * n, 6))
-        self._body_response = np.zeros((2 * n, 6, 2 * n, 6), np.float32)
+        self._wrench = np.zeros((2 * n, 6))
+        self._body_response = np.zeros((2 * n, 6, tree_size, 6), np.float32)
         self.bodies = np.zeros(0, np.int32)
         """Plant bodies in contact [n], sorted."""
         self.wrenches = np.zeros((0, 6))
@@ -70,10 +74,17 @@ class ImpulseSolver:
             for k, geom in enumerate(other[: self.warm_start.count[0]].tolist()):
                 if geom >= 0:
                     other[k] = at.get(previous.names[geom], REMOVED_GEOM)
-        size = (3 * self.capacity, self.rigid.mj_model.nv)
+        world = self.rigid.mj_model
+        size = (3 * self.capacity, world.nv)
         self.rows = SharedArrays(
-            structs.Rows, rigid_jacobian=np.zeros(size), rigid_response=np.zeros(size), **self._row_arrays
+            structs.Rows,
+            rigid_jacobian=np.zeros(size),
+            rigid_response=np.zeros(size),
+            rigid_velocity=np.zeros(world.nv),
+            **self._row_arrays,
         )
+        labels = np.zeros(2 * world.ntree, np.int32)  # see EffectiveMass.island_labels
+        self.islands = SharedArrays(structs.Islands, rigid_last_contact=labels, **self._island_arrays)
         self.bind_launches(detection)
 
     def clear(self) -> None:
@@ -86,13 +97,16 @@ class ImpulseSolver:
         self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
         self._build_islands(1)
         touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
-        self.bodies = bodies = self._touched_bodies[:touched].copy()
+        self.bodies = bodies = self.touched.body[:touched].copy()
         rigid_jacobian, rigid_response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
         rigid_jacobian[:] = 0.0
         rigid_response[:] = 0.0
+        rows.rigid_velocity[:] = 0.0
+        self.touched.velocity[:touched] = 0.0
         self._write_contact_rows(n)
 
-        self._body_response[:touched, :, :touched] = self.plants.impulse_response(bodies)
+        widest = int((self.touched.tree_end[:touched] - self.touched.tree_start[:touched]).max())
+        self._body_response[:touched, :, :widest] = self.plants.impulse_response_by_tree(bodies)[:, :, :widest]
         geom_bodies = self.rigid_arrays.geoms.body[self.contacts.other[:n].clip(0)]
         is_constrained = counters[structs.IS_CONSTRAINED] = self.rigid.is_constrained(geom_bodies)
         self._inverse_mass_times_jacobian(row_count)
@@ -104,7 +118,7 @@ class ImpulseSolver:
 
         self.warm_start.count[0] = n
         self._store_warm_start(n)
-        self._accumulate_wrenches(touched)
+        self._accumulate_wrenches(1)
         self.wrenches = self._wrench[:touched].copy()
         self.rigid_force = rows.impulse[:row_count] @ rigid_jacobian / -self.parameters.dt
 
@@ -115,8 +129,8 @@ class ImpulseSolver:
         geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
         candidates, contacts = detection.candidates.struct, self.contacts.struct
         groups, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
-        counters, touched = share(detection.counters, wp.int32), share(self._touched_bodies, wp.int32)
-        body_response = share(self._body_response, wp.float32).reshape((12 * self.capacity, -1))
+        counters, touched = share(detection.counters, wp.int32), self.touched.struct
+        body_response, factors = share(self._body_response, wp.float32), rigid.factors.struct
         self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
         self._build_islands = bind_launch(
             islands.build_islands,
@@ -130,11 +144,11 @@ class ImpulseSolver:
         )
         self._inverse_mass_times_jacobian = bind_launch(
             delassus.inverse_mass_times_jacobian,
-            [geoms, bodies, rigid_bodies, rigid.factors.struct, contacts, touched, counters, body_response],
+            [geoms, rigid_bodies, factors, contacts, touched, counters, body_response],
             [rows],
         )
         self._assemble_delassus = bind_launch(
-            delassus.assemble_delassus, [geoms, rigid_bodies, contacts, groups], [rows]
+            delassus.assemble_delassus, [parameters, geoms, rigid_bodies, contacts, touched, groups], [rows]
         )
         self._solve_islands = bind_launch(
             projected_gauss_seidel.solve_islands,
@@ -142,14 +156,19 @@ class ImpulseSolver:
                 parameters,
                 p.solver_sweeps,
                 p.solver_newton_steps,
-                p.solver_newton_contacts,
                 p.solver_tolerance,
+                geoms,
+                counters,
+                rigid_bodies,
+                factors,
                 contacts,
             ],
-            [groups, rows],
+            [touched, groups, rows],
         )
         self._store_warm_start = bind_launch(
-            forces.store_warm_start, [parameters, groups, rows], [contacts, warm_start]
+            forces.store_warm_start,
+            [parameters, geoms, rigid_bodies, touched, groups, rows],
+            [contacts, warm_start],
         )
         self._accumulate_wrenches = bind_launch(
             forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
