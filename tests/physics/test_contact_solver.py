@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 from vinesim import frames
 from vinesim.bench import scenes
+from vinesim.kernels.contact import structs
 from vinesim.physics.contact.plant_capsules import plant_capsules
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import RigidWorld
@@ -172,38 +173,42 @@ def test_islands_are_independent():
     np.testing.assert_array_equal(ends[0], np.concatenate(ends[1:]))
 
 
-def converged(dense: int) -> PhysicsParameters:
-    """Sweeps to the end, with a Delassus matrix for islands of up to ``dense`` contacts and without Newton steps."""
+def converged(newton_contacts: int) -> PhysicsParameters:
+    """Solved to the end, with Newton steps where plants couple at most so many contacts, else by sweeps alone."""
     return PhysicsParameters(
-        solver_newton_contacts=dense, solver_newton_steps=0, solver_tolerance=1e-10, solver_sweeps=20000
+        solver_newton_contacts=newton_contacts, solver_newton_steps=20, solver_tolerance=1e-10, solver_sweeps=20000
     )
 
 
-def test_a_large_island_has_the_forces_of_its_delassus_matrix():
-    """The first step in which 24 canes press on 4 bars: the same state, solved with the matrix and without."""
-    forces = []
-    for dense in (0, 200):
-        physics = Physics(scenes.cane_row(24), parameters=converged(dense))
+def test_newton_steps_of_blocks_find_the_forces_of_sweeps():
+    """The first step in which 24 canes press on 4 bars, from the same state: a block for each cane."""
+    forces, sweeps = [], []
+    for newton_contacts in (0, 16):
+        physics = Physics(scenes.cane_row(24), parameters=converged(newton_contacts))
         physics.add_robot(scenes.combs("combs", 4, 24))
         tick = 0
         while not physics.contacts:
             physics.rigid.command("combs", np.full(2, 0.0005 * tick))
             physics.step()
             tick += 1
-        assert physics.contact_solver.impulses.island_count == 1
+        solver = physics.contact_solver
+        assert solver.impulses.island_count == 1
+        assert solver.detection.counters[structs.BLOCKS] == 24
         forces.append(np.array([contact.force for contact in physics.contacts]))
+        sweeps.append(solver.impulses.sweeps)
     assert len(forces[0]) >= 48
     assert np.abs(forces[0]).max() > 1.0
     np.testing.assert_allclose(forces[0], forces[1], atol=1e-6 * np.abs(forces[0]).max())
+    assert 4 * sweeps[1] < sweeps[0]
 
 
-def test_contacts_of_two_plants_need_no_matrix():
-    """A cane falls on another, the first step in which they press: the same state, solved with the matrix and without."""
+def test_newton_steps_of_two_touching_plants_find_the_forces_of_sweeps():
+    """A cane falls on another, the first step in which they press, from the same state: one block."""
     forces = []
-    for dense in (0, 16):
+    for newton_contacts in (0, 16):
         lower = cane((0.0, 0.0, 1.0), radius=0.005)
         upper = cane((0.5, -0.9, 1.02), radius=0.004, heading=0.5 * np.pi)
-        physics = Physics(assemble([lower, upper]), parameters=converged(dense))
+        physics = Physics(assemble([lower, upper]), parameters=converged(newton_contacts))
         physics.add_robot(bar((3.0, 3.0, 1.0)))
         physics.plants.body_load[physics.model.bodies_of(1), 2] = -0.2
         physics.plants.wake([0, 1])

@@ -54,7 +54,9 @@ def contact_measurements() -> Iterator[Measurement]:
         yield from _compare_with_mujoco(case, "contact", scenes.cane_row(canes), robots, steps)
     for bars, canes in COMBS:
         case = f"{canes} canes and bunches between {bars} bars of two combs"
-        yield from _compare_with_mujoco(case, "contact", scenes.cane_row(canes), [scenes.combs("combs", bars, canes)], 5)
+        yield from _compare_with_mujoco(
+            case, "contact", scenes.cane_row(canes), [scenes.combs("combs", bars, canes)], 5
+        )
 
 
 def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:

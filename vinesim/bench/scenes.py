@@ -114,9 +114,10 @@ def combs(name: str, bars: int, canes: int) -> RobotSpec:
     Drives [m]: lift of the lower bars, and lowering of the upper ones; each cane touches every bar from 2 mm on.
     """
     cylinder = f'<geometry><cylinder radius="0.02" length="{SPACING * canes}"/></geometry>'
+    height = 0.006 + 0.02 + 0.002
     collisions = [
-        f'<collision><origin xyz="{x:.4f} 0 {side * (0.006 + 0.02 + 0.002):.4f}" rpy="1.5707963 0 0"/>{cylinder}</collision>'
-        for x, side in zip(np.linspace(-0.3, 0.3, bars), np.resize([-1.0, 1.0], bars), strict=True)
+        f'<collision><origin xyz="{x:.4f} 0 {z:.4f}" rpy="1.5707963 0 0"/>{cylinder}</collision>'
+        for x, z in zip(np.linspace(-0.3, 0.3, bars), np.resize([-height, height], bars), strict=True)
     ]
     urdf = (
         f'<robot name="combs"><link name="base_footprint">{_inertial(50.0)}</link>'

@@ -110,8 +110,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     solver_newton_steps: Annotated[int, msgspec.Meta(ge=0)] = 6
     """Largest number of active-set Newton steps of an island. TUNED."""
     solver_newton_contacts: Annotated[int, msgspec.Meta(ge=0)] = 16
-    """Islands of more contacts have no Delassus matrix and take no Newton step: these cost the square and the cube of
-    their number, sweeps without them grow with it."""
+    """Islands in which plants couple more contacts take no Newton step, which costs the cube of their number."""
     solver_tolerance: Positive = 1e-6
     """[1] Sweeps end when none changes an impulse by more than this share of the largest. TUNED."""
     wake_speed: Positive = 1e-3

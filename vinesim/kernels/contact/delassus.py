@@ -3,8 +3,9 @@
 For plants M^-1 is the impulse response of the articulation solver; for rigid bodies it comes from MuJoCo's sparse factor
 L^T D L of M^ (mass with implicit servos). Where active constraints bind a rigid body, the caller fills in its response.
 
-Only small islands have the matrix itself. Of a large one there is M^-1 J^T alone, whose size grows with the number of
-contacts and not with its square: :mod:`vinesim.kernels.contact.large_islands` works with that.
+Only the plants' part is assembled, a matrix for each block of contacts that plants couple. Rigid bodies couple blocks; what
+they add, J_r H^-1 J_r^T, has the rank of their degrees of freedom and stays in its factors: ``rigid_jacobian`` and
+``rigid_response``.
 """
 
 import warp as wp
@@ -14,7 +15,6 @@ from vinesim.kernels.contact.structs import (
     Contacts,
     Geoms,
     Islands,
-    Parameters,
     RigidBodies,
     RigidFactors,
     Rows,
@@ -141,52 +141,31 @@ def body_velocity_along(
     return value
 
 
-@wp.func
-def delassus_entry(
-    row: int, column: int, last_dof: int, rigid: RigidBodies, contacts: Contacts, touched: TouchedBodies, rows: Rows
-):  # fmt: skip
-    """One entry of J M^-1 J^T."""
-    c = row // 3
-    source = column // 3
-    value = body_velocity_along(
-        wp.float64(0.0), row, 0, contacts.body_slot[c], column, source, contacts, touched, rows
-    )  # fmt: skip
-    if contacts.other[c] < 0:
-        value = body_velocity_along(value, row, 6, contacts.other_slot[c], column, source, contacts, touched, rows)
-    dof = int(last_dof)
-    while dof >= 0:
-        value = value + rows.rigid_jacobian[row, dof] * rows.rigid_response[column, dof]
-        dof = rigid.dof_parent[dof]
-    return value
-
-
 @wp.kernel
 def assemble_delassus(
-    # model
-    parameters: Parameters,
-    geoms: Geoms,
     # in
-    rigid: RigidBodies,
     contacts: Contacts,
     touched: TouchedBodies,
     islands: Islands,
     # out
     rows_out: Rows,
 ):
-    """One thread per row of the Delassus matrix: entries of the contacts of its island; of a large island its own."""
+    """One thread per row: the plants' entries of J M^-1 J^T with all rows of its block."""
     row = wp.tid()
     c = row // 3
-    last_dof = int(-1)  # noqa: RUF046
-    if contacts.other[c] >= 0:
-        last_dof = geoms.dof[contacts.other[c]]
-    first = islands.start[contacts.island[c]]
-    last = islands.start[contacts.island[c] + 1]
-    if last - first <= parameters.dense_contacts:
-        for m in range(first, last):
-            for k in range(3):
-                rows_out.delassus[row, 3 * (m - first) + k] = delassus_entry(
-                    row, 3 * islands.contact[m] + k, last_dof, rigid, contacts, touched, rows_out
-                )
-    else:
+    block = contacts.block[c]
+    first = islands.block_start[block]
+    last = islands.block_start[block + 1]
+    at = islands.matrix_start[block] + (3 * (contacts.place[c] - first) + row % 3) * 3 * (last - first)
+    for m in range(first, last):
+        source = islands.contact[m]
         for k in range(3):
-            rows_out.delassus[row, k] = delassus_entry(row, 3 * c + k, last_dof, rigid, contacts, touched, rows_out)
+            column = 3 * source + k
+            value = body_velocity_along(
+                wp.float64(0.0), row, 0, contacts.body_slot[c], column, source, contacts, touched, rows_out
+            )  # fmt: skip
+            if contacts.other[c] < 0:
+                value = body_velocity_along(
+                    value, row, 6, contacts.other_slot[c], column, source, contacts, touched, rows_out
+                )  # fmt: skip
+            rows_out.delassus[at + 3 * (m - first) + k] = value

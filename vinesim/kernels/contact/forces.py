@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from vinesim.kernels.contact.large_islands import velocity_along
+from vinesim.kernels.contact.row_velocity import velocity_along
 from vinesim.kernels.contact.structs import (
     BODIES,
     CONTACTS,
@@ -12,7 +12,6 @@ from vinesim.kernels.contact.structs import (
     Parameters,
     RigidBodies,
     Rows,
-    TouchedBodies,
     WarmStart,
 )
 
@@ -26,7 +25,6 @@ def store_warm_start(
     geoms: Geoms,
     # in
     rigid: RigidBodies,
-    touched: TouchedBodies,
     islands: Islands,
     rows: Rows,
     # out
@@ -43,17 +41,8 @@ def store_warm_start(
     contacts_out.force[c] = wp.transpose(axes) * impulse / parameters.dt
     slip_u = rows.velocity_free[n + 1]
     slip_v = rows.velocity_free[n + 2]
-    first = islands.start[contacts_out.island[c]]
-    last = islands.start[contacts_out.island[c] + 1]
-    if last - first <= parameters.dense_contacts:
-        for m in range(first, last):
-            for k in range(3):
-                source = rows.impulse[3 * islands.contact[m] + k]
-                slip_u = slip_u + rows.delassus[n + 1, 3 * (m - first) + k] * source
-                slip_v = slip_v + rows.delassus[n + 2, 3 * (m - first) + k] * source
-    else:
-        slip_u = velocity_along(slip_u, n + 1, geoms, rigid, contacts_out, touched, rows)
-        slip_v = velocity_along(slip_v, n + 2, geoms, rigid, contacts_out, touched, rows)
+    slip_u = velocity_along(slip_u, n + 1, geoms, rigid, contacts_out, islands, rows)
+    slip_v = velocity_along(slip_v, n + 2, geoms, rigid, contacts_out, islands, rows)
     # the stretch with which spring and damper give just this friction: a contact that slides drags its anchor along
     force_u = impulse[1] / parameters.dt + parameters.damping * slip_u
     force_v = impulse[2] / parameters.dt + parameters.damping * slip_v

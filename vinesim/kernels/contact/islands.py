@@ -8,10 +8,12 @@ import warp as wp
 
 from vinesim.kernels.contact.structs import (
     AWAKE_TREES,
+    BLOCKS,
     BODIES,
     CONTACTS,
     IMPACTED_TREES,
     ISLANDS,
+    MATRIX_ENTRIES,
     OVERFLOW,
     Candidates,
     Capsules,
@@ -126,33 +128,97 @@ def link_contacts(c: int, last_contact_out: wp.array(dtype=wp.int32), place: int
 
 
 @wp.func
-def list_islands(contact_count: int, contacts_out: Contacts, islands_out: Islands):
-    """Number the islands by their first contacts and list their contacts; returns the number of islands."""
-    count = int(0)  # noqa: RUF046
+def flatten_labels(contact_count: int, label_out: wp.array(dtype=wp.int32)):
+    """Let every contact's label be the first contact of its set."""
     for c in range(contact_count):
-        contacts_out.island[c] = island_root(contacts_out.island, c)
-    for c in range(contact_count):  # roots come first: a number replaces each root before others look it up
-        root = contacts_out.island[c]
-        if root == c:
-            contacts_out.island[c] = count
-            islands_out.start[count] = 0
-            count = count + 1
-        else:
-            contacts_out.island[c] = contacts_out.island[root]
-        islands_out.start[contacts_out.island[c]] = islands_out.start[contacts_out.island[c]] + 1
+        label_out[c] = island_root(label_out, c)
+
+
+@wp.func
+def is_listed_before(a: int, b: int, islands: Islands):
+    """Whether contact a comes before contact b in the list: by islands, then by blocks."""
+    before = islands.label[a] < islands.label[b]
+    if islands.label[a] == islands.label[b]:
+        before = islands.block_label[a] < islands.block_label[b]
+    return before
+
+
+@wp.func
+def list_contacts(contact_count: int, islands_out: Islands):
+    """List all contacts by islands and blocks. Contacts come by trees, so few move far."""
+    for c in range(contact_count):
+        at = int(c)
+        while at > 0 and is_listed_before(c, islands_out.contact[wp.max(at - 1, 0)], islands_out):
+            islands_out.contact[at] = islands_out.contact[at - 1]
+            at = at - 1
+        islands_out.contact[at] = c
+
+
+@wp.func
+def number_sets(
+    contact_count: int, counters_out: wp.array(dtype=wp.int32), contacts_out: Contacts, islands_out: Islands
+):
+    """Number islands and blocks in the order of the list, and place the blocks' matrices one after the other."""
+    islands = int(-1)  # noqa: RUF046
+    blocks = int(-1)  # noqa: RUF046
+    for place in range(contact_count):
+        c = islands_out.contact[place]
+        previous = islands_out.contact[wp.max(place - 1, 0)]
+        if place == 0 or islands_out.block_label[c] != islands_out.block_label[previous]:
+            blocks = blocks + 1
+            islands_out.block_start[blocks] = place
+        if place == 0 or islands_out.label[c] != islands_out.label[previous]:
+            islands = islands + 1
+            islands_out.start[islands] = place
+            islands_out.first_block[islands] = blocks
+        contacts_out.island[c] = islands
+        contacts_out.block[c] = blocks
+        contacts_out.place[c] = place
+    islands_out.start[islands + 1] = contact_count
+    islands_out.first_block[islands + 1] = blocks + 1
+    islands_out.block_start[blocks + 1] = contact_count
+    entries = int(0)  # noqa: RUF046
+    for b in range(blocks + 1):
+        islands_out.matrix_start[b] = entries
+        rows = 3 * (islands_out.block_start[b + 1] - islands_out.block_start[b])
+        entries = entries + rows * rows
+    counters_out[ISLANDS] = islands + 1
+    counters_out[BLOCKS] = blocks + 1
+    counters_out[MATRIX_ENTRIES] = entries
+
+
+@wp.func
+def island_of_dof(dof: int, rigid: RigidBodies, contacts: Contacts, islands: Islands):
+    """Island of a degree of freedom; -1 if it has no contact."""
+    contact = islands.rigid_last_contact[rigid.tree_island[rigid.dof_tree[dof]]]
+    island = int(-1)  # noqa: RUF046
+    if contact >= 0:
+        island = contacts.island[contact]
+    return island
+
+
+@wp.func
+def list_dofs(island_count: int, rigid: RigidBodies, contacts: Contacts, islands_out: Islands):
+    """List the degrees of freedom of the rigid bodies in contact, island by island."""
+    for i in range(island_count + 1):
+        islands_out.first_dof[i] = 0
+    for dof in range(islands_out.dof.shape[0]):
+        island = island_of_dof(dof, rigid, contacts, islands_out)
+        if island >= 0:
+            islands_out.first_dof[island] = islands_out.first_dof[island] + 1
     listed = int(0)  # noqa: RUF046
-    for i in range(count):  # from sizes to the places of the first contacts
-        size = islands_out.start[i]
-        islands_out.start[i] = listed
+    for i in range(island_count):
+        size = islands_out.first_dof[i]
+        islands_out.first_dof[i] = listed
         listed = listed + size
-    for c in range(contact_count):
-        i = contacts_out.island[c]
-        islands_out.contact[islands_out.start[i]] = c
-        islands_out.start[i] = islands_out.start[i] + 1
-    for k in range(count):  # each start was moved to the next one's
-        islands_out.start[count - k] = islands_out.start[count - k - 1]
-    islands_out.start[0] = 0
-    return count
+    for dof in range(islands_out.dof.shape[0]):
+        island = island_of_dof(dof, rigid, contacts, islands_out)
+        if island >= 0:
+            islands_out.dof[islands_out.first_dof[island]] = dof
+            islands_out.first_dof[island] = islands_out.first_dof[island] + 1
+    for k in range(island_count):  # each first place was moved to the next one's
+        islands_out.first_dof[island_count - k] = islands_out.first_dof[island_count - k - 1]
+    islands_out.first_dof[0] = 0
 
 
 @wp.kernel
@@ -191,16 +257,21 @@ def build_islands(
         islands_out.rigid_last_contact[label] = -1
 
     for c in range(contact_count):
-        contacts_out.island[c] = c
+        islands_out.label[c] = c
         contacts_out.body_slot[c] = slot_of(contacts_out.body[c], body_count, touched_out.body)
         contacts_out.other_slot[c] = slot_of(contacts_out.other_body[c], body_count, touched_out.body)
-        link_contacts(
-            c, touched_out.last_contact, touched_out.tree_start[contacts_out.body_slot[c]], contacts_out.island
-        )
+        link_contacts(c, touched_out.last_contact, touched_out.tree_start[contacts_out.body_slot[c]], islands_out.label)
         if contacts_out.other_body[c] >= 0:
             place = touched_out.tree_start[contacts_out.other_slot[c]]
-            link_contacts(c, touched_out.last_contact, place, contacts_out.island)
+            link_contacts(c, touched_out.last_contact, place, islands_out.label)
+    flatten_labels(contact_count, islands_out.label)
+    for c in range(contact_count):
+        islands_out.block_label[c] = islands_out.label[c]
+    for c in range(contact_count):
         label = rigid_island(contacts_out.other[c], geoms, rigid)
         if label >= 0:
-            link_contacts(c, islands_out.rigid_last_contact, label, contacts_out.island)
-    counters_out[ISLANDS] = list_islands(contact_count, contacts_out, islands_out)
+            link_contacts(c, islands_out.rigid_last_contact, label, islands_out.label)
+    flatten_labels(contact_count, islands_out.label)
+    list_contacts(contact_count, islands_out)
+    number_sets(contact_count, counters_out, contacts_out, islands_out)
+    list_dofs(counters_out[ISLANDS], rigid, contacts_out, islands_out)

@@ -21,9 +21,12 @@ BODIES = wp.constant(4)
 IS_CONSTRAINED = wp.constant(5)
 """1 if a rigid body in contact is bound by active constraints of MuJoCo."""
 ISLANDS = wp.constant(6)
+BLOCKS = wp.constant(8)
+MATRIX_ENTRIES = wp.constant(9)
+"""Entries of the matrices of all blocks."""
 SORT_AXIS = wp.constant(7)
 """World axis (0, 1, 2) along which the boxes of trees are sorted."""
-COUNTERS = 8
+COUNTERS = 10
 
 AABB_BLOCK = wp.constant(32)
 """So many static boxes share one box around them, and are skipped by one comparison."""
@@ -53,8 +56,6 @@ class Parameters:
     """[m/s] Boxes and free bunches that are slower wake no plant."""
     plant_friction: wp.float64
     """[1] Coulomb coefficient between plants."""
-    dense_contacts: int
-    """Islands of at most so many contacts have a Delassus matrix and take Newton steps."""
 
 
 @wp.struct
@@ -283,6 +284,9 @@ class Contacts:
     axes: wp.array(dtype=wp.mat33d)
     """rows: normal, first and second tangent."""
     island: wp.array(dtype=wp.int32)
+    block: wp.array(dtype=wp.int32)
+    place: wp.array(dtype=wp.int32)
+    """place in the list of the islands."""
     force: wp.array(dtype=wp.vec3d)
     """[N] on the plant."""
 
@@ -298,22 +302,37 @@ class TouchedBodies:
     """[slot] slot after the last of the same tree."""
     last_contact: wp.array(dtype=wp.int32)
     """[slot] scratch: the contact of the tree that begins here that was linked last."""
-    velocity: wp.array2d(dtype=wp.float64)
-    """[slot, 6] m/s, rad/s by which impulses change its velocity, linear first; of large islands only."""
 
 
 @wp.struct
 class Islands:
-    """Islands: sets of contacts that do not affect each other within the step."""
+    """Islands: sets of contacts that do not affect each other within the step. Each consists of blocks.
+
+    A block is a set of contacts that plants couple. The blocks of an island are coupled by rigid bodies only.
+    """
 
     start: wp.array(dtype=wp.int32)
     """[island + 1] first place of each in ``contact``."""
+    first_block: wp.array(dtype=wp.int32)
+    """[island + 1]"""
+    block_start: wp.array(dtype=wp.int32)
+    """[block + 1] first place of each in ``contact``."""
+    matrix_start: wp.array(dtype=wp.int32)
+    """[block + 1] first entry of its matrix in ``Rows.delassus``."""
     contact: wp.array(dtype=wp.int32)
-    """[contact] contacts, island by island."""
-    sweeps: wp.array(dtype=wp.int32)
-    """[island] Gauss-Seidel sweeps of the last solve."""
+    """[place] contacts, island by island and block by block."""
+    label: wp.array(dtype=wp.int32)
+    """[contact] scratch: the first contact of the same island."""
+    block_label: wp.array(dtype=wp.int32)
+    """[contact] scratch: the first contact of the same block."""
+    first_dof: wp.array(dtype=wp.int32)
+    """[island + 1] first place of each in ``dof``."""
+    dof: wp.array(dtype=wp.int32)
+    """[place] degrees of freedom of the rigid bodies, island by island."""
     rigid_last_contact: wp.array(dtype=wp.int32)
     """[label of rigid bodies] scratch: the contact with these rigid bodies that was linked last."""
+    sweeps: wp.array(dtype=wp.int32)
+    """[island] Gauss-Seidel sweeps of the last solve."""
 
 
 @wp.struct
@@ -331,18 +350,34 @@ class Rows:
     """The same for the tree of ``other_body``, if that is another tree."""
     rigid_response: wp.array2d(dtype=wp.float64)
     """[row, dof] the same for the rigid world."""
-    rigid_velocity: wp.array(dtype=wp.float64)
-    """[dof] by which impulses change the velocities of the rigid world; of large islands only."""
-    delassus: wp.array2d(dtype=wp.float64)
-    """[row, row of the island] J M^-1 J^T; of a large island the contact's own three columns only."""
+    delassus: wp.array(dtype=wp.float64)
+    """J M^-1 J^T of the plants [entry], a matrix of rows for each block."""
     velocity_free: wp.array(dtype=wp.float64)
     """[row] m/s along the row at the end of the step without contacts."""
     bias: wp.array(dtype=wp.float64)
     """[row] m/s"""
     impulse: wp.array(dtype=wp.float64)
     """[row] N s"""
-    newton_system: wp.array2d(dtype=wp.float64)
-    """[row, row of the island + 2] scratch of Newton steps; the last column keeps the impulses from before them."""
+    rigid_velocity: wp.array(dtype=wp.float64)
+    """[dof] by which the impulses change the velocities of the rigid world."""
+
+
+@wp.struct
+class SolverScratch:
+    """What the solver of an island works with."""
+
+    matrix: wp.array(dtype=wp.float64)
+    """[entry] as ``Rows.delassus``: the linear system of a Newton step."""
+    columns: wp.array2d(dtype=wp.float64)
+    """[row, 1 + dof of the island] its right-hand sides: velocities without impulses, and Jacobians of the dofs."""
+    rigid_system: wp.array2d(dtype=wp.float64)
+    """[dof, 1 + dof of the island] what is left of it for the rigid velocities, right-hand side first."""
+    impulse_first: wp.array(dtype=wp.float64)
+    """[row] N s before the first Newton step."""
+    impulse_before: wp.array(dtype=wp.float64)
+    """[row] N s before the last sweep."""
+    direction: wp.array(dtype=wp.float64)
+    """[row] N s, direction of search."""
 
 
 @wp.struct

@@ -26,7 +26,6 @@ def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
     made.margin, made.static_margin = p.contact_margin, p.static_contact_margin
     made.max_separation_speed, made.impact_speed = p.max_separation_speed, p.impact_speed
     made.wake_speed, made.plant_friction = p.wake_speed, p.friction
-    made.dense_contacts = p.solver_newton_contacts
     return made
 
 

@@ -18,6 +18,8 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
 
+MATRIX_CONTACTS = 16
+"""Room for the matrices of the blocks is made for blocks of so many contacts, and more when they are larger."""
 REMOVED_GEOM = np.iinfo(np.int32).max
 """Number that a warm start keeps for a geom that is gone."""
 
@@ -36,18 +38,20 @@ class ImpulseSolver:
         self.plants, self.rigid, self.arrays, self.parameters = plants, rigid, arrays, parameters
         self._kernel_parameters = kernel_parameters
         n = self.capacity = parameters.contact_capacity
-        dense = parameters.solver_newton_contacts
         self.contacts = SharedArrays.zeros(structs.Contacts, n)
         self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
-        self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1, velocity=np.zeros((2 * n, 6)))
+        self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1)
         tree_size = plants.buffers.max_tree_size
-        self._island_arrays = {name: np.zeros(n + 1, np.int32) for name in ("start", "contact", "sweeps")}
+        self._island_arrays = {
+            name: np.zeros(n + 1, np.int32)
+            for name in ("start", "first_block", "block_start", "matrix_start", "contact", "label", "block_label",
+                         "first_dof", "sweeps")
+        }  # fmt: skip
+        self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
         self._row_arrays = {
             "plant_jacobian": np.zeros((3 * n, 12)),
             "plant_response": np.zeros((3 * n, 6 * tree_size)),
             "other_response": np.zeros((3 * n, 6 * tree_size)),
-            "delassus": np.zeros((3 * n, 3 * max(1, dense))),
-            "newton_system": np.zeros((3 * n, 3 * dense + 2)),
             "velocity_free": np.zeros(3 * n),
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
@@ -74,18 +78,30 @@ class ImpulseSolver:
             for k, geom in enumerate(other[: self.warm_start.count[0]].tolist()):
                 if geom >= 0:
                     other[k] = at.get(previous.names[geom], REMOVED_GEOM)
-        world = self.rigid.mj_model
-        size = (3 * self.capacity, world.nv)
+        self._allocate()
+        self.bind_launches(detection)
+
+    def _allocate(self) -> None:
+        """Arrays whose size depends on the rigid world or on the matrices of the blocks."""
+        world, rows = self.rigid.mj_model, 3 * self.capacity
         self.rows = SharedArrays(
             structs.Rows,
-            rigid_jacobian=np.zeros(size),
-            rigid_response=np.zeros(size),
+            rigid_jacobian=np.zeros((rows, world.nv)),
+            rigid_response=np.zeros((rows, world.nv)),
             rigid_velocity=np.zeros(world.nv),
+            delassus=self._matrix,
             **self._row_arrays,
         )
+        self.scratch = SharedArrays(
+            structs.SolverScratch,
+            matrix=np.zeros_like(self._matrix),
+            columns=np.zeros((rows, 1 + world.nv)),
+            rigid_system=np.zeros((world.nv, 1 + world.nv)),
+            **{name: np.zeros(rows) for name in ("impulse_first", "impulse_before", "direction")},
+        )
         labels = np.zeros(2 * world.ntree, np.int32)  # see EffectiveMass.island_labels
-        self.islands = SharedArrays(structs.Islands, rigid_last_contact=labels, **self._island_arrays)
-        self.bind_launches(detection)
+        dofs = np.zeros(world.nv, np.int32)
+        self.islands = SharedArrays(structs.Islands, rigid_last_contact=labels, dof=dofs, **self._island_arrays)
 
     def clear(self) -> None:
         """Forget the last solve, but for its warm start."""
@@ -93,16 +109,19 @@ class ImpulseSolver:
 
     def solve(self, count: int, counters: np.ndarray) -> None:
         """Find the impulses of the first ``count`` contacts, and what they do to either side."""
-        n, row_count, rows = count, 3 * count, self.rows
+        n, row_count = count, 3 * count
         self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
         self._build_islands(1)
-        touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
+        if counters[structs.MATRIX_ENTRIES] > len(self._matrix):
+            self._matrix = np.zeros(2 * int(counters[structs.MATRIX_ENTRIES]))
+            self._allocate()
+            self.bind_launches(self._detection)
+            self._build_islands(1)
+        rows, touched, island_count = self.rows, int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
         self.bodies = bodies = self.touched.body[:touched].copy()
         rigid_jacobian, rigid_response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
         rigid_jacobian[:] = 0.0
         rigid_response[:] = 0.0
-        rows.rigid_velocity[:] = 0.0
-        self.touched.velocity[:touched] = 0.0
         self._write_contact_rows(n)
 
         widest = int((self.touched.tree_end[:touched] - self.touched.tree_start[:touched]).max())
@@ -124,6 +143,7 @@ class ImpulseSolver:
 
     def bind_launches(self, detection: ContactDetection) -> None:
         """Bind every kernel to its arrays; to call again when ``detection`` has new arrays of candidates."""
+        self._detection = detection
         p, parameters, rigid = self.parameters, self._kernel_parameters, self.rigid_arrays
         capsules, bodies = self.arrays.capsules.struct, self.arrays.bodies.struct
         geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
@@ -147,27 +167,16 @@ class ImpulseSolver:
             [geoms, rigid_bodies, factors, contacts, touched, counters, body_response],
             [rows],
         )
-        self._assemble_delassus = bind_launch(
-            delassus.assemble_delassus, [parameters, geoms, rigid_bodies, contacts, touched, groups], [rows]
-        )
+        self._assemble_delassus = bind_launch(delassus.assemble_delassus, [contacts, touched, groups], [rows])
         self._solve_islands = bind_launch(
             projected_gauss_seidel.solve_islands,
-            [
-                parameters,
-                p.solver_sweeps,
-                p.solver_newton_steps,
-                p.solver_tolerance,
-                geoms,
-                counters,
-                rigid_bodies,
-                factors,
-                contacts,
-            ],
-            [touched, groups, rows],
-        )
+            [parameters, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms,
+             rigid_bodies, contacts],
+            [groups, self.scratch.struct, rows],
+        )  # fmt: skip
         self._store_warm_start = bind_launch(
             forces.store_warm_start,
-            [parameters, geoms, rigid_bodies, touched, groups, rows],
+            [parameters, geoms, rigid_bodies, groups, rows],
             [contacts, warm_start],
         )
         self._accumulate_wrenches = bind_launch(
