@@ -15,6 +15,7 @@ from vinesim.kernels.contact.structs import (
     ISLANDS,
     MATRIX_ENTRIES,
     OVERFLOW,
+    SKIPPED_GEOMS,
     Candidates,
     Capsules,
     Contacts,
@@ -41,9 +42,11 @@ def compact_candidates(
     count = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
     overflow = int(0)  # noqa: RUF046
     impacted = int(0)  # noqa: RUF046
+    skipped = int(0)  # noqa: RUF046
     for row in range(counters_out[AWAKE_TREES]):
         kept = wp.min(candidates.count[row], slots)
         overflow = overflow + candidates.count[row] - kept
+        skipped = skipped + candidates.skipped_geoms[row]
         if candidates.is_impact[row]:
             impacted = impacted + 1
         for slot in range(kept):
@@ -53,6 +56,7 @@ def compact_candidates(
     counters_out[CONTACTS] = count
     counters_out[OVERFLOW] = overflow
     counters_out[IMPACTED_TREES] = impacted
+    counters_out[SKIPPED_GEOMS] = skipped
 
 
 @wp.func
