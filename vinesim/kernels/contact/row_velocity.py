@@ -71,7 +71,8 @@ def add_impulse(row: int, change: wp.float64, island: int, contacts: Contacts, i
 def update_rigid_velocity(island: int, contacts: Contacts, islands: Islands, rows_out: Rows):
     """Compute the rigid velocities of an island anew from all its impulses."""
     for place in range(islands.first_dof[island], islands.first_dof[island + 1]):
-        rows_out.rigid_velocity[islands.dof[place]] = wp.float64(0.0)
+        dof = islands.dof[place]
+        rows_out.rigid_velocity[dof] = wp.float64(0.0)
     for m in range(islands.start[island], islands.start[island + 1]):
         c = islands.contact[m]
         if contacts.other[c] >= 0:

@@ -186,7 +186,8 @@ class KernelLaunches:
         for i, start in enumerate(tree_start):
             of_tree = np.flatnonzero(tree == i)
             block = packed[start : start + len(of_tree), :, : len(of_tree)]
-            dense[np.ix_(order[of_tree], range(6), order[of_tree], range(6))] = block
+            at = order[of_tree]
+            dense[at[:, None], :, at] = block.transpose(0, 2, 1, 3)
         return dense
 
     def _record_response(self, capacity: int) -> None:
