@@ -153,8 +153,9 @@ class Physics:
 
     def _put_to_sleep(self) -> None:
         if self.parameters.sleep:
-            near, held = self.contact_solver.near_trees, self.grasp_manager.held_trees
-            self.sleep_monitor.update(np.union1d(near, held) if len(held) else near)
+            keep_awake = self.contact_solver.remote_trees.copy()
+            keep_awake[self.contact_solver.near_trees] = keep_awake[self.grasp_manager.held_trees] = True
+            self.sleep_monitor.update(keep_awake, self.contact_solver.pressing_pairs)
 
     # ------------------------------------------------------------------ results of a step
 

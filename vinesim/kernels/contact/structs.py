@@ -49,8 +49,6 @@ class Parameters:
     """[m/s]"""
     impact_speed: wp.float64
     """[m/s] A contact that closes faster is an impact."""
-    wake_speed: wp.float64
-    """[m/s] Boxes and free bunches that are slower wake no plant."""
     plant_friction: wp.float64
     """[1] Coulomb coefficient between plants."""
 
@@ -183,8 +181,8 @@ class Actors:
     start: wp.array(dtype=wp.int32)
     """[actor + 1] first geom of each."""
     is_remote: wp.array(dtype=wp.bool)
-    wakes_only_moving: wp.array(dtype=wp.bool)
-    """Boxes and free bunches wake plants only while they are faster than ``wake_speed``."""
+    may_sleep: wp.array(dtype=wp.bool)
+    """Boxes and free bunches wake plants only while MuJoCo has them awake."""
 
 
 @wp.struct
@@ -203,6 +201,8 @@ class RigidBodies:
     """[MuJoCo body]"""
     dof_parent: wp.array(dtype=wp.int32)
     dof_tree: wp.array(dtype=wp.int32)
+    tree_asleep: wp.array(dtype=wp.int32)
+    """[MuJoCo tree] negative while it is awake."""
     velocity_free: wp.array(dtype=wp.float64)
     """[dof] at the end of the step if there were no plants."""
     correction: wp.array(dtype=wp.float64)

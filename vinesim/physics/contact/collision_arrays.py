@@ -25,7 +25,7 @@ def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
     made.compliance = 1.0 / (p.dt * (stiffness * p.dt + damping))
     made.margin, made.static_margin = p.contact_margin, p.static_contact_margin
     made.max_separation_speed, made.impact_speed = p.max_separation_speed, p.impact_speed
-    made.wake_speed, made.plant_friction = p.wake_speed, p.friction
+    made.plant_friction = p.friction
     return made
 
 
@@ -95,7 +95,7 @@ class RigidArrays:
             structs.Actors,
             start=np.array([*first, self.movable], np.int32),
             is_remote=is_remote[first],
-            wakes_only_moving=np.array([actor[i] not in rigid.actors for i in first], np.bool_),
+            may_sleep=np.array([actor[i] not in rigid.actors for i in first], np.bool_),
         )
         self.dof_names = rigid.dof_names
         velocity, correction, before = rigid.velocity_free, np.zeros(world.nv), np.zeros(world.nv)
@@ -115,6 +115,7 @@ class RigidArrays:
             subtree_com=data.subtree_com,
             dof_parent=world.dof_parentid,
             dof_tree=world.dof_treeid,
+            tree_asleep=data.tree_asleep,
             velocity_free=velocity,
             correction=correction,
             correction_before=before,

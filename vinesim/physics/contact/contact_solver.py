@@ -173,6 +173,14 @@ class ContactSolver:
         return self._reported
 
     @property
+    def pressing_pairs(self) -> np.ndarray:
+        """[k, 2] Different trees that pressed on each other in the last step."""
+        n, contacts = self.count, self.impulses.contacts
+        pressing = (contacts.other_body[:n] >= 0) & (self.impulses.rows.impulse[0 : 3 * n : 3] > 0.0)
+        pairs = self.model.body_tree[np.stack([contacts.body[:n], contacts.other_body[:n]], -1)[pressing]]
+        return pairs[pairs[:, 0] != pairs[:, 1]]
+
+    @property
     def touched_trees(self) -> tuple[tuple[int, str], ...]:
         """(tree, actor) for every tree that an actor pressed on in the last step, sorted."""
         if self._touched is None:

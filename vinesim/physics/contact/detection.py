@@ -155,7 +155,9 @@ class ContactDetection:
         by_tree = {"index_list": "order", "partitions": self.plants.threads}
 
         self._geom_aabbs = bind_launch(broadphase.geom_aabbs, [parameters, geoms, rigid.bodies.struct], [geom_states])
-        self._actor_aabbs = bind_launch(broadphase.actor_aabbs, [parameters, actors, geom_states], [actor_boxes])
+        self._actor_aabbs = bind_launch(
+            broadphase.actor_aabbs, [actors, geoms, rigid.bodies.struct, geom_states], [actor_boxes]
+        )
         self._tree_aabbs = bind_launch(
             broadphase.tree_aabbs,
             [parameters, capsules, order, trees, bodies],

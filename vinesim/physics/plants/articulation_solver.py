@@ -27,23 +27,12 @@ from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
 from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.plants.kernel_launches import KernelLaunches
+from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
 from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-
-
-def kernel_parameters(
-    p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
-) -> dict[str, Any]:
-    """Fields of :class:`vinesim.kernels.articulation.structs.SolverParameters`."""
-    return {
-        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
-        "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
-        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
-    }  # fmt: skip
 
 
 class ArticulationSolver:
@@ -304,15 +293,26 @@ class ArticulationSolver:
 
     # ------------------------------------------------------------------ one step
 
-    def predict(self) -> None:
-        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts."""
+    def predict(self, trees: np.ndarray | None = None) -> None:
+        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts.
+
+        ``trees`` [k]: only these, since they were woken or their phi was changed after the prediction of all.
+        """
         self._checked = None
         self._runner.list_trees(self._awake)
-        self.launches.upload_changed()
-        count = len(self._runner.stepped)
-        self.launches.upload_step(count)
-        self._runner.predict()
-        self.launches.download_prediction(count)
+        launches = self.launches
+        launches.upload_changed()
+        if trees is None:
+            count = len(self._runner.stepped)
+            launches.upload_step(count)
+            self._runner.predict()
+            launches.download_prediction(count)
+        else:
+            count = len(trees)
+            self.list_subset(trees)
+            launches.upload_subset_step(count)
+            launches.predict_subset(count)
+            launches.download_subset_prediction(count)
         self.buffers.synchronize()
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:

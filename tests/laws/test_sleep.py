@@ -1,0 +1,101 @@
+"""Sleep is invisible: what sleeps is where it would have come to rest, and bears what it bore."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.support.contact_scenes import cane
+from vinesim import frames
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.step import Physics
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+
+WOOD = 8e9, 700.0
+
+
+def rod(at, beta: float = 0.01, radius: float = 0.01, bodies: int = 20, tip_mass: float = 0.0) -> TreeBuilder:
+    """A straight cane of 1 m along x, which is not in equilibrium; ``tip_mass`` [kg] is in its tip."""
+    tree = TreeBuilder(frames.pose(np.array(at, float)))
+    tree.add_rod(-1, 1.0, (radius, radius), RodMaterial(*WOOD, beta), bodies)
+    if tip_mass:
+        tree.bodies[-1] |= {"mass": tree.bodies[-1]["mass"] + tip_mass, "com": (1.0 / bodies, 0.0, 0.0)}
+    return tree
+
+
+def settled(at, **options) -> TreeBuilder:
+    tree = rod(at, **options)
+    tree.solve_rest_pose()
+    return tree
+
+
+def asleep(physics: Physics, limit: float) -> float:
+    """Step until every tree sleeps; the time [s] that took."""
+    while len(physics.plants.awake):
+        physics.step()
+        assert physics.time < limit
+    return physics.time
+
+
+@pytest.mark.parametrize("bodies", [8, 64])
+@pytest.mark.parametrize("tip_mass", [0.0, 0.5])
+@pytest.mark.parametrize("beta", [0.005, 0.05, 1.0])
+def test_a_released_cane_sleeps_where_it_would_come_to_rest(beta: float, tip_mass: float, bodies: int) -> None:
+    if beta == 0.005 and tip_mass:
+        beta = 0.01  # swings for half as long
+    physics = Physics(assemble([rod((0.0, 0.0, 2.0), beta, 0.008, bodies, tip_mass)]))
+    reference = Physics(
+        assemble([rod((0.0, 0.0, 2.0), 0.2, 0.008, bodies, tip_mass)]), parameters=PhysicsParameters(sleep=False)
+    )
+    drawn = physics.snapshot().body_q[:, :3].copy()
+    physics.wake(np.array([0]))
+    reference.wake(np.array([0]))
+    asleep(physics, 40.0)
+    for _ in range(600):
+        reference.step()
+    rest = reference.snapshot().body_q[:, :3]
+    travel = np.linalg.norm(rest - drawn, axis=1).max()
+    assert travel > 5e-3
+    error = np.linalg.norm(physics.snapshot().body_q[:, :3] - rest, axis=1).max()
+    assert error < min(1e-4, 1e-3 * travel)
+
+
+def test_a_cane_sleeps_no_sooner_than_it_is_slow() -> None:
+    """Its tip is followed to the last step, and what the last one moves it is below what anyone sees."""
+    physics = Physics(assemble([rod((0.0, 0.0, 2.0), 0.05, 0.008, 64, 0.5)]))
+    physics.wake(np.array([0]))
+    tips = []
+    while len(physics.plants.awake):
+        physics.step()
+        physics.update_kinematics()
+        tips.append(physics.state.body_q[-1, :3].copy())
+        assert physics.time < 40.0
+    steps = np.linalg.norm(np.diff(tips, axis=0), axis=1)
+    assert steps[:50].max() > 1e-3
+    assert steps[-2] < 3e-5
+    assert steps[-1] < 2.3e-4
+
+
+def test_a_crate_that_rests_on_two_canes_is_borne_in_every_step() -> None:
+    canes = [settled((0.0, side, 1.0)) for side in (-0.1, 0.1)]
+    model = assemble(canes, box_pose=[[0.5, 0, 1.0105, 0, 0, 0, 1]], box_size=[[0.1, 0.3, 0.1]], box_mass=[0.5])
+    physics = Physics(model)
+    borne = []
+    for _ in range(1500):
+        physics.step()
+        borne.append(-sum(contact.force[2] for contact in physics.contacts))
+    np.testing.assert_allclose(borne[500:], 0.5 * 9.81, rtol=1e-3)
+
+
+def test_a_bunch_that_was_picked_and_lies_on_canes_is_borne_in_every_step() -> None:
+    """The law of the crate for a free bunch: it never sleeps while plants bear it, so neither do these."""
+    canes = [settled((0.0, side, 1.0), radius=0.012) for side in (-0.05, 0.05)]
+    physics = Physics(assemble([cane((0.0, 3.0, 2.0), bunch=0.4), *canes]))
+    physics.pick(0)
+    lying = frames.pose(np.array([0.6, -0.085, 1.06]), frames.from_x_axis(np.array([0.0, 1.0, 0.0])))
+    physics.rigid.place_bunch(0, lying, np.zeros(6))
+    borne = []
+    for _ in range(2000):
+        physics.step()
+        borne.append(-sum(contact.force[2] for contact in physics.contacts if contact.actor == "bunch/0"))
+    np.testing.assert_allclose(borne[1500:], 0.4 * 9.81, rtol=1e-3)
