@@ -14,9 +14,11 @@ from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 WOOD = 8e9, 700.0
 
 
-def rod(at, beta: float = 0.01, radius: float = 0.01, bodies: int = 20, tip_mass: float = 0.0) -> TreeBuilder:
-    """A straight cane of 1 m along x, which is not in equilibrium; ``tip_mass`` [kg] is in its tip."""
-    tree = TreeBuilder(frames.pose(np.array(at, float)))
+def rod(
+    at, beta: float = 0.01, radius: float = 0.01, bodies: int = 20, tip_mass: float = 0.0, heading: float = 0.0
+) -> TreeBuilder:
+    """A straight, level cane of 1 m, which is not in equilibrium; ``tip_mass`` [kg] is in its tip."""
+    tree = TreeBuilder(frames.pose(np.array(at, float), frames.from_yaw(heading)))
     tree.add_rod(-1, 1.0, (radius, radius), RodMaterial(*WOOD, beta), bodies)
     if tip_mass:
         tree.bodies[-1] |= {"mass": tree.bodies[-1]["mass"] + tip_mass, "com": (1.0 / bodies, 0.0, 0.0)}
@@ -81,21 +83,81 @@ def test_a_crate_that_rests_on_two_canes_is_borne_in_every_step() -> None:
     model = assemble(canes, box_pose=[[0.5, 0, 1.0105, 0, 0, 0, 1]], box_size=[[0.1, 0.3, 0.1]], box_mass=[0.5])
     physics = Physics(model)
     borne = []
-    for _ in range(1500):
+    for _ in range(800):
         physics.step()
-        borne.append(-sum(contact.force[2] for contact in physics.contacts))
-    np.testing.assert_allclose(borne[500:], 0.5 * 9.81, rtol=1e-3)
+        borne.append(sum(contact.force[2] for contact in physics.contacts))
+    np.testing.assert_allclose(borne[300:], 0.5 * 9.81, rtol=1e-3)
 
 
 def test_a_bunch_that_was_picked_and_lies_on_canes_is_borne_in_every_step() -> None:
     """The law of the crate for a free bunch: it never sleeps while plants bear it, so neither do these."""
-    canes = [settled((0.0, side, 1.0), radius=0.012) for side in (-0.05, 0.05)]
+    canes = [settled((0.0, side, 1.0), radius=0.012) for side in (-0.035, 0.035)]
     physics = Physics(assemble([cane((0.0, 3.0, 2.0), bunch=0.4), *canes]))
     physics.pick(0)
-    lying = frames.pose(np.array([0.6, -0.085, 1.06]), frames.from_x_axis(np.array([0.0, 1.0, 0.0])))
-    physics.rigid.place_bunch(0, lying, np.zeros(6))
+    physics.rigid.place_bunch(0, frames.pose(np.array([0.5, 0.0, 1.05])), np.zeros(6))
     borne = []
-    for _ in range(2000):
+    for _ in range(900):
         physics.step()
-        borne.append(-sum(contact.force[2] for contact in physics.contacts if contact.actor == "bunch/0"))
-    np.testing.assert_allclose(borne[1500:], 0.4 * 9.81, rtol=1e-3)
+        borne.append(sum(contact.force[2] for contact in physics.contacts if contact.actor == "bunch/0"))
+    np.testing.assert_allclose(borne[600:], 0.4 * 9.81, rtol=1e-3)
+
+
+def dragged(sleep: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A row of canes whose first is held at 0.75 m and pulled through the others: positions [step, body, 3], the force
+    [step, 3] of the hold, and how many trees were awake [step]."""
+    model = assemble([cane((0.0, 0.06 * i, 2.0), radius=0.005) for i in range(8)])
+    physics = Physics(model, parameters=PhysicsParameters(sleep=sleep))
+    plants = physics.plants
+    physics.wake(np.array([0]) if sleep else np.arange(8))
+    tie = plants.add_tie(12, np.zeros(3), 2000.0, 20.0)
+    start = plants.tie_anchor[tie].copy()
+    positions, forces, awake = [], [], []
+    for step in range(250):
+        plants.tie_anchor[tie] = start + [0.0, 0.25 * min(0.01 * step, 1.0), 0.0]
+        physics.step()
+        physics.update_kinematics()
+        positions.append(physics.state.body_q[:, :3].astype(float))
+        forces.append(2000.0 * (plants.tie_anchor[tie] - positions[-1][12]))
+        awake.append(len(plants.awake))
+    return np.array(positions), np.array(forces), np.array(awake)
+
+
+def test_a_cane_dragged_through_sleeping_canes_moves_them_as_if_they_were_awake() -> None:
+    positions, forces, awake = dragged(sleep=True)
+    expected, expected_forces, _ = dragged(sleep=False)
+    assert awake[0] == 1
+    assert awake.max() < 8  # the last one is not reached
+    assert np.abs(expected[:, 16 * 5 :] - expected[0, 16 * 5 :]).max() > 0.05
+    np.testing.assert_allclose(positions, expected, atol=1e-3)
+    size = np.linalg.norm(expected_forces, axis=1)
+    assert np.abs(forces - expected_forces).max() < 0.02 * size.max()
+
+
+def pressure(physics: Physics) -> float:
+    return sum(float(np.linalg.norm(contact.force)) for contact in physics.contacts if contact.actor == "plants")
+
+
+def test_a_cane_that_came_to_rest_on_another_sleeps_and_wakes_with_it() -> None:
+    """A slack cane sags onto one that sleeps. Whichever is woken then, both are, and the contact bears what it bore."""
+    physics = Physics(assemble([settled((0.0, 0.0, 1.0)), rod((0.5, -0.8, 1.021), heading=np.pi / 2, beta=0.03)]))
+    physics.wake(np.array([1]))
+    awake, borne = [], 0.0
+    while len(physics.plants.awake):
+        borne = pressure(physics)
+        physics.step()
+        awake.append(physics.plants.awake.tolist())
+        assert physics.time < 30.0
+    assert awake[0] == [1]
+    assert awake[-2:] == [[0, 1], []]
+    assert borne > 0.05
+    rest = physics.snapshot().body_q[:, :3].copy()
+    for tree in (0, 1):
+        physics.wake(np.array([tree]))
+        physics.step()
+        assert physics.plants.awake.tolist() == [0, 1]
+        pressures = []
+        while len(physics.plants.awake):
+            physics.step()
+            pressures.append(pressure(physics))
+        np.testing.assert_allclose(pressures[:-1], borne, rtol=0.01)
+        np.testing.assert_allclose(physics.snapshot().body_q[:, :3], rest, atol=2e-5)

@@ -132,7 +132,9 @@ class Physics:
             self.wind.update(self.plants, self.time, observers, self.parameters)
 
     def _refine_bunches(self) -> None:
-        self.level_of_detail.update(self.contact_solver.near_trees)
+        coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
+        if len(coarsened):  # those that sleep collide with other shapes now
+            self.contact_solver.update_tree_bounds(coarsened)
 
     def _integrate_plants(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)

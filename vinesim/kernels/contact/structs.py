@@ -67,6 +67,8 @@ class Trees:
 
     awake: wp.array(dtype=wp.int32)
     """[k] numbers of the trees that this step is about; as many as the thread count says."""
+    is_awake: wp.array(dtype=wp.bool)
+    """[tree]"""
     is_fine: wp.array(dtype=wp.bool)
     """[tree] whether the clusters of its bunches are free to move."""
     is_remote: wp.array(dtype=wp.bool)
@@ -120,7 +122,7 @@ class Capsules:
 
 @wp.struct
 class CapsuleStates:
-    """The capsules of awake trees at the start of the step [capsule]."""
+    """The capsules at the start of the step [capsule]; of sleeping trees, where they fell asleep."""
 
     start: wp.array(dtype=wp.vec3)
     end: wp.array(dtype=wp.vec3)
@@ -129,6 +131,19 @@ class CapsuleStates:
     low: wp.array(dtype=wp.vec3)
     """[m] box of the space that it sweeps in the step."""
     high: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Clearances:
+    """How far capsules of awake trees were from pressing on sleeping trees when they were last compared [capsule]."""
+
+    start: wp.array(dtype=wp.vec3)
+    """[m] then."""
+    end: wp.array(dtype=wp.vec3)
+    distance: wp.array(dtype=float)
+    """[m] that they may move from there; negative if they must be compared in any case."""
+    reach: wp.array(dtype=float)
+    """[m] around the capsule to be searched in this step; 0 for none."""
 
 
 @wp.struct

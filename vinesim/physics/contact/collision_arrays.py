@@ -37,6 +37,7 @@ class PlantArrays:
         self.trees = SharedArrays(
             structs.Trees,
             awake=np.zeros(count, np.int32),
+            is_awake=state.tree_awake,
             is_fine=state.tree_fine,
             is_remote=np.zeros(count, np.bool_),
             bunch_attached=state.bunch_attached,
