@@ -72,8 +72,8 @@ def test_busy_trees_stay_awake() -> None:
     assert sleep.restless.tolist() == []
 
 
-def test_trees_that_press_on_each_other_sleep_together() -> None:
-    """1 presses on 0, 2 on 1; 3 presses on none: while 2 moves, 0 and 1 stay awake, however quiet."""
+def test_trees_in_contact_sleep_together() -> None:
+    """1 touches 0 and 2, 3 touches none: while 2 moves, 0 and 1 stay awake, however quiet."""
     plants = row(4)
     sleep = SleepMonitor(plants, PhysicsParameters(sleep_duration=0.05))
     sleep.wake(np.arange(4))

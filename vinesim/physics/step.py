@@ -157,7 +157,7 @@ class Physics:
         if self.parameters.sleep:
             keep_awake = self.contact_solver.remote_trees.copy()
             keep_awake[self.contact_solver.near_trees] = keep_awake[self.grasp_manager.held_trees] = True
-            self.sleep_monitor.update(keep_awake, self.contact_solver.pressing_pairs)
+            self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs)
 
     # ------------------------------------------------------------------ results of a step
 

@@ -1,4 +1,4 @@
-"""Sleeping trees that awake ones would press on: boxes of blocks, trees and capsules, then the narrowphase.
+"""Sleeping trees that awake ones are about to touch: boxes of blocks, trees and capsules, then the narrowphase.
 
 A capsule that has been compared with all that sleeps around it need not be compared again before it has moved as far
 as it was clear of them: a tree that is awake but hardly moves costs a comparison a capsule.
@@ -37,7 +37,7 @@ def list_due_capsules(
     capsule_states: CapsuleStates,
     clearances_out: Clearances,
 ):
-    """Find the capsules of a tree that may press on something before the step ends; returns the box around these."""
+    """Find the capsules of a tree that may touch something before the step ends; returns the box around these."""
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
     for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
@@ -72,7 +72,7 @@ def compare_with_sleeping_tree(
     capsule_states: CapsuleStates,
     clearances_out: Clearances,
 ):
-    """Whether the due capsules of a tree would press on another; notes how far they are clear of it."""
+    """Whether the due capsules of a tree will be in contact with another; notes how far they are clear of it."""
     reached = bool(False)
     for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
         reach = clearances_out.reach[s]
@@ -112,10 +112,10 @@ def find_reached_trees(
     clearances_out: Clearances,
     is_reached_out: wp.array(dtype=wp.bool),
 ):
-    """One thread per awake tree: mark the sleeping trees on which it would press before the step ends.
+    """One thread per awake tree: mark the sleeping trees with which it is in contact before the step ends.
 
-    Thread i takes the tree ``trees.awake[order[i]]``. parameters: without a margin of contacts between plants.
-    capsule_states: those of sleeping trees are of their last step. Blocks contain awake trees where they fell asleep.
+    Thread i takes the tree ``trees.awake[order[i]]``. What overlaps as generated, or is that near, is in contact only
+    beyond that (:func:`plant_candidate`), so that trees that merely stand together do not wake each other.
     """
     tree = trees.awake[order[wp.tid()]]
     low, high = list_due_capsules(

@@ -135,7 +135,7 @@ class CapsuleStates:
 
 @wp.struct
 class Clearances:
-    """How far capsules of awake trees were from pressing on sleeping trees when they were last compared [capsule]."""
+    """How far capsules of awake trees were from contact with sleeping trees when they were last compared [capsule]."""
 
     start: wp.array(dtype=wp.vec3)
     """[m] then."""

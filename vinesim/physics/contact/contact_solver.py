@@ -29,8 +29,8 @@ class ContactSolver:
     ``wake_near_trees()`` (before ``plants.predict()``) wakes the trees that an actor is near to; ``solve()`` (after it)
     leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.integrate()``.
 
-    Robots, people, boxes and free bunches wake the trees that they are near to, awake trees those that they would press
-    on. Static geoms (ground, poles, trunks) only hold back what moves already. What overlaps in the scene as generated is in contact only beyond
+    Robots, people, boxes and free bunches wake the trees that they are near to, awake trees those that they
+    touch. Static geoms (ground, poles, trunks) only hold back what moves already. What overlaps in the scene as generated is in contact only beyond
     that. All numbers come from ``rigid.parameters``; of more contacts than ``contact_capacity``, the deepest are kept,
     and
     ``dropped_contacts`` and ``overflow_message`` report it.
@@ -97,7 +97,7 @@ class ContactSolver:
             self.impulses.warm_start.count[0] = 0
 
     def _wake_reached_trees(self) -> np.ndarray:
-        """Wake the sleeping trees on which awake ones would press, those on which these would, and so on.
+        """Wake the sleeping trees that awake ones touch, those that these touch, and so on.
 
         Returns all awake trees [k].
         """
@@ -187,12 +187,10 @@ class ContactSolver:
         return self._reported
 
     @property
-    def pressing_pairs(self) -> np.ndarray:
-        """[k, 2] Different trees that pressed on each other in the last step."""
-        n, contacts = self.count, self.impulses.contacts
-        pressing = (contacts.other_body[:n] >= 0) & (self.impulses.rows.impulse[0 : 3 * n : 3] > 0.0)
-        pairs = self.model.body_tree[np.stack([contacts.body[:n], contacts.other_body[:n]], -1)[pressing]]
-        return pairs[pairs[:, 0] != pairs[:, 1]]
+    def contact_pairs(self) -> np.ndarray:
+        """[k, 2] Pairs of awake trees that were in contact in the last step."""
+        bodies = np.stack([self.impulses.contacts.body[: self.count], self.impulses.contacts.other_body[: self.count]], -1)
+        return self.model.body_tree[bodies[bodies[:, 1] >= 0]]
 
     @property
     def touched_trees(self) -> tuple[tuple[int, str], ...]:

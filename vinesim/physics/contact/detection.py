@@ -1,8 +1,8 @@
 """Collision detection of plants: boxes of trees and geoms, trees that actors are near, and candidates of contacts.
 
 The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then, with the
-prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees on which awake ones would
-press) and :meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for
+prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake ones
+reach) and :meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for
 each listing of the rigid world: a bound launch costs a fifth of a plain one.
 """
 
@@ -16,7 +16,7 @@ import warp as wp
 
 from vinesim.kernels.contact import broadphase, narrowphase_plants, narrowphase_rigid, sleeping_trees, structs
 from vinesim.kernels.launch import bind_launch
-from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters
+from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
 from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
@@ -39,11 +39,10 @@ class ContactDetection:
         plants: ArticulationSolver,
         arrays: PlantArrays,
         parameters: PhysicsParameters,
-        numbers: structs.Parameters,
+        kernel_parameters: structs.Parameters,
     ) -> None:
-        """``numbers``: ``parameters`` for the kernels."""
         self.plants, self.arrays, self.parameters = plants, arrays, parameters
-        self._kernel_parameters = numbers
+        self._kernel_parameters = kernel_parameters
         trees = len(arrays.trees.is_fine)
         self._order, self._partition = np.zeros(trees, np.int32), (0, 0)
         self._sorted_rows = np.zeros(trees, np.int32)
@@ -121,7 +120,7 @@ class ContactDetection:
         self._launch_over_trees(len(awake), self._tree_aabbs)
 
     def find_reached_trees(self) -> np.ndarray:
-        """Sleeping trees [k] on which one of the listed awake ones would press before the step ends."""
+        """Sleeping trees [k] with which one of the listed awake ones is in contact, or will be before the step ends."""
         self._is_reached[:] = False
         self._launch_over_trees(int(self.counters[structs.AWAKE_TREES]), self._find_reached_trees)
         return np.flatnonzero(self._is_reached)
@@ -190,11 +189,9 @@ class ContactDetection:
             [actors, trees, block_boxes, tree_boxes, actor_boxes, geom_states],
             [share(self._is_near, wp.bool)],
         )
-        pressing = kernel_parameters(self.parameters)
-        pressing.static_margin = 0.0
         self._find_reached_trees = bind_launch(
             sleeping_trees.find_reached_trees,
-            [pressing, capsules, order, trees, block_boxes, tree_boxes, bodies, capsule_states],
+            [parameters, capsules, order, trees, block_boxes, tree_boxes, bodies, capsule_states],
             [self._clearances.struct, share(self._is_reached, wp.bool)],
             **by_tree,
         )

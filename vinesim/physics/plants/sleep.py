@@ -1,4 +1,4 @@
-"""Sleep of trees: what is at rest is put to sleep, together with all that it presses on.
+"""Sleep of trees: what is at rest is put to sleep, together with all that it touches.
 
 A tree is at rest when no point of it is faster than ``sleep_speed`` nor further than ``sleep_distance`` from where it
 will rest. It is then moved there, so that it sleeps in the pose in which it would have come to rest: less than a camera
@@ -56,11 +56,17 @@ class SleepMonitor:
         self.plants.wake(trees)
         self._forget(trees)
 
-    def update(self, keep_awake: np.ndarray | None = None, pressing_pairs: np.ndarray = _NO_PAIRS) -> np.ndarray:
+    def wake_unbalanced(self) -> None:
+        """Wake the sleeping trees that would not stay where they are."""
+        asleep = np.flatnonzero(~self.plants.state.tree_awake).astype(np.int32)
+        _, distance, _ = self._equilibrium.residual_motion(asleep)
+        self.wake(asleep[distance > CONTACT_SHARE * self.distance])
+
+    def update(self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS) -> np.ndarray:
         """After an integration: the trees that have just been put to sleep [k].
 
-        ``keep_awake`` [tree] bool: what an actor is near to, holds or owns. ``pressing_pairs`` [n, 2]: awake trees that
-        press on each other.
+        ``keep_awake`` [tree] bool: what an actor is near to, holds or owns. ``contact_pairs`` [n, 2]: awake trees that
+        touch each other.
         """
         plants, awake = self.plants, self.plants.awake
         self.quiet_steps[awake] += 1
@@ -74,7 +80,7 @@ class SleepMonitor:
         tolerance = np.where(is_free, self.distance, CONTACT_SHARE * self.distance)
         self._is_at_rest[slow] = (speed < self.speed) & (distance < tolerance)
         stays = ~self._is_at_rest if keep_awake is None else ~self._is_at_rest | keep_awake
-        while len(spread := pressing_pairs[stays[pressing_pairs[:, 0]] != stays[pressing_pairs[:, 1]]]):
+        while len(spread := contact_pairs[stays[contact_pairs[:, 0]] != stays[contact_pairs[:, 1]]]):
             stays[spread] = True
         asleep = slow[~stays[slow]]
         self._equilibrium.move_to_rest(slow[~stays[slow] & is_free])
