@@ -120,6 +120,7 @@ class Physics:
             "trees_slowed": self.fault_guard.slowed,
             "robots_stopped": self.rigid.faults,
             "contacts_dropped": self.contact_solver.dropped_contacts,
+            "geoms_skipped": self.contact_solver.skipped_geoms,
             "grasps_refused": self.grasp_manager.refused_grasps,
         }
 
@@ -156,7 +157,8 @@ class Physics:
     def _put_to_sleep(self) -> None:
         if self.parameters.sleep:
             keep_awake = self.contact_solver.remote_trees.copy()
-            keep_awake[self.contact_solver.near_trees] = keep_awake[self.grasp_manager.held_trees] = True
+            keep_awake[self.contact_solver.near_trees] = True
+            keep_awake[self.model.body_tree[self.plants.held_bodies]] = True
             self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs)
 
     # ------------------------------------------------------------------ results of a step

@@ -39,8 +39,7 @@ class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
     ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
-    a
-    tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after a contact
+    a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after a contact
     began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
     ``predict()`` before them.
 
@@ -208,8 +207,11 @@ class ArticulationSolver:
             self._list_awake()
 
     def put_to_sleep(self, trees: np.ndarray | int) -> None:
-        """Put trees to sleep where they are, with zero rates; their poses are brought up to date."""
-        trees = np.atleast_1d(trees)
+        """Put trees to sleep where they are, with zero rates; their poses are brought up to date.
+
+        :class:`ValueError` if there is no such tree.
+        """
+        trees = checked_trees(trees, len(self.state.tree_awake))
         if len(trees) == 0:
             return
         bodies = self.bodies_of(trees)
@@ -237,6 +239,7 @@ class ArticulationSolver:
         """Let the clusters of these trees' bunches move, from where they ride and as fast as what they ride on.
 
         Pose, velocity and momentum go on. Nothing happens to trees that are fine or have no clusters; none wakes.
+        :class:`ValueError` if there is no such tree.
         """
         self._clusters.refine(trees)
 
@@ -418,12 +421,10 @@ class ArticulationSolver:
             return
         bodies = self._checked = np.asarray(bodies)
         trees = self.model.body_tree[bodies]
-        at = np.searchsorted(self._runner.stepped, trees)
-        if (
-            len(self._runner.stepped) == 0
-            or (self._runner.stepped[np.minimum(at, len(self._runner.stepped) - 1)] != trees).any()
-        ):
-            late = next(i for i, tree in enumerate(trees) if tree not in self._runner.stepped)
+        stepped = self._runner.stepped
+        at = np.searchsorted(stepped, trees)
+        if len(stepped) == 0 or (stepped[np.minimum(at, len(stepped) - 1)] != trees).any():
+            late = next(i for i, tree in enumerate(trees) if tree not in stepped)
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
         riding = bodies - self.model.tree_first[trees] >= self.tree_moving[trees]
         if riding.any():
@@ -466,6 +467,11 @@ class ArticulationSolver:
     def tie_damping(self) -> np.ndarray:
         """N s/m [tie]."""
         return self._ties.damping
+
+    @property
+    def held_bodies(self) -> list[int]:
+        """Bodies that ties of :meth:`add_tie` hold."""
+        return self._ties.held_bodies
 
     def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
