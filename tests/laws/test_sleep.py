@@ -146,10 +146,10 @@ def test_a_cane_dragged_through_sleeping_ones_moves_them_as_if_they_were_awake(
     """Drags so gentle that two runs with everything awake, a micrometre apart, agree too."""
     model = scene()
     body = int(model.tree_first[tree]) + depth
-    positions, forces, awake = drag(Physics(model), body, np.array(way), 200)
+    positions, forces, awake = drag(Physics(model), body, np.array(way), 150)
     all_awake = Physics(model, parameters=PhysicsParameters(sleep=False))
     all_awake.wake(np.arange(len(model.tree_first)))
-    expected, expected_forces, _ = drag(all_awake, body, np.array(way), 200)
+    expected, expected_forces, _ = drag(all_awake, body, np.array(way), 150)
     moved = np.zeros(len(model.tree_first))
     np.maximum.at(moved, model.body_tree, np.linalg.norm(expected - expected[0], axis=-1).max(0))
     assert awake[0] == 1

@@ -194,7 +194,9 @@ class ContactSolver:
     @property
     def contact_pairs(self) -> np.ndarray:
         """[k, 2] Pairs of awake trees that were in contact in the last step."""
-        bodies = np.stack([self.impulses.contacts.body[: self.count], self.impulses.contacts.other_body[: self.count]], -1)
+        bodies = np.stack(
+            [self.impulses.contacts.body[: self.count], self.impulses.contacts.other_body[: self.count]], -1
+        )
         return self.model.body_tree[bodies[bodies[:, 1] >= 0]]
 
     @property

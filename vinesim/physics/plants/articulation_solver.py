@@ -52,8 +52,7 @@ class ArticulationSolver:
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
         threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
-        fast_rate: [rad/s] see ``PhysicsParameters.fast_joint_rate``.
-        max_rate: [rad/s] see ``PhysicsParameters.max_joint_rate``.
+        fast_rate, max_rate: [rad/s] see ``fast_joint_rate`` and ``max_joint_rate`` of ``PhysicsParameters``.
         fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
@@ -215,11 +214,8 @@ class ArticulationSolver:
         if len(trees) == 0:
             return
         bodies = self.bodies_of(trees)
-        self.state.joint_qd[bodies] = 0.0
-        self.state.joint_xd[bodies] = 0.0
-        self.velocity_free[bodies] = 0.0
-        self.acceleration[bodies] = 0.0
-        self._wrench[bodies] = 0.0
+        for rows in (self.state.joint_qd, self.state.joint_xd, self.velocity_free, self.acceleration, self._wrench):
+            rows[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._euler_steps[trees] = 0
         self.forward_kinematics(trees)
@@ -299,11 +295,10 @@ class ArticulationSolver:
     def predict(self, trees: np.ndarray | None = None) -> None:
         """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts.
 
-        ``trees`` [k]: only these, since they were woken or their phi was changed after the prediction of all.
+        ``trees`` [k]: only these, woken or given another phi after the prediction of all.
         """
-        self._checked = None
+        self._checked, launches = None, self.launches
         self._runner.list_trees(self._awake)
-        launches = self.launches
         launches.upload_changed()
         if trees is None:
             count = len(self._runner.stepped)
@@ -333,8 +328,7 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, count = self.launches, len(self._runner.stepped)
-        changed = len(self._loaded_bodies) > 0
+        launches, count, changed = self.launches, len(self._runner.stepped), len(self._loaded_bodies) > 0
         self._wrench[self._loaded_bodies] = 0.0
         self._loaded_bodies = np.zeros(0, np.int32)
         if bodies is not None and len(bodies):
@@ -424,7 +418,7 @@ class ArticulationSolver:
         stepped = self._runner.stepped
         at = np.searchsorted(stepped, trees)
         if len(stepped) == 0 or (stepped[np.minimum(at, len(stepped) - 1)] != trees).any():
-            late = next(i for i, tree in enumerate(trees) if tree not in stepped)
+            late = int(np.argmin(np.isin(trees, stepped)))
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
         riding = bodies - self.model.tree_first[trees] >= self.tree_moving[trees]
         if riding.any():
