@@ -1,8 +1,8 @@
 """Collision detection of plants: boxes of trees and geoms, trees that actors are near, and candidates of contacts.
 
 The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then, with the
-prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake ones
-reach) and :meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for
+prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake ones touch) and
+:meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for
 each listing of the rigid world: a bound launch costs a fifth of a plain one.
 """
 

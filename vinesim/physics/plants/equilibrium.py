@@ -39,7 +39,7 @@ class EquilibriumFinder:
         self._record(plants)
 
     def _record(self, plants: ArticulationSolver) -> None:
-        """Bind the kernel; scratch, factors and predicted rates are those of a step, which no one needs between steps."""
+        """Bind the kernel; scratch, factors and predicted rates are those of a step, unused between steps."""
         launches, s = plants.launches, structs
         fill = launches.fill
         numbers = {name: getattr(launches.parameters, name) for name in s.fields(s.SolverParameters)}
