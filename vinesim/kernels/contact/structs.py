@@ -54,8 +54,6 @@ class Parameters:
     """[m/s]"""
     impact_speed: wp.float64
     """[m/s] A contact that closes faster is an impact."""
-    wake_speed: wp.float64
-    """[m/s] Boxes and free bunches that are slower wake no plant."""
     plant_friction: wp.float64
     """[1] Coulomb coefficient between plants."""
 
@@ -74,6 +72,8 @@ class Trees:
 
     awake: wp.array(dtype=wp.int32)
     """[k] numbers of the trees that this step is about; as many as the thread count says."""
+    is_awake: wp.array(dtype=wp.bool)
+    """[tree]"""
     is_fine: wp.array(dtype=wp.bool)
     """[tree] whether the clusters of its bunches are free to move."""
     is_remote: wp.array(dtype=wp.bool)
@@ -127,7 +127,7 @@ class Capsules:
 
 @wp.struct
 class CapsuleStates:
-    """The capsules of awake trees at the start of the step [capsule]."""
+    """The capsules at the start of the step [capsule]; of sleeping trees, where they fell asleep."""
 
     start: wp.array(dtype=wp.vec3)
     end: wp.array(dtype=wp.vec3)
@@ -136,6 +136,19 @@ class CapsuleStates:
     low: wp.array(dtype=wp.vec3)
     """[m] box of the space that it sweeps in the step."""
     high: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Clearances:
+    """How far capsules of awake trees were from contact with sleeping trees when they were last compared [capsule]."""
+
+    start: wp.array(dtype=wp.vec3)
+    """[m] then."""
+    end: wp.array(dtype=wp.vec3)
+    distance: wp.array(dtype=float)
+    """[m] that they may move from there; negative if they must be compared in any case."""
+    reach: wp.array(dtype=float)
+    """[m] around the capsule to be searched in this step; 0 for none."""
 
 
 @wp.struct
@@ -192,8 +205,8 @@ class Actors:
     start: wp.array(dtype=wp.int32)
     """[actor + 1] first geom of each."""
     is_remote: wp.array(dtype=wp.bool)
-    wakes_only_moving: wp.array(dtype=wp.bool)
-    """Boxes and free bunches wake plants only while they are faster than ``wake_speed``."""
+    may_sleep: wp.array(dtype=wp.bool)
+    """Boxes and free bunches wake plants only while MuJoCo has them awake."""
 
 
 @wp.struct
@@ -212,6 +225,8 @@ class RigidBodies:
     """[MuJoCo body]"""
     dof_parent: wp.array(dtype=wp.int32)
     dof_tree: wp.array(dtype=wp.int32)
+    tree_asleep: wp.array(dtype=wp.int32)
+    """[MuJoCo tree] negative while it is awake."""
     velocity_free: wp.array(dtype=wp.float64)
     """[dof] at the end of the step if there were no plants."""
     correction: wp.array(dtype=wp.float64)

@@ -17,6 +17,7 @@ from vinesim.kernels.articulation.joint_wrench import joint_wrench
 from vinesim.kernels.articulation.kinematics import forward_kinematics
 from vinesim.kernels.articulation.prediction import predict
 from vinesim.kernels.launch import bind_launch
+from vinesim.physics.parameters import PhysicsParameters
 
 if TYPE_CHECKING:
     from vinesim.physics.plants.articulation_solver import ArticulationSolver
@@ -39,6 +40,17 @@ SCRATCH = {
     ),
 }  # fmt: skip
 """Rows that only kernels see."""
+
+
+def kernel_parameters(
+    p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
+) -> dict[str, Any]:
+    """Fields of :class:`vinesim.kernels.articulation.structs.SolverParameters`."""
+    return {
+        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
+        "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
+        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
+    }  # fmt: skip
 
 
 class KernelLaunches:
@@ -113,6 +125,8 @@ class KernelLaunches:
 
         self.upload_step = copier("stepping", *STEP_INPUTS)
         self.download_prediction = copier("stepping", "body_q", "body_qd", "body_qd_free", to_host=True)
+        self.upload_subset_step = copier("subset", *STEP_INPUTS)
+        self.download_subset_prediction = copier("subset", "body_q", "body_qd", "body_qd_free", to_host=True)
         self.upload_wrenches = copier("stepping", "body_wrench")
         self.download_joints = copier(
             "stepping", "joint_x", "joint_xd", "joint_q", "joint_qd", "body_acceleration", to_host=True
@@ -131,10 +145,13 @@ class KernelLaunches:
         joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
         partitioned = {"index_list": "trees", "partitions": self._threads}
-        self.predict = record(
-            predict, parameters, self._model, "stepping", "tree_phi", "tree_euler_steps", self._forces, joints,
-            "phi_used",
-            self._bodies, self._factors, scratch, prediction, **partitioned,
+        self.predict, self.predict_subset = (
+            record(
+                predict, parameters, self._model, trees, "tree_phi", "tree_euler_steps", self._forces, joints,
+                "phi_used",
+                self._bodies, self._factors, scratch, prediction, **options,
+            )
+            for trees, options in (("stepping", partitioned), ("subset", {"index_list": "trees"}))
         )  # fmt: skip
         self.integrate = record(
             integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", joints, prediction, "tree_rate",
