@@ -90,7 +90,7 @@ def test_all_messages_are_recorded(tmp_path):
     }
 
     # all tree updates and events that bob received are recorded, in order and bitwise
-    updates = [messages.decode_trees(e.payload) for e in recorded.messages if e.key == "c/0/0/ada"]
+    updates = [messages.decode_trees(e.payload) for e in recorded.messages if e.key in ("tree/0/0/ada", "near/0/0/ada")]
     assert len(updates) > 90
     last = [
         e
@@ -103,7 +103,7 @@ def test_all_messages_are_recorded(tmp_path):
 
     # log time is network time: a delay and a poll after the author's time stamp
     for entry in recorded.messages:
-        if entry.key == "c/0/0/ada":
+        if entry.key in ("tree/0/0/ada", "near/0/0/ada"):
             assert 0.0 < entry.time - messages.time_of(entry.payload) < 0.03
     assert recorded.start == pytest.approx(EPOCH, abs=0.2)
 
@@ -155,7 +155,7 @@ def test_an_observer_records_an_actor_that_is_alone(tmp_path):
     recorded = world.recorded()
     assert families(recorded) == {"a", "c", "own", "hello", "live", "snap"}
     assert sum(entry.key.startswith("a/ada") for entry in recorded.messages) > 150
-    assert sum(entry.key == "c/0/0/ada" for entry in recorded.messages) > 90
+    assert sum(entry.key in ("tree/0/0/ada", "near/0/0/ada") for entry in recorded.messages) > 90
     assert not any("recorder" in entry.key for entry in recorded.messages)
 
 
@@ -222,7 +222,7 @@ def test_the_official_reader_reads_the_json(tmp_path):
     assert pose["joint_position"] == pytest.approx([0.1, -0.2])
     stamp = pose["timestamp"]["sec"] * 10**9 + pose["timestamp"]["nsec"]
     assert stamp == message.publish_time <= message.log_time
-    assert messages_of["c/0/0/ada"][0][2]["trees"][0]["tree"] == 0
+    assert messages_of["tree/0/0/ada"][0][2]["trees"][0]["tree"] == 0
     assert messages_of["own/0/0/ada"][0][2]["claims"][0] == {
         "kind": "tree", "index": 0, "ownership": 0, "authority": 1, "owner": "ada", "touched": True,
     }  # fmt: skip

@@ -50,7 +50,7 @@ def watch(original: Recording, **span: float) -> tuple[MinimalClient, list[bytes
 
 
 def recorded_trees(original: Recording) -> list[messages.TreeStates]:
-    kinds = (entry.payload for entry in original.messages if entry.key in ("c/0/0/ada", "own/0/0/ada"))
+    kinds = (entry.payload for entry in original.messages if entry.key in ("tree/0/0/ada", "near/0/0/ada", "own/0/0/ada"))
     return [
         messages.decode_trees(payload) for payload in kinds if messages.kind_of(payload) == messages.MessageKind.TREES
     ]
@@ -213,7 +213,7 @@ def test_a_recording_of_a_replay_is_the_recording(original, tmp_path):
     second = read_recording(tmp_path / "again.mcap")
 
     def bodies(recorded: Recording) -> list[bytes]:
-        return [e.payload[14:] for e in recorded.messages if e.key == "c/0/0/ada"]
+        return [e.payload[14:] for e in recorded.messages if e.key in ("tree/0/0/ada", "near/0/0/ada")]
 
     assert bodies(second) == bodies(original)
     assert dataclasses.replace(second, messages=[]).metadata["digest"] == vineyard().digest()

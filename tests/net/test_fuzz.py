@@ -101,7 +101,7 @@ def test_a_message_from_the_far_future_does_not_block_its_sender():
     claim = ada.replicator.claim(0)
     header = np.array([0]), np.array([claim.ownership]), np.array([claim.authority]), np.array([messages.TOUCHED])
     invalid = messages.TreeStates(1e300, *header, np.array([len(q)]), q, qd)
-    bus.publisher("c/0/0/ada").put(messages.encode_trees(invalid)[0][0])
+    bus.publisher("tree/0/0/ada").put(messages.encode_trees(invalid)[0][0])
     hub.advance(0.01)
     bob.tick(hub.time)
     ada.place[0] = 1.5

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -88,3 +90,22 @@ def test_a_receiver_of_some_layers_gets_their_rate_at_any_rate_of_steps(layers, 
     assert all(b - a < every + max(gaps) for a, b in zip(received, [*received[1:], before], strict=True))
     if max(gaps) == 1:
         assert len(received) - 1 == before // every
+
+
+@given(points, st.floats(0.1, 6.0), st.floats(0.0, 2 * np.pi), st.floats(0.0, 1.0))
+def test_the_cells_of_trees_cover_a_circle_and_no_more(position, distance, angle, share):
+    cells = interest.tree_cells_within(np.array(position), distance)
+    inside = np.array(position) + share * (distance - 1e-6) * np.array([np.cos(angle), np.sin(angle)])
+    assert tuple(interest.cells_of(inside[None], interest.TREE_CELL_SIZE)[0].tolist()) in cells
+    for cell in cells:
+        low = interest.TREE_CELL_SIZE * np.array(cell)
+        nearest = np.clip(position, low, low + interest.TREE_CELL_SIZE)
+        assert np.hypot(*(nearest - position)) <= distance + 1e-9
+
+
+def test_an_error_of_a_tree_is_seen_at_no_larger_angle_from_farther_away():
+    """Each layer's tolerance is at most that of the nearest, times how much farther away its receivers are than 1 m."""
+    layers = sorted(interest.TREE_LAYERS, key=lambda layer: layer.distance)
+    assert layers[0].tolerance == 1.0
+    for near, far in itertools.pairwise(layers):
+        assert far.tolerance <= near.distance

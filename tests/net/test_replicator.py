@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from vinesim import frames
 from vinesim.net.codec import control, messages
 from vinesim.net.codec.messages import Hello
-from vinesim.net.replication import dead_reckoning
+from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.peers import WorldMismatch
 from vinesim.net.replication.receiver import Inbox
@@ -287,7 +287,7 @@ def test_a_steady_touch_sends_heartbeats_and_a_moving_one_when_extrapolation_fai
             stream = ada.replicator._state.tree_stream
             silence = dead_reckoning.clamp_age(hub.time - ada.replicator._state.ownership[0].published_at)
             extrapolated = dead_reckoning.extrapolate(
-                stream._published_q[bodies], stream._published_rate[bodies], silence
+                stream._published_q[-1, bodies], stream._published_rate[-1, bodies], silence
             )
             worst = max(
                 worst, dead_reckoning.angle_between(ada.state.joint_q[bodies].astype(float), extrapolated).max()
@@ -297,11 +297,41 @@ def test_a_steady_touch_sends_heartbeats_and_a_moving_one_when_extrapolation_fai
     assert worst <= dead_reckoning.ANGLE_ERROR
 
 
+def test_copies_of_a_tree_are_as_wrong_as_their_distance_allows_and_rest_exactly():
+    """The owner knows the copy of every peer to the bit; those beyond 3 m get fewer states, all the state of rest."""
+    hub = MemoryHub(delay=0.02)
+    ada, bob, cleo = clients = [Client(hub, "ada", 1.0), Client(hub, "bob", 2.0), Client(hub, "cleo", 4.6)]
+    ada.touched = {0}
+    run(hub, clients, 1.0)
+    bodies, worst = ada.model.bodies_of(0), [0.0, 0.0]
+    for k in range(300):
+        ada.bend(0, 0.2 + 0.15 * np.sin(0.06 * k), 0.15 * 0.06 / TICK * np.cos(0.06 * k))
+        run(hub, clients, TICK)
+        stream, entry = ada.replicator._state.tree_stream, ada.replicator._state.ownership[0]
+        for layer, sent in enumerate((entry.published_to_all_at, entry.published_at)):
+            position, _ = stream.prediction_error(layer, np.array([hub.time - sent]))
+            worst[layer] = max(worst[layer], float(position[0]))
+    for layer, (_, _, tolerance) in enumerate(interest.TREE_LAYERS):
+        assert (
+            0.2 * tolerance * dead_reckoning.POSITION_ERROR < worst[layer] <= tolerance * dead_reckoning.POSITION_ERROR
+        )
+    assert 10 < len(cleo.received) < 0.7 * len(bob.received)
+    run(hub, clients, 0.2)
+    for layer, peer in ((0, cleo), (1, bob)):
+        there = peer.replicator._state.tree_stream
+        np.testing.assert_array_equal(there._published_q[0, bodies], stream._published_q[layer, bodies])
+    ada.touched = set()
+    run(hub, clients, 0.2)
+    assert bob.received[-1].resting
+    assert cleo.received[-1].resting
+    np.testing.assert_array_equal(bob.state.joint_q[bodies], cleo.state.joint_q[bodies])
+
+
 def test_trees_of_one_cell_share_a_message():
     hub = MemoryHub()
     ada, bob = Client(hub, "ada", 2.0), Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 0.5)
-    ada.touched = {0, 1, 2, 3, 4}
+    ada.touched = {0, 1}
     run(hub, [ada, bob], TICK)
     assert ada.replicator.counters.environment.messages_out == 1
     assert ada.replicator.counters.environment.bytes_out == 14 + 5 * (13 + 6 * 9)
@@ -550,13 +580,13 @@ def test_an_unknown_peer_an_invalid_tree_and_a_repeated_message_are_ignored():
     bob.touched = {0}
     bob.bend(0, 0.3)
     eavesdropper = hub.bus("eavesdropper")
-    eavesdropper.subscribe("c/**", 100)
+    eavesdropper.subscribe("tree/**", 100)
     run(hub, [ada, bob], 0.1)
-    (_, recorded), *_ = eavesdropper.poll()
+    (key, recorded), *_ = eavesdropper.poll()
     bob.bend(0, -0.3)
     run(hub, [ada, bob], 0.1)
     held, received = ada.state.joint_q.copy(), len(ada.received)
-    bob.bus.publisher("c/0/0/bob").put(recorded)
+    bob.bus.publisher(key).put(recorded)
     run(hub, [ada, bob], 0.1)
     assert len(ada.received) == received
     np.testing.assert_array_equal(ada.state.joint_q, held)

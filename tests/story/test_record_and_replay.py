@@ -103,7 +103,7 @@ def killed_recording(tmp_path_factory) -> Iterator[tuple[str, pathlib.Path, floa
 
             # a tree is bent, rests, and is bent again until the recorder is killed
             clients.until(
-                lambda: "c/0/0/ada" in keys(path), "the tree to be recorded",
+                lambda: "tree/0/0/ada" in keys(path), "the tree to be recorded",
                 lambda: ada.bend(0, 0.5 * np.sin(0.1 * clients.number)),
             )  # fmt: skip
             ada.touched = set()
@@ -137,7 +137,7 @@ def test_a_killed_recorder_loses_at_most_one_second(killed_recording):
     assert killed - 1.0 < last <= killed + 0.1
     assert "killed" in recording.damage
     assert recording.metadata["scene"] == "rows"
-    moved = [entry for entry in recording.messages if entry.key == "c/0/0/ada"]
+    moved = [entry for entry in recording.messages if entry.key in ("tree/0/0/ada", "near/0/0/ada")]
     assert killed - 1.0 < moved[-1].time
 
 
@@ -152,7 +152,7 @@ def test_a_second_recorder_writes_a_second_file(killed_recording):
         client = MinimalClient(bus, 1.5)
         clients = TickedClients(client)
         clients.until(
-            lambda: {"hello/eve", "a/eve", "c/0/0/eve"} <= keys(second), "a client alone in the area to be recorded",
+            lambda: {"hello/eve", "a/eve", "tree/0/0/eve"} <= keys(second), "a client alone in the area to be recorded",
             lambda: client.bend(1, 0.5 * np.sin(0.1 * clients.number)),
         )  # fmt: skip
         recorder.send_signal(signal.SIGINT)
@@ -237,7 +237,7 @@ def count_bytes(endpoint: str, path: pathlib.Path | None, distance: float) -> li
         def all_matched() -> bool:
             ready = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.replicator._state.peers._layers[0].matching
             if distance < 5.0:
-                streams = [s.matching and e.matching for s, e in ada.replicator._state.cells.publishers.values()]
+                streams = [p.matching for p in ada.replicator._state.tree_channels.publishers[-1].values()]
                 ready &= (
                     ada.replicator._state.peers._layers[-1].matching
                     and bob.replicator._state.peers._layers[-1].matching
@@ -277,7 +277,7 @@ def test_a_recorder_does_not_change_traffic(tmp_path, distance):
         )
     assert without_recorder == with_recorder
     recorded = {entry.key for entry in read_recording(path).messages}
-    assert ("c/0/0/ada" in recorded) == (distance < 5.0)
+    assert ("tree/0/0/ada" in recorded) == (distance < 5.0)
     assert "a/ada/far" in recorded
 
 
@@ -334,6 +334,6 @@ def test_recording_needs_only_a_spectator_certificate(tmp_path):
                 ada.touched = set()
             recorder.step()
 
-        plants = {"c/0/0/ada", "own/0/0/ada"}
+        plants = {"tree/0/0/ada", "near/0/0/ada", "own/0/0/ada"}
         clients.until(lambda: plants <= keys(recording.path), "the tree and its claim to be recorded", on_tick)
         assert poses | plants <= keys(recording.path)

@@ -45,7 +45,7 @@ _EXTREMES = (
 
 def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Random) -> tuple[str, bytes]:
     """A family of keys and a well-formed message as ``actor`` might send it; what it says may be impossible."""
-    kind = chance.choice(("a", "c", "things", "own", "fact", "force", "control"))
+    kind = chance.choice(("a", "tree", "things", "own", "fact", "force", "control"))
     claim = Claim(chance.randrange(3), chance.randrange(1 << 16), actor.name)
     if kind == "a":
         return kind, encode_pose(actor.pose(now))
@@ -58,8 +58,9 @@ def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Ra
         return kind, encode_wrenches(
             WrenchMessage(now, {link: np.array([chance.uniform(-1, 1) for _ in range(6)]) * 2000.0 for link in links})
         )
-    if kind == "c":
-        return kind, _trees_message(model, chance.randrange(len(model.tree_first)), claim, now, chance)
+    if kind == "tree":
+        tree = chance.randrange(len(model.tree_first))
+        return chance.choice(("tree", "near")), _trees_message(model, tree, claim, now, chance)
     if kind == "things":
         number = np.array([_object_id(model, chance.choice((ObjectKind.BUNCH, ObjectKind.BOX)), chance)])
         flags = np.array([messages.TOUCHED])
@@ -74,7 +75,7 @@ def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Ra
     if kind == "fact":
         records = [_record(model, claim, now, chance) for _ in range(chance.randint(1, 3))]
         return kind, messages.encode_records(records)
-    return chance.choice(("own", "fact", "c")), chance.choice((
+    return chance.choice(("own", "fact", "c", "tree", "near")), chance.choice((
         messages.encode_hello(Hello(actor.name, scene="fake_clients", digest="fake_clients")),
         messages.encode_time(now, chance.uniform(-1e9, 1e9)),
         messages.encode_welcome(messages.Welcome("go away")),
@@ -146,7 +147,7 @@ _PARENTS = (
 def key_of(family: str, name: str, cells: list[interest.Cell], chance: random.Random) -> str:
     """Key of a message of ``name``; one in ten is of another family, of another cell, too short or too long."""
     if chance.random() < 0.1:
-        family = chance.choice(("a", "c", "own", "fact", "force"))
+        family = chance.choice(("a", "c", "tree", "near", "own", "fact", "force"))
     x, y = chance.choice(cells)
     if chance.random() < 0.05:
         odd = (

@@ -123,7 +123,10 @@ class Recorder:
 
     def _subscribe(self) -> None:
         self._is_subscribed = True
-        if self._families & {"trees", "things"}:
+        if "trees" in self._families:
+            for layer in interest.TREE_LAYERS:
+                self.bus.subscribe(f"{layer.family}/**", KEEP_ALL)
+        if "things" in self._families:
             self.bus.subscribe("c/**", KEEP_ALL)
         if "events" in self._families:
             self.bus.subscribe("own/**", KEEP_ALL)
@@ -194,17 +197,14 @@ class Recorder:
 
     def _record(self, key: str, payload: bytes) -> None:
         family, _, rest = key.partition("/")
-        kind = -1
         try:
-            kind = messages.kind_of(payload)
+            messages.kind_of(payload)
             if family == "a":
                 name = rest.partition("/")[0]
                 self._positions[name] = decode_pose(payload, name).base_q[:3]
         except MessageError:
             self.malformed += 1
         if family == "a" and "poses" not in self._families:
-            return
-        if family == "c" and self._families.isdisjoint({"trees"} if kind == messages.MessageKind.TREES else {"things"}):
             return
         self._put(key, payload)
 

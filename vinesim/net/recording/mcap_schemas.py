@@ -80,7 +80,15 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "c": (
         "vinesim.Moving",
         _object(
-            "vinesim.Moving", "What an actor moves in a cell.", timestamp=_TIME, trees=_TREES, things=_THINGS, **_COMMON
+            "vinesim.Moving", "Boxes and bunches that an actor moves in a cell.", timestamp=_TIME, things=_THINGS,
+            **_COMMON,
+        ),
+    ),
+    **dict.fromkeys(
+        ("tree", "near"),
+        (
+            "vinesim.Trees",
+            _object("vinesim.Trees", "Trees that an actor moves.", timestamp=_TIME, trees=_TREES, **_COMMON),
         ),
     ),
     "own": (

@@ -1,7 +1,8 @@
 """Subscriptions and publishers of one actor in the interest cells around it and around the objects that it owns.
 
-Keys: ``c/<x>/<y>/<actor>`` for states of what moves (best effort), ``own/<x>/<y>/<actor>`` for claims and states at
-rest (reliable).
+Keys: ``c/<x>/<y>/<actor>`` for states of boxes and bunches that move (best effort), ``own/<x>/<y>/<actor>`` for claims
+and states at rest (reliable). States of trees have channels of their own
+(:mod:`vinesim.net.replication.tree_channels`).
 """
 
 from __future__ import annotations

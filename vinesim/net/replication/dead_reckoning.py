@@ -82,9 +82,13 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return 4.0 * np.arcsin(np.minimum(0.5 * np.sqrt(chord), 1.0))
 
 
-def needs_update(position_error: np.ndarray, angle_error: np.ndarray, silence: np.ndarray) -> np.ndarray:
-    """Which objects are due [k] bool: copies wrong by 5 mm or 1 degree, or silent for a heartbeat."""
-    return (position_error > POSITION_ERROR) | (angle_error > ANGLE_ERROR) | (silence >= HEARTBEAT_PERIOD - 1e-9)
+def needs_update(
+    position_error: np.ndarray, angle_error: np.ndarray, silence: np.ndarray, tolerance: float = 1.0
+) -> np.ndarray:
+    """Which objects are due [k] bool: copies wrong by 5 mm or 1 degree, each times ``tolerance``, or silent for a
+    heartbeat."""
+    wrong = (position_error > tolerance * POSITION_ERROR) | (angle_error > tolerance * ANGLE_ERROR)
+    return wrong | (silence >= HEARTBEAT_PERIOD - 1e-9)
 
 
 def blend_weight(age: float | np.ndarray) -> float | np.ndarray:

@@ -53,6 +53,27 @@ given speed moves by the same angle between two poses, seen from the receiver. H
 LAYER_HYSTERESIS = 1.2
 """A layer is received until its actor is farther away than its distance by this factor."""
 
+TREE_CELL_SIZE = 2.0
+"""Edge of a cell of the states of trees [m]: small, so that few arrive that are farther away than a layer reaches."""
+
+
+class TreeLayer(NamedTuple):
+    """A share of the states of trees, under a family of keys of its own."""
+
+    family: str
+    """First chunk of the key."""
+    distance: float
+    """[m] Actors within it receive the layer; of the first, at most the interest radius counts."""
+    tolerance: float
+    """A state leaves when the copies of those who receive no further layer are wrong by so many times
+    :data:`~vinesim.net.replication.dead_reckoning.POSITION_ERROR` or
+    :data:`~vinesim.net.replication.dead_reckoning.ANGLE_ERROR`."""
+
+
+TREE_LAYERS = (TreeLayer("tree", MAX_INTEREST_RADIUS, 3.0), TreeLayer("near", 3.0, 1.0))
+"""Beyond 3 m a copy of a tree may be wrong by 15 mm, which is 5 mrad seen from there; an error of 5 mm is seen from 1 m
+at the same angle. A state on a layer counts for all layers after it."""
+
 Cell = tuple[int, int]
 
 
@@ -61,9 +82,20 @@ def cell_of(position: np.ndarray) -> Cell:
     return int(position[0] // CELL_SIZE), int(position[1] // CELL_SIZE)
 
 
-def cells_of(positions: np.ndarray) -> np.ndarray:
-    """Cells [k, 2] int of positions [k, 2 or 3] m."""
-    return np.floor(positions[:, :2] / CELL_SIZE).astype(np.int64)
+def cells_of(positions: np.ndarray, size: float = CELL_SIZE) -> np.ndarray:
+    """Cells [k, 2] int of ``size`` [m] of positions [k, 2 or 3] m."""
+    return np.floor(positions[:, :2] / size).astype(np.int64)
+
+
+def tree_cells_within(position: np.ndarray, distance: float) -> set[Cell]:
+    """Cells of the states of trees of which a point is within ``distance`` [m] of ``position`` [2 or 3] m."""
+    low, high = (np.floor((position[:2] + way * distance) / TREE_CELL_SIZE).astype(int) for way in (-1.0, 1.0))
+    x, y = (np.arange(low[axis], high[axis] + 1) for axis in (0, 1))
+    # how far the nearest edge of each column and row is away
+    away = [np.maximum(np.maximum(TREE_CELL_SIZE * k - p, p - TREE_CELL_SIZE * (k + 1)), 0.0)
+            for k, p in ((x, position[0]), (y, position[1]))]  # fmt: skip
+    column, row = np.nonzero(np.hypot(away[0][:, None], away[1][None, :]) <= distance)
+    return set(zip(x[column].tolist(), y[row].tolist(), strict=True))
 
 
 def cell_window(middle: Cell) -> frozenset[Cell]:

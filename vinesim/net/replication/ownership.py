@@ -41,6 +41,10 @@ class ObjectRecord:
     """When the newest message about it arrived."""
     listener_count: int = 0
     """Peers within the interest radius when its state was last published."""
+    published_to_all_at: float = LONG_AGO
+    """Of a tree: time of the newest own state that left on the first layer."""
+    near_listener_count: int = 0
+    """Of a tree: peers within the distance of the last layer when its state last left on any."""
     corrected_at: float = LONG_AGO
     """When the claim was last repeated as a correction."""
 
@@ -102,7 +106,8 @@ class Ownership:
         known = self._known[object_id]
         if object_id not in self.owned or known.announced:
             known.previous = known.claim
-        known.claim, known.touching, known.announced, known.silent, known.listener_count = claim, True, False, False, 0
+        known.claim, known.touching, known.announced, known.silent = claim, True, False, False
+        known.listener_count = known.near_listener_count = 0
         self.owned.add(object_id)
 
     def release(self, object_id: int) -> Claim:
@@ -195,6 +200,7 @@ class Ownership:
         for known in self._known.values():
             known.published_at += step
             known.received_at += step
+            known.published_to_all_at += step
             known.corrected_at += step
 
     def expire(self, time: float) -> None:

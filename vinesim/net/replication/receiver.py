@@ -17,6 +17,7 @@ from vinesim.net.codec.messages import (
     TreeStates,
     is_valid_name,
 )
+from vinesim.net.replication import interest
 from vinesim.net.replication.authority import NO_OWNER, Claim
 from vinesim.net.replication.early_messages import EarlyMessages
 from vinesim.net.replication.hand_forces import MAX_POSE_AGE, LinkCentre
@@ -53,6 +54,9 @@ class Inbox:
     """New retained records, and whether their poses hold. They do not if a newer claim is known; cuts always hold."""
     released: list[int] = dataclasses.field(default_factory=list)
     """Objects that have lost their remote owner: they are at rest, or the owner has left."""
+
+
+_TREE_FAMILIES = tuple(layer.family for layer in interest.TREE_LAYERS)
 
 
 @dataclasses.dataclass(slots=True)
@@ -121,7 +125,8 @@ class Receiver:
         chunks = rest.split("/")
         sender = chunks[0] if family == "a" else chunks[-1]
         traffic = {
-            "a": counters.actor, "c": counters.environment, "fact": counters.retained, "force": counters.force
+            "a": counters.actor, "c": counters.environment, "fact": counters.retained, "force": counters.force,
+            **dict.fromkeys(_TREE_FAMILIES, counters.environment),
         }  # fmt: skip
         traffic.get(family, counters.event).count_in(payload)
         peer = state.peers.known.get(sender)

@@ -15,6 +15,7 @@ from vinesim.net.replication.ownership import Ownership
 from vinesim.net.replication.peers import PeerRegistry
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.replication.streams import ObjectStream, TreeStream, object_counts
+from vinesim.net.replication.tree_channels import TreeChannels
 from vinesim.net.transport.bus import Bus, Publisher
 from vinesim.scene.ids import is_tree
 from vinesim.scene.model import Model
@@ -29,6 +30,7 @@ class ReplicationState:
     def __init__(self, bus: Bus, hello: Hello, model: Model, interest_radius: float, jitter_buffer: float) -> None:
         self.bus, self.hello, self.model = bus, hello, model
         self.cells = CellChannels(bus, interest_radius)
+        self.tree_channels = TreeChannels(bus, interest_radius)
         self.counters = Counters()
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
         self.wrench_sync = WrenchSync(bus, hello.name, self.counters)
@@ -74,10 +76,10 @@ class ReplicationState:
         self.wrench_sync.shift_time(step)
         self.coupling_sync.shift_time(step)
 
-    def count_listeners(self, positions: np.ndarray) -> np.ndarray:
-        """Number of peers within the interest radius of each position [k, 3] m: [k] int."""
+    def count_listeners(self, positions: np.ndarray, distance: float | None = None) -> np.ndarray:
+        """Number of peers within ``distance`` [m], by default the interest radius, of each position [k, 3] m: [k]."""
         others = np.array(list(self.peers.positions().values())).reshape(-1, 3)
-        return interest.count_listeners(positions, others, self.cells.interest_radius)
+        return interest.count_listeners(positions, others, distance or self.cells.interest_radius)
 
 
 def put_counted(publisher: Publisher, payload: bytes, traffic: Traffic) -> bool:

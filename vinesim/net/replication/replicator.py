@@ -5,7 +5,8 @@ The decisions are pure functions in other modules: who owns an object (:mod:`~vi
 is near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong
 (:mod:`~vinesim.net.replication.dead_reckoning`).
 
-Keys: ``a/<actor>`` poses, ``c/<x>/<y>/<actor>`` states of what moves in a cell, ``own/<x>/<y>/<actor>`` claims and
+Keys: ``a/<actor>`` poses, ``tree/<x>/<y>/<actor>`` and ``near/<x>/<y>/<actor>`` states of trees that move in a cell,
+``c/<x>/<y>/<actor>`` those of boxes and bunches, ``own/<x>/<y>/<actor>`` claims and
 states at rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, and the queries
 ``snap/<x>/<y>`` (records of a cell), ``hello/<actor>`` and ``clock``.
 """

@@ -17,17 +17,16 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord, TreeStates
 from vinesim.net.replication import authority, dead_reckoning
 from vinesim.net.replication.authority import Claim
-from vinesim.net.replication.interest import Cell
+from vinesim.net.replication.interest import TREE_LAYERS, Cell
 from vinesim.net.replication.ownership import ObjectRecord
 from vinesim.net.replication.replication_state import ReplicationState, put_counted
 from vinesim.net.replication.streams import (
     ClaimColumns,
     DetachedRoots,
-    ObjectStream,
     StateReader,
-    TreeStream,
     with_roots,
 )
+from vinesim.net.transport.bus import Publisher
 from vinesim.scene.ids import is_tree
 from vinesim.scene.values import TreeUpdate
 
@@ -84,9 +83,10 @@ class Sender:
             self._publish_detachment(object_id, step)
         state.retained.flush()
         tree_count = sum(map(is_tree, active))
-        for stream, ids in ((state.tree_stream, active[:tree_count]), (state.object_stream, active[tree_count:])):
-            if ids:
-                self._publish_states(stream, ids, touched, step)
+        if tree_count:
+            self._publish_trees(active[:tree_count], touched, step)
+        if tree_count < len(active):
+            self._publish_objects(active[tree_count:], touched, step)
         return settled
 
     def _adopt_orphans(self, moving: set[int], step: LocalStep) -> None:
@@ -109,16 +109,68 @@ class Sender:
         state = self._state
         owned = {cell for object_id in state.ownership.owned if (cell := state.cell_of(object_id)) is not None}
         state.cells.update(owned)
+        trees = {state.tree_stream.layer_cell[object_id] for object_id in state.ownership.owned if is_tree(object_id)}
+        state.tree_channels.update(state.cells.position, trees)
         state.retained.update_window(state.cells.subscriptions, state.cells.changes, now)
         state.peers.update_interest(state.cells.position)
 
     # ------------------------------------------------------------ moving
 
-    def _publish_states(
-        self, stream: TreeStream | ObjectStream, active: tuple[int, ...], touched: set[int], step: LocalStep
-    ) -> None:
-        """Publish, cell by cell, the states of which the copies are wrong."""
-        state = self._state
+    def _publish_trees(self, active: tuple[int, ...], touched: set[int], step: LocalStep) -> None:
+        """Publish, layer by layer and cell by cell, the states of trees of which the copies are wrong."""
+        state, stream, channels = self._state, self._state.tree_stream, self._state.tree_channels
+        entries = [state.ownership[tree] for tree in active]
+        contact = [tree in touched for tree in active]
+        middles = stream.middle[list(active)]
+        listeners = [state.count_listeners(middles, distance) for distance in channels.distances]
+        if not listeners[0].any():
+            for entry, touching in zip(entries, contact, strict=True):
+                entry.listener_count, entry.near_listener_count, entry.touching = 0, 0, touching
+            return
+        stream.read(active, step.read, step.detached_roots)
+        for layer, due in enumerate(self._find_due_trees(entries, listeners, contact, step)):
+            rows_by_cell: dict[Cell, list[int]] = {}
+            for row in np.flatnonzero(due).tolist():
+                rows_by_cell.setdefault(stream.layer_cell[active[row]], []).append(row)
+            for cell, rows in sorted(rows_by_cell.items()):
+                publisher = channels.publishers[layer].get(cell)
+                if publisher is None or not publisher.matching:
+                    continue
+                here = [(active[row], entries[row]) for row in rows]
+                for tree, entry in here:
+                    self._announce(state.cells.event_publisher(stream.cell[tree]), [(tree, entry)])
+                for payload in stream.encode(rows, _columns(here), step.time, layer):
+                    put_counted(publisher, payload, state.counters.environment)
+                for row in rows:
+                    entry = entries[row]
+                    entry.announced, entry.published_at = True, step.time
+                    entry.near_listener_count = int(listeners[-1][row])
+                    if layer == 0:
+                        entry.published_to_all_at, entry.listener_count = step.time, int(listeners[0][row])
+
+    def _find_due_trees(
+        self, entries: list[ObjectRecord], listeners: list[np.ndarray], contact: list[bool], step: LocalStep
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Which of the trees last read to publish on either layer, [k] bool each: the copies of its receivers are
+        wrong, or a listener, claim or contact is new."""
+        stream, (all_, near) = self._state.tree_stream, listeners
+        silence = step.time - np.array([(entry.published_to_all_at, entry.published_at) for entry in entries]).T
+        wrong = [
+            dead_reckoning.needs_update(*stream.prediction_error(number, silence[number]), silence[number], tolerance)
+            for number, (_, _, tolerance) in enumerate(TREE_LAYERS)
+        ]
+        for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
+            wrong[0][row] |= all_[row] > entry.listener_count or entry.touching != touching
+            wrong[1][row] |= near[row] > entry.near_listener_count
+            entry.touching = touching
+            entry.listener_count = min(entry.listener_count, int(all_[row]))
+            entry.near_listener_count = min(entry.near_listener_count, int(near[row]))
+        for_all = wrong[0] & (all_ > 0)
+        return for_all, wrong[1] & (near > 0) & ~for_all
+
+    def _publish_objects(self, active: tuple[int, ...], touched: set[int], step: LocalStep) -> None:
+        """Publish, cell by cell, the states of boxes and bunches of which the copies are wrong."""
+        state, stream = self._state, self._state.object_stream
         entries = [state.ownership[object_id] for object_id in active]
         listeners = state.count_listeners(stream.positions(active, step.read))
         contact = [object_id in touched for object_id in active]
@@ -126,7 +178,7 @@ class Sender:
             for entry, touching in zip(entries, contact, strict=True):
                 entry.listener_count, entry.touching = 0, touching
             return
-        due = self._find_due(stream, active, entries, listeners, contact, step)
+        due = self._find_due_objects(active, entries, listeners, contact, step)
         cells = stream.cells(active)
         rows_by_cell: dict[Cell, list[int]] = {}
         for row in np.flatnonzero(due).tolist():
@@ -138,30 +190,31 @@ class Sender:
             if not states.matching:
                 continue
             here = [(active[row], entries[row]) for row in rows]
-            new = [(object_id, entry.claim, entry.touching) for object_id, entry in here if not entry.announced]
-            if new:
-                put_counted(events, messages.encode_claims(new), state.counters.event)
-            flags = [messages.TOUCHED * entry.touching for _, entry in here]
-            columns = ClaimColumns([entry.claim for _, entry in here], flags)
-            for payload in stream.encode(rows, columns, step.time, cell):
+            self._announce(events, here)
+            for payload in stream.encode(rows, _columns(here), step.time, cell):
                 put_counted(states, payload, state.counters.environment)
             for row in rows:
                 entry = entries[row]
                 entry.announced, entry.published_at, entry.listener_count = True, step.time, int(listeners[row])
 
-    def _find_due(
-        self, stream: TreeStream | ObjectStream, active: tuple[int, ...], entries: list[ObjectRecord],
-        listeners: np.ndarray, contact: list[bool], step: LocalStep,
+    def _find_due_objects(
+        self, active: tuple[int, ...], entries: list[ObjectRecord], listeners: np.ndarray, contact: list[bool],
+        step: LocalStep,
     ) -> np.ndarray:  # fmt: skip
         """Which objects to publish [k] bool: the prediction is wrong, or a listener, claim or contact is new."""
         silence = step.time - np.array([entry.published_at for entry in entries])
-        error = stream.prediction_error(active, silence, step.read, step.detached_roots)
-        due = dead_reckoning.needs_update(*error, silence)
+        due = dead_reckoning.needs_update(*self._state.object_stream.prediction_error(active, silence), silence)
         for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
             due[row] |= listeners[row] > entry.listener_count or entry.touching != touching
             entry.touching = touching
             entry.listener_count = min(entry.listener_count, int(listeners[row]))
         return due & (listeners > 0)
+
+    def _announce(self, events: Publisher | None, objects: list[tuple[int, ObjectRecord]]) -> None:
+        """Publish the claims among those of ``objects`` that no peer can know yet."""
+        new = [(object_id, entry.claim, entry.touching) for object_id, entry in objects if not entry.announced]
+        if new and events is not None:
+            put_counted(events, messages.encode_claims(new), self._state.counters.event)
 
     # ------------------------------------------------------------ rest and retained records
 
@@ -262,3 +315,9 @@ class Sender:
         (payload,), decoded = messages.encode_trees(with_roots(batch, [(numbers, x, rate_factor * xd)]))
         (update,) = decoded.updates(self._state.hello.name)
         return payload, update
+
+
+def _columns(objects: list[tuple[int, ObjectRecord]]) -> ClaimColumns:
+    """Claims and flags of some objects."""
+    entries = [entry for _, entry in objects]
+    return ClaimColumns([entry.claim for entry in entries], [messages.TOUCHED * entry.touching for entry in entries])

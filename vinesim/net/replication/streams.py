@@ -8,7 +8,7 @@ not. Sender and receiver keep the same quantised values and extrapolate them ali
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
@@ -52,29 +52,22 @@ class TreeStream:
         self.model = model
         self.middle = _tree_centres(model)
         self.cell = [tuple(cell) for cell in interest.cells_of(self.middle).tolist()]
-        body_count = len(model.body_mass)
+        self.layer_cell = [tuple(cell) for cell in interest.cells_of(self.middle, interest.TREE_CELL_SIZE).tolist()]
+        """Cell under which the states of each tree leave."""
+        body_count, layers = len(model.body_mass), len(interest.TREE_LAYERS)
         self._bodies = [model.bodies_of(tree) for tree in range(len(model.tree_first))]
         self._lever_arm = _lever_arms(model)
-        self._published_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (body_count, 1))
-        self._published_rate = np.zeros((body_count, 4))
-        self._published_roots: dict[int, DetachedRoots] = {}
+        self._published_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (layers, body_count, 1))
+        """What those hold who receive all layers up to each."""
+        self._published_rate = np.zeros((layers, body_count, 4))
+        self._published_roots: tuple[dict[int, DetachedRoots], ...] = tuple({} for _ in range(layers))
         self._active: tuple[int, ...] | None = None
         self._sizes = self._starts = self._order = np.zeros(0, np.int64)
         self._q = self._qd = np.zeros((0, 4))
         self._roots: list[DetachedRoots] = []
 
-    def positions(self, active: tuple[int, ...], read: StateReader) -> np.ndarray:
-        """Positions of these trees [k, 3] m."""
-        return self.middle[list(active)]
-
-    def cells(self, active: tuple[int, ...]) -> list[Cell]:
-        """Cells under which they are published [k]."""
-        return [self.cell[tree] for tree in active]
-
-    def prediction_error(
-        self, active: tuple[int, ...], silence: np.ndarray, read: StateReader, cut: Callable[[int], DetachedRoots]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Errors of the peers' copies by now [k] m and [k] rad; ``silence`` [k] s since the last state."""
+    def read(self, active: tuple[int, ...], read: StateReader, cut: Callable[[int], DetachedRoots]) -> None:
+        """Read the states of these trees, to be judged and encoded."""
         if self._active != active:
             self._active = active
             self._sizes = self.model.tree_size[list(active)].astype(np.int64)
@@ -84,15 +77,21 @@ class TreeStream:
         self._q = np.concatenate([joint_q for joint_q, _ in state]).astype(np.float64)
         self._qd = np.concatenate([joint_qd for _, joint_qd in state]).astype(np.float64)
         self._roots = [cut(tree) for tree in active]
+
+    def prediction_error(self, layer: int, silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Errors of the copies of peers who receive no further layer, [k] m and [k] rad, of the trees last read;
+        ``silence`` [k] s since the last state that they got."""
+        assert self._active is not None
         bodies, horizon = self._order, dead_reckoning.clamp_age(silence)
         dt = np.repeat(dead_reckoning.faded_age(silence), self._sizes)[:, None]
         angle = dead_reckoning.angle_between(
-            self._q, dead_reckoning.extrapolate(self._published_q[bodies], self._published_rate[bodies], dt)
+            self._q,
+            dead_reckoning.extrapolate(self._published_q[layer, bodies], self._published_rate[layer, bodies], dt),
         )
         position = np.add.reduceat(angle * self._lever_arm[bodies], self._starts)
-        for row, (tree, roots) in enumerate(zip(active, self._roots, strict=True)):
+        for row, (tree, roots) in enumerate(zip(self._active, self._roots, strict=True)):
             if len(roots[0]):
-                published = self._published_roots.get(tree, NO_ROOTS)
+                published = self._published_roots[layer].get(tree, NO_ROOTS)
                 if len(published[0]) != len(roots[0]):
                     position[row] = np.inf
                 else:
@@ -100,8 +99,9 @@ class TreeStream:
                     position[row] += np.linalg.norm(roots[1] - predicted, axis=1).max()
         return position, np.maximum.reduceat(angle, self._starts)
 
-    def encode(self, rows: list[int], published: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
-        """Messages about some rows of the trees that were last judged; they become the last published state."""
+    def encode(self, rows: list[int], published: ClaimColumns, time: float, layer: int) -> list[bytes]:
+        """Messages about some rows of the trees last read; they become the last published state of ``layer`` and of
+        all after it."""
         assert self._active is not None
         here = [self._active[row] for row in rows]
         part: slice | np.ndarray = slice(None)
@@ -109,15 +109,13 @@ class TreeStream:
             part = np.concatenate([np.arange(self._starts[r], self._starts[r] + self._sizes[r]) for r in rows])
         batch = TreeStates(time, np.array(here), *published.columns(), self._sizes[rows], self._q[part], self._qd[part])
         payloads, received = messages.encode_trees(with_roots(batch, [self._roots[row] for row in rows]))
-        self._remember(self._order[part], received, received.updates(""))
+        bodies = self._order[part]
+        self._published_q[layer:, bodies] = received.joint_q
+        self._published_rate[layer:, bodies] = dead_reckoning.quaternion_rate(received.joint_q, received.joint_qd)
+        for update in received.updates("") if len(received.root) else ():
+            for roots in self._published_roots[layer:]:
+                roots[update.tree] = update.root, update.root_x, update.root_xd
         return payloads
-
-    def _remember(self, bodies: np.ndarray, received: TreeStates, updates: Iterable[TreeUpdate]) -> None:
-        self._published_q[bodies] = received.joint_q
-        self._published_rate[bodies] = dead_reckoning.quaternion_rate(received.joint_q, received.joint_qd)
-        if len(received.root):
-            for update in updates:
-                self._published_roots[update.tree] = update.root, update.root_x, update.root_xd
 
     def extrapolated(self, news: dict[int, tuple[TreeStates, str]], now: float, time: float) -> list[TreeUpdate]:
         """The last state of each tree in ``news``, extrapolated to now; it becomes the last known state."""
@@ -138,11 +136,10 @@ class TreeStream:
                 if news.get(update.tree, (None,))[0] is trees:
                     found[update.tree] = update
                     bodies = self._bodies[update.tree]
-                    self._published_q[bodies], self._published_rate[bodies] = (
-                        trees.joint_q[first:last],
-                        rate[first:last],
-                    )
-                    self._published_roots[update.tree] = received.root, received.root_x, received.root_xd
+                    self._published_q[:, bodies] = trees.joint_q[first:last]
+                    self._published_rate[:, bodies] = rate[first:last]
+                    for roots in self._published_roots:
+                        roots[update.tree] = received.root, received.root_x, received.root_xd
                 first = last
         return [found[tree] for tree in sorted(found)]
 
@@ -179,9 +176,7 @@ class ObjectStream:
         """Cells under which they are published [k]."""
         return [self._cell[object_id] for object_id in active]
 
-    def prediction_error(
-        self, active: tuple[int, ...], silence: np.ndarray, read: StateReader, cut: Callable[[int], DetachedRoots]
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def prediction_error(self, active: tuple[int, ...], silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Errors of the peers' copies by now [k] m and [k] rad; ``silence`` [k] s since the last state."""
         unknown: tuple[np.ndarray, np.ndarray] = np.full(7, np.inf), np.zeros(6)
         published = [self._published.get(object_id, unknown) for object_id in active]

@@ -34,7 +34,7 @@ class CertificateError(BusError):
     """A certificate or key is missing or unusable; the text names it."""
 
 
-FAMILIES = ("c", "own", "fact", "voice")
+FAMILIES = ("c", "tree", "near", "own", "fact", "voice")
 """First chunks of keys ``FAMILY/<cx>/<cy>/<actor>``."""
 
 _EVERYTHING = [

@@ -1,0 +1,61 @@
+"""Subscriptions and publishers of one actor for the states of moving trees.
+
+Keys: ``tree/<x>/<y>/<actor>`` for all within the interest radius, ``near/<x>/<y>/<actor>`` for what only those near the
+tree need besides (:data:`vinesim.net.replication.interest.TREE_LAYERS`). An actor subscribes to the cells within the
+distance of a layer, not to a window: a tree that is farther away is not received.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.net.replication import interest
+from vinesim.net.replication.interest import TREE_LAYERS, Cell
+from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher, Subscription
+
+OPEN_MARGIN, CLOSE_MARGIN = 0.3, 0.8
+"""[m] A cell is opened this far beyond the distance of its layer, and closed that far: others know the own position
+late, and one who walks along an edge does not open and close in turn."""
+
+STEP = 0.1
+"""[m] The cells are chosen anew after so much motion."""
+
+
+class TreeChannels:
+    """The channels that are open now, layer by layer."""
+
+    def __init__(self, bus: Bus, interest_radius: float) -> None:
+        """``interest_radius`` [m]: distance of the first layer, and the largest of all."""
+        self._bus = bus
+        self.distances = tuple(min(layer.distance, interest_radius) for layer in TREE_LAYERS)
+        """Of each layer [m]."""
+        self.subscriptions: tuple[dict[Cell, Subscription], ...] = tuple({} for _ in TREE_LAYERS)
+        self.publishers: tuple[dict[Cell, Publisher], ...] = tuple({} for _ in TREE_LAYERS)
+        self._position: np.ndarray | None = None
+        self._owned: set[Cell] = set()
+
+    def update(self, position: np.ndarray, owned: set[Cell]) -> None:
+        """Follow the own ``position`` [3] m and the cells of trees that are ``owned``.
+
+        Publishers are open where the actor can touch a tree, before it does, and where it owns one.
+        """
+        moved = self._position is None or float(np.hypot(*(position - self._position)[:2])) > STEP
+        if not moved and owned == self._owned:
+            return
+        self._position, self._owned = position.copy(), set(owned)
+        reach = self.distances[-1]
+        touchable = interest.tree_cells_within(position, reach + OPEN_MARGIN) | owned
+        kept_touchable = interest.tree_cells_within(position, reach + CLOSE_MARGIN) | owned
+        for layer, subscriptions, publishers, distance in zip(
+            TREE_LAYERS, self.subscriptions, self.publishers, self.distances, strict=True
+        ):
+            opened = interest.tree_cells_within(position, distance + OPEN_MARGIN)
+            kept = interest.tree_cells_within(position, distance + CLOSE_MARGIN)
+            for cell in sorted(subscriptions.keys() - kept):
+                subscriptions.pop(cell).close()
+            for cell in sorted(opened - subscriptions.keys()):
+                subscriptions[cell] = self._bus.subscribe(f"{layer.family}/{cell[0]}/{cell[1]}/*", KEEP_LAST_64)
+            for cell in sorted(publishers.keys() - kept_touchable):
+                publishers.pop(cell).close()
+            for cell in sorted(touchable - publishers.keys()):
+                publishers[cell] = self._bus.publisher(f"{layer.family}/{cell[0]}/{cell[1]}/{self._bus.name}")
