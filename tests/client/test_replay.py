@@ -50,7 +50,9 @@ def watch(original: Recording, **span: float) -> tuple[MinimalClient, list[bytes
 
 
 def recorded_trees(original: Recording) -> list[messages.TreeStates]:
-    kinds = (entry.payload for entry in original.messages if entry.key in ("tree/0/0/ada", "near/0/0/ada", "own/0/0/ada"))
+    kinds = (
+        entry.payload for entry in original.messages if entry.key in ("tree/0/0/ada", "near/0/0/ada", "own/0/0/ada")
+    )
     return [
         messages.decode_trees(payload) for payload in kinds if messages.kind_of(payload) == messages.MessageKind.TREES
     ]

@@ -41,10 +41,19 @@ class RigidGeoms:
     link: tuple[str, ...]
 
 
-def movable_geoms(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> RigidGeoms:
-    """The colliding geoms of some MuJoCo bodies; ``owner`` maps their numbers to actor and link."""
-    ids = np.flatnonzero(np.isin(m.geom_bodyid, list(owner)) & (m.geom_contype != 0))
+def owned_geoms(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> RigidGeoms:
+    """All geoms of some MuJoCo bodies; ``owner`` maps their numbers to actor and link."""
+    ids = np.flatnonzero(np.isin(m.geom_bodyid, list(owner)))
     return _of(m, ids, [owner[body] for body in m.geom_bodyid[ids].tolist()])
+
+
+def colliding(m: mujoco.MjModel, geoms: RigidGeoms) -> RigidGeoms:
+    """Those of ``geoms`` that collide now: the geoms of a hand change with what it holds, and nothing else of them."""
+    rows = np.flatnonzero(m.geom_contype[geoms.id] != 0)
+    names = [field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link")]
+    arrays: dict[str, Any] = {name: getattr(geoms, name)[rows] for name in names}
+    actor, link = (tuple(map(column.__getitem__, rows.tolist())) for column in (geoms.actor, geoms.link))
+    return RigidGeoms(actor=actor, link=link, **arrays)
 
 
 def static_geoms(m: mujoco.MjModel) -> RigidGeoms:

@@ -258,8 +258,7 @@ class WorldCore:
             hand.weld_to(self.mj_model, self.mj_data, body)
 
     def _update_tables(self) -> None:
-        """List all bodies and geoms anew after a change of MuJoCo's model, and count :attr:`generation`."""
-        self.generation += 1
+        """List all bodies and geoms anew after bodies were added or removed, and count :attr:`generation`."""
         m = self.mj_model
         bunch_body = {i: self._names.body[free_bunch.slot_name(slot)] for i, slot in self._bunch_slot.items()}
         bunches = {i: (body, bunch_body[i]) for i, body in self._free_bunches.items()}
@@ -268,4 +267,10 @@ class WorldCore:
         own = self._visual_body > 0
         self._visual_row[self._visual_body[own]] = np.flatnonzero(own)
         self.owners = list_owners(self.model, self._names, self._robots, self._humans, bunch_body)
-        self.geoms = collision_geoms.movable_geoms(m, self.owners)
+        self._owned_geoms = collision_geoms.owned_geoms(m, self.owners)
+        self._update_geoms()
+
+    def _update_geoms(self) -> None:
+        """List the geoms that collide anew after a hand closed or opened, and count :attr:`generation`."""
+        self.generation += 1
+        self.geoms = collision_geoms.colliding(self.mj_model, self._owned_geoms)

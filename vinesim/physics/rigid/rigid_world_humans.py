@@ -23,7 +23,7 @@ class HumanAccess(WorldCore):
         human.set_pose(pose)
         if busy != [hand.busy for hand in human.hands]:
             human.update_hand_collisions(self.mj_model)
-            self._update_tables()
+            self._update_geoms()
 
     def hand_sample(self, name: str, side: str) -> HandSample:
         """A person's ``"left"`` or ``"right"`` hand after the last step."""
@@ -47,14 +47,14 @@ class HumanAccess(WorldCore):
         pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
         hand.grasp_pose, hand.held = frames.compose(frames.inverse(pose[0]), pose[1]), (actor, link)
         hand.weld_to(self.mj_model, self.mj_data, body)
-        self._update_tables()
+        self._update_geoms()
 
     def grasp_plant(self, name: str, side: str, body: int) -> None:
         """Let a hand hold a plant's ``body``: it touches nothing, and :meth:`place_hand` puts it on the plant."""
         hand = self.human(name).hand(side)
         hand.held = ("plants", f"body/{body}")
         hand.weld_to(self.mj_model, self.mj_data, None)
-        self._update_tables()
+        self._update_geoms()
 
     def place_hand(self, name: str, side: str, pose: np.ndarray) -> None:
         """Put a hand at ``pose`` [7], at rest."""
@@ -64,7 +64,7 @@ class HumanAccess(WorldCore):
     def release(self, name: str, side: str) -> None:
         """Open a hand."""
         self.human(name).hand(side).release(self.mj_model, self.mj_data)
-        self._update_tables()
+        self._update_geoms()
 
     def nearest_to_hand(self, name: str, side: str, reach: float) -> tuple[float, str, str] | None:
         """What a hand can grasp: gap [m], actor and link of the nearest rigid body; None if none is nearer than
