@@ -52,6 +52,8 @@ class Counters:
     wrenches_limited: int = 0
     """Messages and steps whose wrenches were reduced to what hands can do."""
 
+    foreign: int = 0
+    """Messages and answers that the bus dropped: of a session that does not hold the name they came under."""
     lost: int = 0
     """Received samples that the bus discarded: its store was full, or the sample too large."""
     network_failures: int = 0
