@@ -261,7 +261,7 @@ def fuzz() -> Iterator[Measurement]:
     counters, spent, arrived = result.clients[0].replicator.counters, result.step_times, result.arrived
     for case, value, unit in (
         ("broken messages sent", MESSAGE_COUNT, ""),
-        ("arrived where somebody listens, newest poses only", arrived, ""),
+        ("arrived at a subscriber, newest poses only", arrived, ""),
         ("counted as malformed", counters.malformed, ""),
         ("counted as sound and of no use", counters.dropped, ""),
         ("a tick with 50 of them, p50", 1e3 * np.percentile(spent, 50), "ms"),

@@ -112,7 +112,7 @@ class Pair:
         return reach
 
     def enable_naive_authority(self) -> None:
-        """For comparison: whoever touches the tree takes it from its owner, again and again."""
+        """For comparison: each touch takes the tree from its owner, again and again."""
         for client in self.clients:
             rule = functools.partial(_grab, client, client.replicator.send)
             client.replicator.send = rule  # pyright: ignore[reportAttributeAccessIssue] a bench replaces the method

@@ -105,6 +105,12 @@ def _live(rows: Sequence[str] = ()) -> Iterator[Measurement]:
     return live(rows, lambda line: print(line, file=sys.stderr, flush=True))
 
 
+def _soak(minutes: float | None = None) -> Iterator[Measurement]:
+    from vinesim.bench.soak import MINUTES, soak
+
+    return soak(MINUTES if minutes is None else minutes, lambda line: print(line, file=sys.stderr, flush=True))
+
+
 RAISED = {
     "torso_lift_joint": 0.45,
     **{f"arm_{side}_{i}_joint": q for side in ("left", "right") for i, q in ((1, 0.6), (2, 0.1), (4, 1.8))},
@@ -126,6 +132,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "traffic": _traffic,
     "load": _load,
     "fuzz": _fuzz,
+    "soak": _soak,
 }
 
 
@@ -133,11 +140,15 @@ class NoSuchBench(ValueError):
     """There is no benchmark of that name; the text lists all."""
 
 
-def _measurements(name: str, plot: pathlib.Path | None, rows: Sequence[str]) -> Iterator[Measurement]:
+def _measurements(
+    name: str, plot: pathlib.Path | None, rows: Sequence[str], minutes: float | None
+) -> Iterator[Measurement]:
     drawn = {"sync": _sync, "sensors": _sensors}.get(name)
     try:
         if name == "live":
             yield from _live(rows)
+        elif name == "soak":
+            yield from _soak(minutes)
         else:
             yield from drawn(plot) if drawn else BENCHES[name]()
     except ModuleNotFoundError as missing:
@@ -148,18 +159,24 @@ def _measurements(name: str, plot: pathlib.Path | None, rows: Sequence[str]) -> 
         ) from None
 
 
-def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = ()) -> int:
+def run(
+    names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = (),
+    minutes: float | None = None,
+) -> int:  # fmt: skip
     """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
-    ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none.
+    ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none;
+    ``minutes`` of soak.
     """
     if rows and "live" not in names:
         raise NoSuchBench("--row chooses rows of the bench live; leave it out")
+    if minutes is not None and "soak" not in names:
+        raise NoSuchBench("--minutes is how long the bench soak runs; leave it out")
     for name in names:
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in _measurements(name, plot, rows):
+        for m in _measurements(name, plot, rows, minutes):
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

@@ -15,6 +15,9 @@ def bench(
         list[str] | None,
         typer.Option(help="Of live: demo, camera, lidar, tendone, start, generate, tick, link, cold; may repeat."),
     ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.1, help="Of soak: how long it measures; 60 unless given.")
+    ] = None,
     plot: Annotated[
         pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
     ] = None,
@@ -25,6 +28,7 @@ def bench(
     sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
     beside budgets). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links;
     needs root), traffic (bytes a client receives), load (many clients), fuzz (broken messages).
+    Of a long run: soak (memory, threads and open files of robots, people and a recorder; Linux).
 
     \b
     Examples:
@@ -34,10 +38,11 @@ def bench(
       vinesim bench live --row demo --row camera
       vinesim bench sync --json --plot docs/pictures/network-sync.png
       vinesim bench sensors --plot docs/pictures
+      vinesim bench soak --minutes 20 --json
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json, plot, row or ()))
+    raise typer.Exit(run(names, json, plot, row or (), minutes))
 
 
 def ros_build_interfaces(

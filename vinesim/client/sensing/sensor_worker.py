@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinesim import allocator
 from vinesim.client.sensing.rigid_visual_list import VisualListMessage, VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.worker_process import serve
@@ -213,6 +214,7 @@ class SensorWorker:
                 else:
                     for name in self.scheduler.warm_up(snapshot, poses):
                         self._awaits(name)
+                    allocator.release_free_memory()
                     is_ready = True
                     self._awaits()
                     self.pipe.send(("ready", None))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import pathlib
 import queue
 import signal
 import sys
@@ -41,11 +42,13 @@ class WorkerError(RuntimeError):
 def serve(title: str, pipe: Connection, work: Callable[[], None], niceness: int) -> NoReturn:
     """The whole life of a process: ``work``, until it returns, fails, or the client's process has ended.
 
-    ``title`` names the process in its log: "sensor process". With its ``niceness`` and class it does not take the core
-    of the loop that wakes it (docs/decisions/sensor-process.md).
+    ``title`` names the process in its log and in ``ps -o comm``: "sensor process". With its ``niceness`` and class it
+    does not take the core of the loop that wakes it (docs/decisions/sensor-process.md).
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    with contextlib.suppress(OSError):  # where there is no /proc, the process keeps Python's name
+        pathlib.Path("/proc/self/comm").write_text(title)
     if hasattr(os, "nice"):
         os.nice(niceness)
     if hasattr(os, "SCHED_BATCH"):

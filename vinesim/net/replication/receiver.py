@@ -17,7 +17,7 @@ from vinesim.net.codec.messages import (
     TreeStates,
     is_valid_name,
 )
-from vinesim.net.replication.authority import NOBODY, Claim
+from vinesim.net.replication.authority import NO_OWNER, Claim
 from vinesim.net.replication.early_messages import EarlyMessages
 from vinesim.net.replication.hand_forces import MAX_POSE_AGE, LinkCentre
 from vinesim.net.replication.interest import Cell
@@ -173,7 +173,7 @@ class Receiver:
         is_near = state.cells.is_within_radius(state.tree_stream.middle[trees.tree])
         columns = (trees.tree, trees.ownership, trees.authority, trees.flags)
         for row, (tree, ownership, sequence, flags) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
-            claim = Claim(ownership, sequence, NOBODY if flags & messages.RESTING else sender)
+            claim = Claim(ownership, sequence, NO_OWNER if flags & messages.RESTING else sender)
             touching = bool(flags & messages.TOUCHED)
             is_accepted = state.ownership.receive_state(tree, claim, touching, trees.time, step.time)
             if is_accepted and is_near[row]:
@@ -211,7 +211,7 @@ class Receiver:
             return
         if not state.retained.merge(cell, record):
             return
-        claim = Claim(record.ownership, record.authority, record.author if record.moving else NOBODY)
+        claim = Claim(record.ownership, record.authority, record.author if record.moving else NO_OWNER)
         holds = state.ownership.receive_retained(record.object, claim, record.moving, step.time)
         if is_remote:
             step.inbox.records.append((state.retained.state.get(record.object) or record, holds))
