@@ -206,7 +206,9 @@ class Storm:
     """Messages that reached the first client."""
 
 
-def run_storm(count: int, seed: int = 0, *, is_stranger: bool = False, kind: str = "robot", binds_names: bool = False) -> Storm:
+def run_storm(
+    count: int, seed: int = 0, *, is_stranger: bool = False, kind: str = "robot", binds_names: bool = False
+) -> Storm:
     """A storm against two clients from an admitted actor of ``kind``, or from a program that never was admitted.
 
     Not ``binds_names``: messages under the names of others reach the clients' own checks.
