@@ -1,4 +1,4 @@
-"""A name belongs to the session that joined with it: what others send or answer under it is dropped, without TLS, too."""
+"""A name belongs to the session that joined with it: what others send or answer under it is dropped without TLS, too."""
 
 from __future__ import annotations
 
