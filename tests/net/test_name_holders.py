@@ -1,4 +1,4 @@
-"""A name belongs to the session that joined with it: what others send or answer under it is dropped without TLS, too."""
+"""A name belongs to the session that joined with it: messages and answers of others under it are dropped."""
 
 from __future__ import annotations
 
