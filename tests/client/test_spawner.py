@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import errno
 from collections.abc import Callable
 
 import numpy as np
@@ -66,11 +67,11 @@ def test_no_tick_waits_for_a_robot_that_joins(vinebot):
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
     for tick in range(5):
-        assert spawner.spawn("guest", update_at(vinebot, 0.1 * tick)) is None
+        assert spawner.spawn({"guest": update_at(vinebot, 0.1 * tick)}).get("guest") is None
         physics.step()
     assert physics.rigid.robots == ("host",)
     deferred.work()
-    guest = spawner.spawn("guest", update_at(vinebot, 0.5))
+    guest = spawner.spawn({"guest": update_at(vinebot, 0.5)}).get("guest")
     assert guest is not None
     assert guest.name == "guest"
     assert "guest" not in spawner
@@ -105,14 +106,14 @@ def test_a_world_that_changed_during_compilation_is_compiled_again(vinebot):
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
     update = update_at(vinebot, 0.0)
-    spawner.spawn("guest", update)
+    spawner.spawn({"guest": update}).get("guest")
     deferred.work()
     physics.rigid.add_robot(vinebot.to_spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
-    assert spawner.spawn("guest", update) is None
+    assert spawner.spawn({"guest": update}).get("guest") is None
     assert physics.rigid.robots == ("host", "other")
-    assert spawner.spawn("guest", update) is None
+    assert spawner.spawn({"guest": update}).get("guest") is None
     deferred.work()
-    assert spawner.spawn("guest", update) is not None
+    assert spawner.spawn({"guest": update}).get("guest") is not None
     assert physics.rigid.robots == ("host", "other", "guest")
 
 
@@ -120,7 +121,7 @@ def test_an_actor_that_leaves_before_being_ready_is_not_spawned(vinebot):
     physics, deferred = world(vinebot), DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
-    spawner.spawn("guest", update_at(vinebot, 0.0))
+    spawner.spawn({"guest": update_at(vinebot, 0.0)}).get("guest")
     spawner.cancel("guest")
     deferred.work()
     assert "guest" not in spawner
@@ -139,7 +140,7 @@ def test_a_robot_that_cannot_be_loaded_is_logged_once(vinebot, caplog, change, r
     physics = world(vinebot)
     spawner = RemoteSpawner(physics.rigid, vinebot)
     spawner.enqueue(hello(vinebot, **change))
-    assert spawner.spawn("guest", update_at(vinebot, 0.0)) is None
+    assert spawner.spawn({"guest": update_at(vinebot, 0.0)}).get("guest") is None
     assert "guest" not in spawner
     (record,) = caplog.records
     assert reason in record.getMessage()
@@ -154,3 +155,18 @@ def test_a_robot_name_from_the_network_is_not_a_path(vinebot, tmp_path, monkeypa
     found = resolve_description(hello(vinebot, urdf=text, robot="../escaped"), vinebot)
     assert found.joints == vinebot.joints
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_full_disk_costs_the_robot_that_joins_and_not_the_tick(vinebot, monkeypatch, caplog):
+    physics = world(vinebot)
+    spawner = RemoteSpawner(physics.rigid, None)
+    spawner.enqueue(hello(vinebot, robot="other", urdf=vinebot.urdf.replace("vinebot", "other")))
+
+    def full(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    assert spawner.spawn({"guest": update_at(vinebot, 2.0)}) == {}
+    assert "guest" not in spawner
+    assert "the robot of guest cannot be shown" in caplog.text
+    physics.step()

@@ -190,6 +190,13 @@ class Ownership:
             if recent and successor(object_id) == self.name:
                 self.take_over(object_id)
 
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+        for known in self._known.values():
+            known.published_at += step
+            known.received_at += step
+            known.corrected_at += step
+
     def expire(self, time: float) -> None:
         """Mark owners as silent that have timed out; their claims still hold."""
         for object_id in self.remote:

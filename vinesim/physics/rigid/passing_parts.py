@@ -10,6 +10,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from vinesim.physics.rigid.static_world import ROBOTS
+
 
 class PassingParts:
     """Which parts [k] of one person touch nothing now."""
@@ -19,14 +21,11 @@ class PassingParts:
         self._geoms = self._obstacles = np.zeros(0, int)
         self._bits = np.zeros((count, 2), int)
 
-    def find_indices(self, m: mujoco.MjModel, bodies: np.ndarray, robots: int) -> None:
-        """Find the geoms of the parts' ``bodies`` [k] and those with the collision bits of ``robots`` in a world that
-        was compiled anew."""
+    def find_indices(self, m: mujoco.MjModel, bodies: np.ndarray) -> None:
+        """Find the geoms of the parts' ``bodies`` [k] and those of robots in a world that was compiled anew."""
         self._geoms = m.body_geomadr[bodies]
         self._bits = np.stack([m.geom_contype[self._geoms], m.geom_conaffinity[self._geoms]], 1)
-        is_obstacle = (m.geom_contype & robots) != 0
-        is_obstacle[self._geoms] = False
-        self._obstacles = np.flatnonzero(is_obstacle)
+        self._obstacles = np.flatnonzero(m.geom_contype & ROBOTS)
         self._apply(m)
 
     def update(self, m: mujoco.MjModel, d: mujoco.MjData, places: np.ndarray, jumped: np.ndarray) -> None:
