@@ -6,6 +6,7 @@ import concurrent.futures
 import errno
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -15,7 +16,9 @@ from vinesim.client.remote.spawner import RemoteSpawner, resolve_description
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 
@@ -46,7 +49,10 @@ def vinebot() -> RobotDescription:
 
 
 def hello(description: RobotDescription, name: str = "guest", **change) -> Hello:
-    defaults = {"robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7}
+    defaults = {
+        "robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7,
+        "sidecar": encode_sidecar(description.base_limits, description.groups),
+    }  # fmt: skip
     return Hello(name, **{**defaults, **change})
 
 
@@ -155,6 +161,53 @@ def test_a_robot_name_from_the_network_is_not_a_path(vinebot, tmp_path, monkeypa
     found = resolve_description(hello(vinebot, urdf=text, robot="../escaped"), vinebot)
     assert found.joints == vinebot.joints
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_robot_of_another_client_has_the_gains_that_its_sender_gave_it(vinebot):
+    """The sender's TOML file does not exist here: groups, gains and limits come with the hello."""
+    stiffer = {
+        name: msgspec.structs.replace(group, stiffness=tuple(1234.0 for _ in group.joints))
+        for name, group in vinebot.groups.items()
+    }
+    base = msgspec.structs.replace(vinebot.base_limits, effort=(500.0, 300.0))
+    there = hello(vinebot, sidecar=encode_sidecar(base, stiffer))
+    found = resolve_description(there, vinebot)
+    assert found is not vinebot
+    assert found.base_limits == base
+    assert found.joints == vinebot.joints
+    grouped = {joint for group in stiffer.values() for joint in group.joints}
+    assert {drive.stiffness for drive in found.drives if drive.joint in grouped} == {1234.0}
+    np.testing.assert_allclose(found.home, vinebot.home)
+    assert resolve_description(hello(vinebot), vinebot) is vinebot
+
+
+def with_group(vinebot: RobotDescription, **change) -> str:
+    name, group = next(iter(vinebot.groups.items()))
+    return encode_sidecar(vinebot.base_limits, {name: msgspec.structs.replace(group, **change)})
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (lambda _: "{", "truncated"),
+        (lambda _: '{"cameras": [], "unknown": 1}', "unknown"),
+        (lambda _: " " * (1 << 17), "B; send at most"),
+        (lambda robot: with_group(robot, joints=("no such joint",), stiffness=None, damping=None, armature=None,
+                                  series_stiffness=None, series_damping=None, home=None), "no drive moves"),
+        (lambda robot: with_group(robot, stiffness=(1e300,) * 9), "stiffness"),
+        (lambda robot: with_group(robot, damping=(-1.0,) * 9), "damping"),
+    ],
+)  # fmt: skip
+def test_a_sidecar_that_no_robot_has_is_refused(vinebot, text, reason):
+    with pytest.raises(DescriptionError, match=reason):
+        resolve_description(hello(vinebot, sidecar=text(vinebot)), vinebot)
+
+
+def test_a_sidecar_from_the_network_names_no_sensor_file(vinebot):
+    """Sensors act where the robot is simulated; a file name in their place is not read."""
+    sidecar = '{"cameras": [{"name": "x", "frame": "base_link", "type": "../../etc/passwd"}], "groups": {}}'
+    found = resolve_description(hello(vinebot, sidecar=sidecar), vinebot)
+    assert all("passwd" not in camera.type for camera in found.cameras)
 
 
 def test_a_full_disk_costs_the_robot_that_joins_and_not_the_tick(vinebot, monkeypatch, caplog):

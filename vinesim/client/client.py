@@ -38,6 +38,7 @@ from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.scene.ids import LABEL_STRIDE
@@ -132,7 +133,8 @@ class Client:
     def add_robot(self, description: RobotDescription, name: str, pose: np.ndarray, bus: Bus) -> Robot:
         """Add a local robot at ``pose`` [7] m, 1; ``bus`` must have its ``name``."""
         hello = Hello(
-            name=name, kind="robot", robot=description.name, urdf=description.urdf, scene=self.scene.name,
+            name=name, kind="robot", robot=description.name, urdf=description.urdf,
+            sidecar=encode_sidecar(description.base_limits, description.groups), scene=self.scene.name,
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
             seed=self.scene.seed,
         )  # fmt: skip

@@ -16,6 +16,7 @@ from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.sidecar import decode_sidecar, encode_sidecar
 from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.scene.values import HumanSpec, HumanUpdate, RobotSpec, RobotUpdate
 
@@ -144,17 +145,23 @@ class RemoteSpawner:
 
 
 def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDescription:
-    """The robot of another client: an installed one with the same URDF text, or one loaded from the text it sent."""
-    if own is not None and hello.urdf == own.urdf:
+    """The robot of another client: an installed one with the same URDF text and sidecar, or one loaded from what it
+    sent."""
+
+    def is_same(known: RobotDescription) -> bool:
+        return known.urdf == hello.urdf and encode_sidecar(known.base_limits, known.groups) == hello.sidecar
+
+    if own is not None and is_same(own):
         return own
     name = hello.robot if is_valid_name(hello.robot) else "robot"  # untrusted, and it becomes a file's name
     try:
         known = load_description(name)
-        if known.urdf == hello.urdf:
+        if is_same(known):
             return known
     except DescriptionError:
         pass
+    sidecar = decode_sidecar(hello.sidecar)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(hello.urdf)
-        return load_description(file, is_remote=True)
+        return load_description(file, is_remote=True, sidecar=sidecar)
