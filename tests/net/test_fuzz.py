@@ -167,7 +167,7 @@ def test_a_client_with_physics_survives_malformed_messages(kind):
 
 
 def test_jumps_of_a_remote_person_do_not_push_a_robot_on_its_wheels():
-    """Poses of human size that jump in and about the robot, and the corrupted ones of a seed that once pushed it 9 m."""
+    """Poses of human size that jump in and about the robot, and corrupted ones of a seed that once pushed it 9 m."""
     hub, now = MemoryHub(), [10.0]
     client, pose = robot_client(hub, now)
     attacker = FakeClient(

@@ -154,5 +154,5 @@ def test_a_pose_of_no_human_size_or_speed_is_refused(point):
         if is_human:
             assert decode_human(payload, "eva").pose is not None
         else:
-            with pytest.raises(MessageError, match="from the hips|faster than"):
+            with pytest.raises(MessageError, match=r"from the hips|faster than"):
                 decode_human(payload, "eva")

@@ -262,8 +262,8 @@ class Replay:
         self, recording: Recording, bus: Bus, live_bus: Callable[[str], Bus], now: float, *,
         speed: float = 1.0, start: float = 0.0, end: float | None = None,
     ) -> None:  # fmt: skip
-        """``bus`` is not live: it queries the clock. ``live_bus(name)`` opens the bus of an actor, also of an absent one
-        while its retained records are published. ``now`` is any clock [s], as in :meth:`step`."""
+        """``bus`` is not live: it queries the clock. ``live_bus(name)`` opens the bus of an actor, also of an absent
+        one while its retained records are published. ``now`` is any clock [s], as in :meth:`step`."""
         self.playhead = Playhead(recording, start, end)
         self.sent = 0
         """Messages that had a subscriber."""
