@@ -27,7 +27,7 @@ from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
 from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.plants.kernel_launches import KernelLaunches
+from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
 from vinesim.physics.plants.validation import checked_trees, validate
@@ -35,23 +35,11 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
 
-def kernel_parameters(
-    p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
-) -> dict[str, Any]:
-    """Fields of :class:`vinesim.kernels.articulation.structs.SolverParameters`."""
-    return {
-        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
-        "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
-        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
-    }  # fmt: skip
-
-
 class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
     ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
-    a
-    tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after a contact
+    a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after contact
     began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
     ``predict()`` before them.
 
@@ -64,8 +52,7 @@ class ArticulationSolver:
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
         threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
-        fast_rate: [rad/s] see ``PhysicsParameters.fast_joint_rate``.
-        max_rate: [rad/s] see ``PhysicsParameters.max_joint_rate``.
+        fast_rate, max_rate: [rad/s] see ``fast_joint_rate`` and ``max_joint_rate`` of ``PhysicsParameters``.
         fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
@@ -131,13 +118,11 @@ class ArticulationSolver:
         model, state = self.model, self.state
         trees, bodies = len(model.tree_first), len(model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
-        """phi asked for each tree [tree]; set it as you like. 1 from the start where a tie is stiff
-        (``stiff_tie_mass``)."""
+        """phi asked for each tree [tree]; set it as you like. 1 where a tie is stiff (``stiff_tie_mass``)."""
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``predict()`` [tree]."""
         self.tree_rate = np.zeros(trees, np.float32)
-        """Fastest joint that the last integration found [tree] rad/s, and m/s of what falls; NaN or above
-        ``fault_rate`` for a tree that it stopped."""
+        """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -227,11 +212,8 @@ class ArticulationSolver:
         if len(trees) == 0:
             return
         bodies = self.bodies_of(trees)
-        self.state.joint_qd[bodies] = 0.0
-        self.state.joint_xd[bodies] = 0.0
-        self.velocity_free[bodies] = 0.0
-        self.acceleration[bodies] = 0.0
-        self._wrench[bodies] = 0.0
+        for rows in (self.state.joint_qd, self.state.joint_xd, self.velocity_free, self.acceleration, self._wrench):
+            rows[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._euler_steps[trees] = 0
         self.forward_kinematics(trees)
@@ -308,24 +290,39 @@ class ArticulationSolver:
 
     # ------------------------------------------------------------------ one step
 
-    def predict(self) -> None:
-        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts."""
-        self._checked = None
+    def predict(self, trees: np.ndarray | None = None) -> None:
+        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts.
+
+        ``trees`` [k]: only these, woken or given another phi after the prediction of all.
+        """
+        self._checked, launches = None, self.launches
         self._runner.list_trees(self._awake)
-        self.launches.upload_changed()
-        count = len(self._runner.stepped)
-        self.launches.upload_step(count)
-        self._runner.predict()
-        self.launches.download_prediction(count)
+        launches.upload_changed()
+        if trees is None:
+            count = len(self._runner.stepped)
+            launches.upload_step(count)
+            self._runner.predict()
+            launches.download_prediction(count)
+        else:
+            count = len(trees)
+            self.list_subset(trees)
+            launches.upload_subset_step(count)
+            launches.predict_subset(count)
+            launches.download_subset_prediction(count)
         self.buffers.synchronize()
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
 
         ``impulse_response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of
-        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees. A view, good until
-        the next call.
+        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees.
         """
+        self._require_stepped(bodies)
+        return self.launches.dense_impulse_response(bodies)
+
+    def impulse_response_by_tree(self, bodies: np.ndarray) -> np.ndarray:
+        """:meth:`impulse_response` without its zeros, [n, 6, m, 6]: entry [u, :, t] for the t-th listed body of the
+        tree of body u. Bodies of one tree must be neighbours in ``bodies``. A view, good until the next call."""
         self._require_stepped(bodies)
         return self.launches.impulse_response(bodies)
 
@@ -334,8 +331,7 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, count = self.launches, len(self._runner.stepped)
-        changed = len(self._loaded_bodies) > 0
+        launches, count, changed = self.launches, len(self._runner.stepped), len(self._loaded_bodies) > 0
         self._wrench[self._loaded_bodies] = 0.0
         self._loaded_bodies = np.zeros(0, np.int32)
         if bodies is not None and len(bodies):
@@ -399,8 +395,7 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
-        """Use phi = 1 in the next steps of trees about to be touched, for ``contact_onset_duration`` (``integrate()``
-        sees to new contacts)."""
+        """Use phi = 1 for ``contact_onset_duration``: trees about to be touched (``integrate()`` sees to touched)."""
         self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self._onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
@@ -422,12 +417,10 @@ class ArticulationSolver:
             return
         bodies = self._checked = np.asarray(bodies)
         trees = self.model.body_tree[bodies]
-        at = np.searchsorted(self._runner.stepped, trees)
-        if (
-            len(self._runner.stepped) == 0
-            or (self._runner.stepped[np.minimum(at, len(self._runner.stepped) - 1)] != trees).any()
-        ):
-            late = next(i for i, tree in enumerate(trees) if tree not in self._runner.stepped)
+        stepped = self._runner.stepped
+        at = np.searchsorted(stepped, trees)
+        if len(stepped) == 0 or (stepped[np.minimum(at, len(stepped) - 1)] != trees).any():
+            late = int(np.argmin(np.isin(trees, stepped)))
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
         riding = bodies - self.model.tree_first[trees] >= self.tree_moving[trees]
         if riding.any():
@@ -470,6 +463,11 @@ class ArticulationSolver:
     def tie_damping(self) -> np.ndarray:
         """N s/m [tie]."""
         return self._ties.damping
+
+    @property
+    def held_bodies(self) -> list[int]:
+        """Bodies that ties of :meth:`add_tie` hold."""
+        return self._ties.held_bodies
 
     def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.

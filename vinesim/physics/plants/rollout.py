@@ -24,8 +24,9 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels.articulation import integration, kinematics, prediction, structs
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import ArticulationSolver, kernel_parameters
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.device_buffers import DeviceBuffers, find_device
+from vinesim.physics.plants.kernel_launches import kernel_parameters
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
