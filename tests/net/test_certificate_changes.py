@@ -90,6 +90,21 @@ def test_a_running_server_takes_new_certificates_and_its_actors_and_records_stay
             wait(is_refused, "bob to be refused without his file")
 
 
+def test_clients_with_datagrams_come_back_to_both_ports(tmp_path):
+    """The socket of QUIC is released some time after its session is closed."""
+    certs = tmp_path / "certs"
+    create(certs, "ada")
+    with Server(("tls/127.0.0.1:0", "quic/127.0.0.1:0"), certificates=certs) as server:
+        quic = str(server.endpoints[1])
+        with ZenohBus("ada", connect=quic, certificates=certs) as ada:
+            links = ada.links
+            assert len(links) > 1
+            for _ in range(2):
+                create(certs, "server", Role.SERVER)
+                wait(lambda: served_serial(server) == serial(certs / "server.pem"), "the new certificate")
+                wait(lambda: ada.links == links and not ada.status_message, "both links to be back")
+
+
 def test_a_new_authority_for_all_is_used_by_servers_and_by_clients_that_come_back(tmp_path):
     certs, new = tmp_path / "certs", tmp_path / "new"
     create(certs, "ada")

@@ -37,6 +37,10 @@ LEASE = 1000
 """A server that is silent for this long is taken to be gone [ms]: half of what actors are granted."""
 
 
+RELEASE_TIMEOUT = 5.0
+"""Time limit for the release of the ports of a session that was closed [s]."""
+
+
 class PortTaken(BusError):
     """The server cannot listen on the endpoint."""
 
@@ -251,6 +255,10 @@ class Server:
             close_session(self._session)
             with self._lock:
                 self._admission.forget_actors()
+            # a session that fails to open may keep some of its sockets: so only when all are free
+            until = time.monotonic() + RELEASE_TIMEOUT
+            while time.monotonic() < until and not all(map(endpoints.can_listen, self.endpoints)):
+                self._stop.wait(0.02)
             try:
                 self._session = _open_router(self.endpoints, self._linked, settings)
                 self._declared = self._declare(self._root)
