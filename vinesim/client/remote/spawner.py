@@ -5,9 +5,12 @@ from __future__ import annotations
 import concurrent.futures
 import logging
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
+
+from vinesim.client.remote.mesh_exchange import MeshExchange
 from vinesim.client.remote.remote_human import RemoteHuman, human_spec
 from vinesim.net.codec.messages import Hello, is_valid_name
 from vinesim.physics.rigid.mujoco_world import CompiledWorld
@@ -25,16 +28,26 @@ Prepared = tuple[RobotDescription | None, CompiledWorld]
 
 
 class RemoteSpawner:
-    """Remote actors that have joined but have no body here yet."""
+    """Remote actors that have joined but have no body here yet, and robots whose meshes arrive after they have one."""
 
     def __init__(
-        self, rigid: RigidWorld, own: RobotDescription | None, executor: concurrent.futures.Executor | None = None
+        self,
+        rigid: RigidWorld,
+        own: RobotDescription | None,
+        executor: concurrent.futures.Executor | None = None,
+        meshes: MeshExchange | None = None,
     ) -> None:
-        """``own``: a description that is loaded already, if any; without ``executor`` actors are compiled at once."""
+        """``own``: a description that is loaded already, if any; without ``executor`` actors are compiled at once.
+        ``meshes``: those of remote robots; without it they are boxes."""
         self.rigid, self.own = rigid, own
+        self.meshes = meshes or MeshExchange()
         self._executor = executor
         self._enqueued: dict[str, Hello] = {}
         self._compiling: dict[str, concurrent.futures.Future[Prepared]] = {}
+        self._spawned: dict[str, Hello] = {}
+        """Robots that have a body here."""
+        self._outdated: set[str] = set()
+        """Robots of which meshes have arrived since their last compilation began."""
 
     def __contains__(self, name: str) -> bool:
         return name in self._enqueued
@@ -45,8 +58,9 @@ class RemoteSpawner:
 
     def cancel(self, name: str) -> None:
         """Remove an actor that has left."""
-        self._enqueued.pop(name, None)
-        self._compiling.pop(name, None)
+        for of_name in (self._enqueued, self._compiling, self._spawned):
+            of_name.pop(name, None)
+        self._outdated.discard(name)
 
     def spawn(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemoteHuman | None:
         """The body of an enqueued actor at the pose of ``update``; None until it is compiled.
@@ -54,24 +68,48 @@ class RemoteSpawner:
         An actor that cannot be shown is logged and removed.
         """
         hello = self._enqueued[name]
+        prepared = self._result(name, hello, lambda: self._prepare(hello, update))
+        if prepared is None:
+            return None
+        del self._enqueued[name]
+        description, _ = prepared
+        if description is None or not isinstance(update, RobotUpdate):
+            return RemoteHuman(self.rigid, name)
+        self._spawned[name] = hello
+        if description.urdf != hello.urdf:  # not the text of an installed robot, whose meshes are files
+            self.meshes.want(name, hello.urdf)
+        other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, is_in_world=True)
+        self.rigid.place_robot(name, update.base_q, update.position)
+        return other
+
+    def renewed(self) -> Iterator[RemoteRobot]:
+        """Robots whose meshes have arrived and now stand in the place of boxes, in the state that they were in."""
+        self._outdated.update(self.meshes.changed())
+        for name in sorted(self._outdated & self._spawned.keys() | self._compiling.keys() & self._spawned.keys()):
+            hello = self._spawned[name]
+            prepared = self._result(name, hello, lambda hello=hello: self._prepare(hello, None))
+            if prepared is not None and (description := prepared[0]) is not None:
+                pose, _ = self.rigid.base_state(name)
+                yield RemoteRobot(self.rigid, description, name, hello.index, pose, is_in_world=True)
+
+    def _result(self, name: str, hello: Hello, work: Callable[[], Prepared]) -> Prepared | None:
+        """Compile an actor; its description when the world with it is in use, None until then."""
         if name not in self._compiling:
-            self._compiling[name] = self._submit(lambda: self._prepare(hello, update))
+            self._outdated.discard(name)
+            self._compiling[name] = self._submit(work)
         if not self._compiling[name].done():
             return None
         try:
             description, draft = self._compiling.pop(name).result()
         except ValueError as error:
             log.warning("the %s of %s cannot be shown: %s", hello.kind, name, error)
-            self.cancel(name)
+            if name not in self._spawned:
+                self.cancel(name)
             return None
-        if not self.rigid.adopt(draft):
-            return None  # another actor joined or left meanwhile: compiled again from the next step on
-        self.cancel(name)
-        if description is None or not isinstance(update, RobotUpdate):
-            return RemoteHuman(self.rigid, name)
-        other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, is_in_world=True)
-        self.rigid.place_robot(name, update.base_q, update.position)
-        return other
+        if not self.rigid.adopt(draft):  # another actor joined or left meanwhile: compiled again from the next step on
+            self._outdated.add(name)
+            return None
+        return description, draft
 
     def _submit(self, work: Callable[[], Prepared]) -> concurrent.futures.Future[Prepared]:
         if self._executor is not None:
@@ -83,17 +121,35 @@ class RemoteSpawner:
             done.set_exception(error)
         return done
 
-    def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
+    def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate | None) -> Prepared:
+        """Load and compile an actor at the pose of ``update``; None: again, as the robot that is here already."""
         if isinstance(update, HumanUpdate):
             return None, self.rigid.compile_with(human_spec(hello, update), is_remote=True)
-        description = resolve_description(hello, self.own)
+        received = self.meshes.received(hello.name)
+        if received:
+            try:
+                return self._prepare_robot(hello, update, received)
+            except ValueError as error:
+                log.warning("the meshes of %s cannot be used, boxes stay in their place: %s", hello.name, error)
+                self.meshes.refuse(hello.name)
+        return self._prepare_robot(hello, update, {})
+
+    def _prepare_robot(self, hello: Hello, update: RobotUpdate | None, received: Mapping[str, np.ndarray]) -> Prepared:
+        description = resolve_description(hello, self.own, received)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
-        return description, self.rigid.compile_with(description.to_spec(hello.name, hello.index, update.base_q))
+        pose = None if update is None else update.base_q
+        spec = description.to_spec(hello.name, hello.index, pose)
+        return description, self.rigid.compile_with(spec, replaces=update is None)
 
 
-def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDescription:
-    """The robot of another client: an installed one with the same URDF text, or one loaded from the text it sent."""
+def resolve_description(
+    hello: Hello, own: RobotDescription | None, received: Mapping[str, np.ndarray] | None = None
+) -> RobotDescription:
+    """The robot of another client: an installed one with the same URDF text, or one loaded from the text it sent.
+
+    ``received``: corners [face, 3, 3] m of its meshes by digest; boxes stand in for those that are not there.
+    """
     if own is not None and hello.urdf == own.urdf:
         return own
     name = hello.robot if is_valid_name(hello.robot) else "robot"  # untrusted, and it becomes a file's name
@@ -106,4 +162,4 @@ def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDesc
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(hello.urdf)
-        return load_description(file, is_remote=True)
+        return load_description(file, is_remote=True, received=received)

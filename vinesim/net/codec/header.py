@@ -31,6 +31,9 @@ class MessageKind(enum.IntEnum):
     HELLO = 16
     CLOCK = 17
     WELCOME = 18
+    MESH_PART = 19
+    MESH_REQUEST = 20
+    MESH_WANTED = 21
 
 
 TIMESTAMPED = frozenset(

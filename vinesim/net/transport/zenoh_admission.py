@@ -37,6 +37,8 @@ class ServerAdmission:
         """The server of this world is there, or there never was one."""
         self.rejection = ""
         """Empty, or why a server that was restarted rejects this actor."""
+        self.count = 0
+        """How often a server has admitted this actor."""
         self._declared: list[object] = []
 
     def join(self, hello: bytes) -> None:
@@ -54,6 +56,7 @@ class ServerAdmission:
         elif len(welcomes) > 1:
             log.warning("%s: %d servers keep world %r; link all but one to it with --connect", self._name,
                         len(welcomes), self._world)  # fmt: skip
+        self.count += bool(welcomes)
         querier = self._session.declare_querier(self._key)
 
         def on_matching(status: zenoh.MatchingStatus) -> None:
@@ -77,6 +80,7 @@ class ServerAdmission:
             self._submit(lambda: self._join_again(querier, hello))
             return
         self.rejection = next((welcome.refused for welcome in welcomes if welcome.refused), "")
+        self.count += bool(welcomes) and not self.rejection
         if self.rejection:
             log.error("%s: the server that came back rejects this actor: %s", self._name, self.rejection)
 

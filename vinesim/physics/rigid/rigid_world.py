@@ -11,11 +11,13 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 
 from __future__ import annotations
 
+import dataclasses
+
 import mujoco
 import numpy as np
 
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid import free_bunch, recompile, static_world
+from vinesim.physics.rigid import free_bunch, mujoco_sleep, recompile, static_world
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
 from vinesim.physics.rigid.mujoco_world import CompiledWorld
@@ -71,31 +73,41 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         del self._humans[name]
         self._recompile()
 
-    def compile_with(self, spec: RobotSpec | HumanSpec, *, is_remote: bool = False) -> CompiledWorld:
+    def compile_with(
+        self, spec: RobotSpec | HumanSpec, *, is_remote: bool = False, replaces: bool = False
+    ) -> CompiledWorld:
         """Compile the world with one more actor, for :meth:`adopt`; any thread may call this while steps go on.
 
-        Raises :class:`RobotError` if the URDF does not compile. ``is_remote``: see :meth:`add_human`.
+        Raises :class:`RobotError` if the URDF does not compile. ``is_remote``: see :meth:`add_human`. ``replaces``: the
+        robot is here and keeps its state; only its shapes are others.
         """
         robots, humans = tuple(self._robots.values()), tuple(self._humans.values())
         if isinstance(spec, HumanSpec):
             bit = self._free_collision_bit("human", spec.name, HumanError)
             human = HumanBody(spec, bit, self.parameters, is_remote=is_remote)
             return self._compile_world(robots, (*humans, human))
-        robot = RobotBody(spec, self._free_collision_bit("robot", spec.name, RobotError), self.parameters)
+        if replaces:
+            old = self.robot(spec.name)
+            robot = RobotBody(dataclasses.replace(spec, pose=old.spec.pose), old.bit, self.parameters)
+            planned = tuple(robot if one is old else one for one in robots)
+        else:
+            robot = RobotBody(spec, self._free_collision_bit("robot", spec.name, RobotError), self.parameters)
+            planned = (*robots, robot)
         try:
-            return self._compile_world((*robots, robot), humans)
+            return self._compile_world(planned, humans)
         except ValueError as error:
             raise build_error(spec, error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
-        """Use a world that was compiled with one more actor; between steps.
+        """Use a world that was compiled with one more actor, or with one that replaces another; between steps.
 
         False, and nothing is changed, if other actors joined or left meanwhile: compile it anew.
         """
         present = (*self._robots.values(), *self._humans.values())
         planned = (*compiled.robots, *compiled.humans)
         (added, *more) = [actor for actor in planned if actor not in present] or [None]
-        others = tuple(actor for actor in planned if actor is not added)
+        old = None if added is None else self._robots.get(added.spec.name)
+        others = tuple(old if actor is added else actor for actor in planned if old is not None or actor is not added)
         has_room = compiled.bunch_slots > max(self._bunch_slot.values(), default=-1)
         if added is None or more or others != present or not has_room:
             return False
@@ -105,6 +117,11 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             return True
         spec = added.spec
         self._robots[spec.name] = added
+        if old is not None:
+            added.take_over(old)
+            mujoco_sleep.keep_touching_awake(self.mj_model, self.mj_data, self.mj_model.body(spec.name).id)
+            self._replace_world(compiled)
+            return True
         self._replace_world(compiled)
         self.place_robot(spec.name, spec.pose, spec.home)
         return True

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import pathlib
+from collections.abc import Mapping
 
 import msgspec
 import numpy as np
@@ -45,10 +46,13 @@ BOLTED_EFFORT = (1e6, 1e6)
 """[N], [N m] With which the base of a robot that is bolted down is held: a robot's pushes move it by micrometres."""
 
 
-def load_description(name: str | pathlib.Path, *, is_remote: bool = False) -> RobotDescription:
+def load_description(
+    name: str | pathlib.Path, *, is_remote: bool = False, received: Mapping[str, np.ndarray] | None = None
+) -> RobotDescription:
     """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
 
-    ``is_remote``: its text came over the network, so no file that it names is opened.
+    ``is_remote``: its text came over the network, so no file that it names is opened; its meshes are those of
+    ``received``, corners [face, 3, 3] by digest, and boxes where there are none.
     Raises :class:`DescriptionError` in one line if it cannot be simulated.
     """
     file = _locate(str(name))
@@ -56,8 +60,9 @@ def load_description(name: str | pathlib.Path, *, is_remote: bool = False) -> Ro
     check_numbers(root, file)
     notes: list[str] = []
     assumed: list[str] = []
+    meshes: dict[str, np.ndarray] = {}
     if is_remote:
-        replace_unopened_meshes(root, assumed)
+        meshes = replace_unopened_meshes(root, assumed, received)
     else:
         resolve_meshes(root, file, notes)
     fix_wheels(root, notes)
@@ -80,6 +85,7 @@ def load_description(name: str | pathlib.Path, *, is_remote: bool = False) -> Ro
     add_missing_masses(root, parsed, base, order, assumed)
     urdf = etree.tostring(root, encoding="unicode")
     description = _assemble(parse_robot(root), base, order, file, urdf, sidecar, notes, assumed)
+    description = dataclasses.replace(description, meshes=meshes)
     for note in notes:
         log.info("%s: %s", file.name, note)
     if assumed:
