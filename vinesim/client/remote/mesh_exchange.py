@@ -255,6 +255,7 @@ def _fetch(bus: Bus, digest: str, is_closing: Callable[[], bool]) -> bytes:
             raise MessageError(f"part of mesh {part.digest[:8]} from {part.offset} B on, not of {digest[:8]}")
         arrived += part.data
         size = part.size
-    if triangles.digest_of(arrived) != digest:
-        raise MessageError(f"mesh {digest[:8]} has the digest {triangles.digest_of(arrived)[:8]}")
-    return bytes(arrived)
+    payload = bytes(arrived)
+    if (found := triangles.digest_of(payload)) != digest:
+        raise MessageError(f"mesh {digest[:8]} has the digest {found[:8]}")
+    return payload

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import pathlib
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
@@ -137,7 +137,7 @@ def read_triangles(file: str) -> np.ndarray:
             return np.fromfile(opened, facet, faces)["corners"]
     import trimesh
 
-    return np.asarray(trimesh.load(file, force="mesh").triangles, np.float32)
+    return np.asarray(cast("trimesh.Trimesh", trimesh.load(file, force="mesh")).triangles, np.float32)
 
 
 def replace_unopened_meshes(
