@@ -119,6 +119,14 @@ def test_a_killed_process_is_started_again(robot, caplog):
     ]
 
 
+def test_pictures_go_on_after_a_process_that_hangs(robot, monkeypatch):
+    robot.run_for_pictures(1)
+    monkeypatch.setattr(worker_process, "HANG_TIMEOUT", 3)
+    os.kill(robot.sensors.worker.current().process.pid, signal.SIGSTOP)
+    robot.run_until(lambda: robot.sensors.report()["sensor_restarts"] >= 1, "a restart")
+    robot.run_for_pictures(3)
+
+
 def test_repeated_failures_are_logged_twice_and_counted(robot, caplog, monkeypatch):
     monkeypatch.setattr(worker_process, "LONGEST_PAUSE", 0.0)
     caplog.set_level(logging.WARNING)

@@ -261,7 +261,7 @@ def test_a_remote_robot_touches_only_trees_that_its_owner_reports():
     assert len(physics.plants.awake) == 0
     assert np.array_equal(physics.state.joint_q, asleep)
 
-    physics.contact_solver.remote_trees[20] = True
+    physics.contact_solver.trees_touched_by_copies[20] = True
     physics.step()
     assert {tree for tree, _ in physics.touched} == {20}
 

@@ -43,7 +43,7 @@ def run(
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    who = ", ".join(tape.actors) or "nobody"
+    who = ", ".join(tape.actors) or "no actors"
     print(f"{file}: {len(tape.messages)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
     if out is not None:
         return _look(tape, stop, out, pose, scene, seed, speed, start, end)
@@ -132,4 +132,4 @@ def _first_pose(tape: Recording) -> np.ndarray:
         for entry in tape.messages:
             if entry.key.startswith("a/") and sender_of(entry.key) in such:
                 return decode_pose(entry.payload, "").base_q
-    raise UsageError(f"{tape.path} has no pose of anybody to look at: give --pose X Y YAW")
+    raise UsageError(f"{tape.path} has no pose of an actor to look from: give --pose X Y YAW")

@@ -82,7 +82,11 @@ def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
         key: sum(status[key] for status in statuses)
         for key in ("frames_dropped", "messages_dropped", "sensor_restarts", "ros_restarts")
     }
-    return {"sensors_ready": not awaited, "sensors_awaited": awaited, **counts}
+    return {
+        "sensors_ready": not awaited, "sensors_awaited": awaited, **counts,
+        "sensor_restart_s": max(status["sensor_restart_s"] for status in statuses),
+        "processes": {what: pid for status in statuses for what, pid in status["processes"].items()},
+    }  # fmt: skip
 
 
 def _build_client(

@@ -24,7 +24,7 @@ from vinesim.scene.spec import load_scene, with_seed
 
 CAMERA_TOPICS = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info")
 COSTLY_TOPICS = ("depth/points", "labels")
-"""Topics of a camera that the listener leaves after the first message: nobody looks at so much all the time."""
+"""Topics of a camera that the listener leaves after the first message: no user looks at so much all the time."""
 VISITOR_SENSOR_HZ = "1"
 """The visitor has come to see a bunch move; its own sensors only have to be there."""
 
@@ -37,7 +37,7 @@ class ListenedTopics:
     once: tuple[str, ...]
     """Only until their first message."""
     events: tuple[str, ...]
-    """Nobody waits for these: they may stay silent."""
+    """The start does not wait for these: they may stay silent."""
     owners: Mapping[str, str]
     """Topic: the sensor that it comes from, in words."""
 

@@ -130,7 +130,7 @@ def push_table(summary: dict[str, Any]) -> Table:
             "error of the remote copy",
             "never compared" if error is None else f"{error['p50']:.1f} mm median, {error['p95']:.1f} p95",
         ),
-        ("bytes of touched plants, nobody near", f"{summary['environment_bytes_when_far']}"),
+        ("bytes of touched plants, no actor near", f"{summary['environment_bytes_when_far']}"),
         ("ROS messages received by a stock node", f"{sum(summary['ros_received'].values())}"),
         ("lost of /clock, /joint_states, /tf", "none came" if lost is None else f"{100.0 * lost:.2f} %"),
     ):

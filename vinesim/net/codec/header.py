@@ -28,6 +28,7 @@ class MessageKind(enum.IntEnum):
     OBJECTS = 5
     HUMAN = 6
     WRENCHES = 7
+    COUPLINGS = 8
     HELLO = 16
     CLOCK = 17
     WELCOME = 18
@@ -36,9 +37,9 @@ class MessageKind(enum.IntEnum):
     MESH_WANTED = 21
 
 
-TIMESTAMPED = frozenset(
-    (MessageKind.ROBOT, MessageKind.TREES, MessageKind.OBJECTS, MessageKind.HUMAN, MessageKind.WRENCHES)
-)
+_RARE = (MessageKind.CLAIMS, MessageKind.RETAINED, MessageKind.HELLO, MessageKind.CLOCK, MessageKind.WELCOME)
+
+TIMESTAMPED = frozenset(MessageKind).difference(_RARE)
 """Kinds whose header holds the network time [s] at which the content was sampled."""
 
 MAX_DATAGRAM = 1100

@@ -54,6 +54,8 @@ class ContactSolver:
         """Robots and people that another client controls. Their contacts are computed by that client: here they touch
         only remote trees, so that each contact counts once and a distant copy disturbs nothing.
         """
+        self.remote_trees = np.zeros(len(model.tree_first), np.bool_)
+        """[tree] whether another client owns its state; to be written by the client."""
         self._awake = np.zeros(0, np.int32)
         self._reported: tuple[Contact, ...] | None = ()
         self._touched: tuple[tuple[int, str], ...] | None = ()
@@ -148,8 +150,8 @@ class ContactSolver:
         return self.impulses.rigid_force
 
     @property
-    def remote_trees(self) -> np.ndarray:
-        """[tree] whether another client owns its state; to be written by the client."""
+    def trees_touched_by_copies(self) -> np.ndarray:
+        """[tree] whether copies of remote actors touch it; to be written by the client."""
         return self._arrays.trees.is_remote
 
     @property

@@ -219,8 +219,11 @@ class ArticulationSolver:
             self._list_awake()
 
     def put_to_sleep(self, trees: np.ndarray | int) -> None:
-        """Put trees to sleep where they are, with zero rates; their poses are brought up to date."""
-        trees = np.atleast_1d(trees)
+        """Put trees to sleep where they are, with zero rates; their poses are brought up to date.
+
+        :class:`ValueError` if there is no such tree.
+        """
+        trees = checked_trees(trees, len(self.state.tree_awake))
         if len(trees) == 0:
             return
         bodies = self.bodies_of(trees)
@@ -248,6 +251,7 @@ class ArticulationSolver:
         """Let the clusters of these trees' bunches move, from where they ride and as fast as what they ride on.
 
         Pose, velocity and momentum go on. Nothing happens to trees that are fine or have no clusters; none wakes.
+        :class:`ValueError` if there is no such tree.
         """
         self._clusters.refine(trees)
 
