@@ -86,6 +86,12 @@ def _load() -> Iterator[Measurement]:
     return load()
 
 
+def _actors() -> Iterator[Measurement]:
+    from vinesim.bench.many_actors import actors
+
+    return actors()
+
+
 def _fuzz() -> Iterator[Measurement]:
     from vinesim.bench.message_fuzz import fuzz
 
@@ -146,6 +152,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "link": _link,
     "traffic": _traffic,
     "load": _load,
+    "actors": _actors,
     "fuzz": _fuzz,
     "kill": _kill,
     "soak": _soak,

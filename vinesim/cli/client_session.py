@@ -21,6 +21,7 @@ from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
+from vinesim.errors import writing
 from vinesim.kernels.compilation import compile_kernels
 from vinesim.net.transport.bus import Bus
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -128,7 +129,8 @@ class ClientSession:
                 raise
             raise DeviceLost(f"{device} failed after {client.physics.time:.1f} s: {fault}") from failure
         if self.options.tick_log is not None:
-            loop.log().save(self.options.tick_log)
+            with writing(self.options.tick_log):
+                loop.log().save(self.options.tick_log)
         return status
 
 
@@ -158,9 +160,10 @@ def run_loop(
 
 def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
     """Write ``report.json``, whole or not at all."""
-    partial = out / "report.json.part"
-    partial.write_text(json.dumps(report, indent=2) + "\n")
-    partial.replace(out / "report.json")
+    with writing(out / "report.json"):
+        partial = out / "report.json.part"
+        partial.write_text(json.dumps(report, indent=2) + "\n")
+        partial.replace(out / "report.json")
 
 
 def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form: str, stop: threading.Event) -> None:

@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from vinesim.errors import UsageError
+from vinesim.errors import UsageError, writing
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.keys import sender_of
@@ -107,7 +107,8 @@ def _look(
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
     eyes = standing_view(*pose) if pose is not None else follow_view(_first_pose(tape))
-    out.mkdir(parents=True, exist_ok=True)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
     bus = ReplayBus(tape, "spectator", start=start, end=end)
     spectator = Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time)
     pictures = PictureWriter(spectator, out, 1.0)

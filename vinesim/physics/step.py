@@ -120,6 +120,7 @@ class Physics:
             "trees_slowed": self.fault_guard.slowed,
             "robots_stopped": self.rigid.faults,
             "contacts_dropped": self.contact_solver.dropped_contacts,
+            "geoms_skipped": self.contact_solver.skipped_geoms,
             "grasps_refused": self.grasp_manager.refused_grasps,
         }
 

@@ -29,8 +29,8 @@ def bench(
     What a user waits for: start. Of physics: plants, contact, tick, asleep. Of sensors: camera and lidar (speed),
     sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
     beside budgets). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links;
-    needs root), traffic (bytes a client receives), load (many clients), fuzz (broken messages), kill (programs killed
-    at random moments, while all others go on).
+    needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz
+    (broken messages), kill (programs killed at random moments, while all others go on).
     Of a long run: soak (memory, threads and open files of robots, people and a recorder; Linux).
 
     \b

@@ -16,6 +16,7 @@ from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, process_group
 from vinesim.client.processes.ros_listener import RosListener
+from vinesim.errors import writing
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
@@ -56,7 +57,8 @@ def run_push(
     plan = with_seed(load_scene(scene), seed)
     description = load_description(robot)  # refused once, and before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
-        folder.mkdir(parents=True, exist_ok=True)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
     no_ros = middleware.unavailable_reason()
     if no_ros:

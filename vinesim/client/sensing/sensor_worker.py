@@ -299,9 +299,13 @@ class SensorWorker:
             self.node.publish_lidar(scan)
 
     def _save_best_frame(self, folder: pathlib.Path) -> None:
+        failure = ""
         if self._best_frame is not None:
             from vinesim.sensors.export import images
 
-            images.save_frame(self._best_frame, folder, "")
+            try:
+                images.save_frame(self._best_frame, folder, "")
+            except OSError as bad:
+                failure = bad.strerror or str(bad)
         self.pipe.send(("statistics", self._statistics()))
-        self.pipe.send(("saved", self._best_frame is not None))
+        self.pipe.send(("saved", failure))

@@ -227,7 +227,7 @@ def mark_near_trees(
     A remote actor counts at remote trees only.
     """
     block = wp.tid()
-    for actor in range(actors.start.shape[0] - 1):
+    for actor in range(actors.count[0]):
         actor_low = actor_boxes.low[actor]
         actor_high = actor_boxes.high[actor]
         if not aabbs_disjoint(block_boxes.low[block], block_boxes.high[block], actor_low, actor_high):

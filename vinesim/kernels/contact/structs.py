@@ -23,7 +23,9 @@ IS_CONSTRAINED = wp.constant(5)
 ISLANDS = wp.constant(6)
 SORT_AXIS = wp.constant(7)
 """World axis (0, 1, 2) along which the boxes of trees are sorted."""
-COUNTERS = 8
+SKIPPED_GEOMS = wp.constant(8)
+"""Static geoms beyond what one tree can be near to."""
+COUNTERS = 9
 
 AABB_BLOCK = wp.constant(32)
 """So many static boxes share one box around them, and are skipped by one comparison."""
@@ -137,6 +139,8 @@ class CapsuleStates:
 class Geoms:
     """Rigid geoms that plants collide with [geom]: first those that can move, then static ones."""
 
+    count: wp.array(dtype=wp.int32)
+    """[2] number of those that can move, and of all; there is room for more."""
     id: wp.array(dtype=wp.int32)
     """number in MuJoCo's arrays."""
     body: wp.array(dtype=wp.int32)
@@ -180,6 +184,8 @@ class GeomStates:
 class Actors:
     """Robots, people, boxes and free bunches [actor]: each a range of the movable geoms."""
 
+    count: wp.array(dtype=wp.int32)
+    """[1] number of actors; there is room for more."""
     start: wp.array(dtype=wp.int32)
     """[actor + 1] first geom of each."""
     is_remote: wp.array(dtype=wp.bool)
@@ -246,6 +252,8 @@ class Candidates:
     """[awake tree] whether one of them is an impact."""
     near_geoms: wp.array2d(dtype=wp.int32)
     """[awake tree, k] scratch: geoms whose box overlaps that of the tree."""
+    skipped_geoms: wp.array(dtype=wp.int32)
+    """[awake tree] static geoms whose box overlaps it as well, for which ``near_geoms`` has no room."""
     feature: wp.array2d(dtype=wp.int32)
     """2 * capsule + end of the part along a face; -1 for an empty slot."""
     other: wp.array2d(dtype=wp.int32)

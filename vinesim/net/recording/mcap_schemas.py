@@ -102,8 +102,8 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
         "vinesim.Greeting",
         _object(
             "vinesim.Greeting", "How an actor introduced itself.", name=_TEXT, kind=_TEXT, robot=_TEXT, urdf=_TEXT,
-            scene=_TEXT, digest=_TEXT, seed=_COUNT, protocol=_COUNT, index=_COUNT, joints=_COUNT, height=_NUMBER,
-            **_COMMON,
+            sidecar=_TEXT, scene=_TEXT, digest=_TEXT, seed=_COUNT, protocol=_COUNT, index=_COUNT, joints=_COUNT,
+            height=_NUMBER, **_COMMON,
         ),
     ),
     "live": ("vinesim.Live", _object("vinesim.Live", "An actor came or went.", live=_YES, **_COMMON)),

@@ -48,6 +48,8 @@ class ContactSolver:
         """Contacts left out since the start, for want of room."""
         self.overflow_message = ""
         """When contacts were last left out and how many: empty if never."""
+        self.skipped_geoms = 0
+        """Static geoms left out since the start, as more of them were near one tree than there is room for."""
         self.near_trees = np.zeros(0, np.int32)
         """Trees [k] whose box a robot or a moving box reaches into: these must not fall asleep."""
         self.remote_actors: set[str] = set()
@@ -106,6 +108,7 @@ class ContactSolver:
         if detection.candidates is not candidates:
             self.impulses.bind_launches(detection)
         self.impulses.compact_candidates(1)
+        self.skipped_geoms += int(detection.counters[structs.SKIPPED_GEOMS])
         count, overflow = int(detection.counters[structs.CONTACTS]), int(detection.counters[structs.OVERFLOW])
         if count > capacity:
             overflow += count - capacity
@@ -206,8 +209,13 @@ class ContactSolver:
         self.detection.update_tree_bounds(trees)
 
     def _update_rigid_world(self) -> None:
-        """Take over the rigid world after an actor came or went."""
+        """Take over the rigid world after an actor came or went, a hand opened or closed, or a bunch took a body."""
         previous = self._rigid_arrays
+        if previous is not None and previous.world is self.rigid.mj_model:
+            self._generation = self.rigid.generation
+            self.impulses.renumber_geoms(previous.update(self.rigid, self.remote_actors))
+            self.detection.update_rigid_geoms()
+            return
         self._rigid_arrays = arrays = RigidArrays(self.rigid, self.remote_actors, previous)
         self._generation = self.rigid.generation
         self.detection.set_rigid_world(arrays)

@@ -56,20 +56,24 @@ class ContactDetection:
         self._room = 0
 
     def set_rigid_world(self, rigid_arrays: RigidArrays) -> None:
-        """Take over the geoms of the rigid world after an actor came or went."""
+        """Take over the geoms of the rigid world after it was compiled anew."""
         self.rigid_arrays, self._static_bounded = rigid_arrays, False
-        static = rigid_arrays.count - rigid_arrays.movable
-        self._static_blocks = SharedArrays.zeros(structs.Aabbs, -(-static // AABB_BLOCK))
-        self._actor_boxes = SharedArrays.zeros(structs.Aabbs, rigid_arrays.actor_count)
+        self._static_blocks = SharedArrays.zeros(structs.Aabbs, -(-rigid_arrays.static // AABB_BLOCK))
+        self._actor_boxes = SharedArrays.zeros(structs.Aabbs, len(rigid_arrays.actors.is_remote))
         self._allocate_candidates(max(self._room, MIN_TREE_ROOM))
+
+    def update_rigid_geoms(self) -> None:
+        """The same rigid world has listed its geoms anew: the static ones have other numbers."""
+        self._static_bounded = False
 
     def _allocate_candidates(self, trees: int) -> None:
         """Room for the candidates of so many awake trees."""
         self._room, slots = trees, len(self.slots)
-        near = min(self.rigid_arrays.count, self.rigid_arrays.movable + self.parameters.max_static_geoms_per_tree)
+        static = min(self.rigid_arrays.static, self.parameters.max_static_geoms_per_tree)
+        near = self.rigid_arrays.capacity - self.rigid_arrays.static + static
         self.candidates = SharedArrays.zeros(
             structs.Candidates, trees, slots, count=np.zeros(trees, np.int32), is_impact=np.zeros(trees, np.bool_),
-            near_geoms=np.zeros((trees, near), np.int32),
+            near_geoms=np.zeros((trees, near), np.int32), skipped_geoms=np.zeros(trees, np.int32),
         )  # fmt: skip
         self._bind_launches()
 
@@ -172,8 +176,8 @@ class ContactDetection:
         )
         self._find_rigid_contacts = bind_launch(
             narrowphase_rigid.find_rigid_contacts,
-            [parameters, rigid.movable, capsules, geoms, order, trees, tree_boxes, bodies, capsule_states,
-             rigid.bodies.struct, geom_states, self._static_blocks.struct],
+            [parameters, self.parameters.max_static_geoms_per_tree, capsules, geoms, order, trees, tree_boxes, bodies,
+             capsule_states, rigid.bodies.struct, geom_states, self._static_blocks.struct],
             [candidates],
             **by_tree,
         )  # fmt: skip
