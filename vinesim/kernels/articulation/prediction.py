@@ -20,14 +20,14 @@ from vinesim.kernels.articulation.forces import (
     drag_coefficient,
     residual_damping,
     shear_stiffness,
-    spring_moment,
+    spring_torque,
     tension_stiffness,
     tie_force,
 )
 from vinesim.kernels.articulation.kinematics import body_kinematics, max_joint_rate, parent_kinematics
 from vinesim.kernels.articulation.spatial import (
     cross_rows,
-    logarithm,
+    half_rotation,
     point_mass_inertia,
     rotated_diagonal,
     world_inertia,
@@ -270,13 +270,15 @@ def eliminate_joints(
         turning = wp.vec3()
         if parent >= 0:
             turning = wp.spatial_bottom(bodies.body_qd[parent])
-        frame = wp.quat_to_matrix(factors_out.axes[k])
+        half = half_rotation(joints.joint_q[k])
+        frame = wp.quat_to_matrix(factors_out.axes[k] * half)
         stiffness = model.joint_stiffness[k]
         artificial = (2.0 * phi - 1.0) * dt  # [s] the scheme damps as if beta were larger by this
         damping = wp.max(model.joint_damping[k] - artificial * stiffness, wp.vec3())
         metric = rotated_diagonal(frame, phi * dt * (phi * dt * stiffness + damping))
-        rate = joints.joint_qd[k]
-        spring = wp.cw_mul(stiffness, logarithm(joints.joint_q[k]) + phi * dt * rate) + wp.cw_mul(damping, rate)
+        rate = wp.quat_rotate_inv(half, joints.joint_qd[k])
+        torque = spring_torque(stiffness, joints.joint_q[k])
+        spring = torque + wp.cw_mul(phi * dt * stiffness + damping, rate)
         bias = scratch_out.bias[k]
         J = scratch_out.J[k]
         H = scratch_out.H[k]
@@ -286,11 +288,11 @@ def eliminate_joints(
         u = metric * wp.cross(turning, omega) - frame * spring - wp.spatial_bottom(bias)
         if conservative:
             turns = turning + omega
-            u = u - wp.cross(turns, spring_moment(frame, stiffness, joints.joint_q[k], 0.5 * ahead))
+            u = u - 0.5 * ahead * wp.cross(turns, frame * torque)
         D = wp.inverse(J + metric)
         DJ = D * J
         if conservative and parent >= 0:
-            DJ = DJ - cross_rows(D, spring_moment(frame, stiffness, joints.joint_q[k], 0.5 * reach))
+            DJ = DJ - cross_rows(D, 0.5 * reach * (frame * torque))
         DH = D * H
         factors_out.D[k] = D
         factors_out.DJ[k] = DJ
@@ -301,7 +303,7 @@ def eliminate_joints(
             lever = factors_out.lever[k]
             add_to_parent(k, parent, ahead, reach, turning, metric, lever, J, H, M, bias, DJ, DH, Du, scratch_out)
             if conservative:
-                moment = spring_moment(frame, stiffness, joints.joint_q[k], 0.5 * reach)
+                moment = 0.5 * reach * (frame * torque)
                 centripetal = wp.cross(turning, wp.cross(turning, lever))
                 couple_bending_and_twist(k, parent, reach, moment, centripetal, lever, DJ, DH, scratch_out)
         else:
