@@ -41,6 +41,7 @@ from vinesim.kernels.articulation.structs import (
     Prediction,
     Scratch,
     SolverParameters,
+    substep_parameters,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -363,6 +364,7 @@ def predict(
     trees: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
     tree_euler_steps: wp.array(dtype=wp.int32),
+    tree_steps: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     joints: JointState,
     # out
@@ -377,7 +379,8 @@ def predict(
     The articulated-body algorithm (Featherstone 2008, table 7.1) with implicit springs.
 
     trees: [thread] which tree. tree_phi: [tree] phi asked for, 1/2 to 1; tree_phi_out: [tree] phi used, 1 for a tree
-    with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. bodies_out: poses and velocities
+    with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] substeps that the
+    step is divided into; this is one of them. bodies_out: poses and velocities
     at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
     that is needed later.
     """
@@ -387,12 +390,15 @@ def predict(
     factors = contiguous_factors(factors_out)
     scratch = contiguous_scratch(scratch_out)
     tree = trees[wp.tid()]
+    step = substep_parameters(p, tree_steps[tree])
     phi = tree_phi[tree]
     first = trees_model.tree_first[tree]
     fastest = max_joint_rate(state.joint_qd, first, trees_model.tree_moving[tree], trees_model.pitch)
     if fastest > p.fast_rate or tree_euler_steps[tree] > 0:
         phi = 1.0
     tree_phi_out[tree] = phi
-    assemble_bodies(p, trees_model, contiguous_forces(forces), state, tree, phi, bodies, factors, scratch)
-    eliminate_joints(p, trees_model, state, bodies, tree, phi, factors, scratch)
-    accelerate_bodies(p.dt, trees_model, state, bodies, factors, scratch, tree, contiguous_prediction(prediction_out))
+    assemble_bodies(step, trees_model, contiguous_forces(forces), state, tree, phi, bodies, factors, scratch)
+    eliminate_joints(step, trees_model, state, bodies, tree, phi, factors, scratch)
+    accelerate_bodies(
+        step.dt, trees_model, state, bodies, factors, scratch, tree, contiguous_prediction(prediction_out)
+    )

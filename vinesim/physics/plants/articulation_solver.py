@@ -23,11 +23,12 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.errors import checked_index
+from vinesim.kernels.articulation.first_mode import MAX_SUBSTEPS, substeps_for
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
 from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.plants.kernel_launches import KernelLaunches
+from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
 from vinesim.physics.plants.validation import checked_trees, validate
@@ -35,15 +36,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
 
-def kernel_parameters(
-    p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
-) -> dict[str, Any]:
-    """Fields of :class:`vinesim.kernels.articulation.structs.SolverParameters`."""
-    return {
-        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
-        "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
-        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
-    }  # fmt: skip
+_NO_TREES = np.zeros(0, np.int32)
 
 
 class ArticulationSolver:
@@ -69,6 +62,8 @@ class ArticulationSolver:
         fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
+        substeps: divide the step of trees whose first mode is too fast for it, while nothing touches them; off only to
+            compare with solvers of one step.
         buffers: where arrays live, instead of what ``device`` says.
     """
 
@@ -86,6 +81,7 @@ class ArticulationSolver:
         max_rate: float | None = None,
         fault_rate: float | None = None,
         geometric_stiffness: bool = True,
+        substeps: bool = True,
         buffers: DeviceBuffers | None = None,
     ) -> None:
         p = parameters
@@ -114,9 +110,13 @@ class ArticulationSolver:
             weakref.finalize(self, self.thread_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
         self._onset_steps = numbers["contact_steps"] - 1
-        self.launches = KernelLaunches(self, numbers, threads)
+        self.launches = KernelLaunches(self, numbers, threads, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
-        self._runner = StepRunner(buffers, self.launches, model.tree_size, self._stepping, self.thread_pool)
+        self._runner = StepRunner(
+            buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps,
+            tree_steps=self._steps, tree_rate=self.tree_rate, stepping=self._stepping, floating=self._floating,
+            thread_pool=self.thread_pool,
+        )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self._clusters = BerryClusters(self)
@@ -138,6 +138,9 @@ class ArticulationSolver:
         self.tree_rate = np.zeros(trees, np.float32)
         """Fastest joint that the last integration found [tree] rad/s, and m/s of what falls; NaN or above
         ``fault_rate`` for a tree that it stopped."""
+        self.tree_substeps = np.ones(trees, np.int32)
+        """Into how many substeps the step of each tree is divided while nothing touches it [tree]; counted while it is
+        awake."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -165,7 +168,7 @@ class ArticulationSolver:
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
         self._floating, self._roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
-        self._euler_steps = np.zeros(trees, np.int32)
+        self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
         self._last_contact = np.full(trees, -2, np.int64)  # tick of the last contact
         self._loaded_bodies = np.zeros(0, np.int32)
         self._stepping, self._subset = np.zeros(trees, np.int32), np.zeros(trees, np.int32)
@@ -185,7 +188,8 @@ class ArticulationSolver:
         return {
             wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
                        "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
-                       "tree_euler_steps": self._euler_steps, "floating": self._floating},
+                       "tree_euler_steps": self._euler_steps, "tree_steps": self._steps,
+                       "tree_substeps": self.tree_substeps, "floating": self._floating},
             float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
                     "tie_damping": ties.damping, "tree_phi": self.phi, "phi_used": self.phi_used,
                     "tree_rate": self.tree_rate},
@@ -307,8 +311,7 @@ class ArticulationSolver:
     def predict(self) -> None:
         """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts."""
         self._checked = None
-        self._runner.list_trees(self._awake)
-        self.launches.upload_changed()
+        self._list_stepping()
         count = len(self._runner.stepped)
         self.launches.upload_step(count)
         self._runner.predict()
@@ -330,7 +333,7 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, count = self.launches, len(self._runner.stepped)
+        launches, count, touched = self.launches, len(self._runner.stepped), _NO_TREES
         changed = len(self._loaded_bodies) > 0
         self._wrench[self._loaded_bodies] = 0.0
         self._loaded_bodies = np.zeros(0, np.int32)
@@ -347,19 +350,24 @@ class ArticulationSolver:
             self._last_contact[touched] = self.tick
         elif changed:
             launches.upload_wrenches(count)
-        self._runner.integrate(self._list_floating_roots())
+        self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)
         self.buffers.synchronize()
         self.tick += 1
 
-    def _list_floating_roots(self) -> int:
-        """List the floating roots that this step moves; how many there are."""
-        if len(self._roots) == 0:
-            return 0
+    def _list_stepping(self) -> None:
+        """Step the awake trees from now on, as the model is now."""
+        changed = self.launches.changed
+        self.launches.upload_changed()
+        self._runner.list_trees(self._awake, model_changed=changed)
+
+    def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
+        """The floating roots that this step moves: where kernels find them, and their trees."""
         tree = self.model.body_tree[self._roots]
-        roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
-        self._floating[: len(roots)] = self.buffers.slots[roots]
-        return len(roots)
+        if len(tree):
+            moves = self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)
+            return self.buffers.slots[self._roots[moves]], tree[moves]
+        return _NO_TREES, _NO_TREES
 
     def advance(self, steps: int) -> None:
         """Many steps of the awake trees with nothing in between: no contacts, no sleep, no fault guard.
@@ -369,22 +377,21 @@ class ArticulationSolver:
         ``acceleration`` are of the last step; a tree that went wrong stays where it was (``tree_rate`` is NaN or above
         ``fault_rate``).
         """
-        self._runner.list_trees(self._awake)
-        floating = self._list_floating_roots()
+        self._list_stepping()
+        floating = self._floating_roots()
         if len(self._loaded_bodies) and steps > 0:  # the next prediction still knows the last contacts
-            self._runner.advance(1, floating)
+            self._runner.advance(1, *floating)
             self._wrench[self._loaded_bodies] = 0.0
             self._loaded_bodies = np.zeros(0, np.int32)
             self.launches.upload_wrenches(len(self._runner.stepped))
-            self._runner.advance(steps - 1, floating)
+            self._runner.advance(steps - 1, *floating)
         else:
-            self._runner.advance(steps, floating)
+            self._runner.advance(steps, *floating)
         self.tick += steps
 
     def upload(self) -> None:
         """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
-        self._runner.list_trees(self._awake)
-        self.launches.upload_changed()
+        self._list_stepping()
         self.launches.upload_step(len(self._runner.stepped))
         self.buffers.synchronize()
 
@@ -495,6 +502,6 @@ class ArticulationSolver:
         return self.launches.joint_wrench(bodies)
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
-        """Least damping ratio that a spring mode of this frequency [Hz] can show: pi f (2 phi - 1) dt."""
+        """Least damping ratio that a first mode of this frequency [Hz] can show: pi f (2 phi - 1) dt / substeps."""
         phi = float(self.phi.max(initial=0.5)) if phi is None else phi
-        return math.pi * frequency * (2.0 * phi - 1.0) * self.dt
+        return math.pi * frequency * (2.0 * phi - 1.0) * self.dt / substeps_for(frequency, self.dt)

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.articulation import structs
+from vinesim.kernels.articulation import first_mode
 from vinesim.kernels.articulation.floating_components import correct_floating_momentum
 from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.articulation.integration import integrate
@@ -17,6 +18,7 @@ from vinesim.kernels.articulation.joint_wrench import joint_wrench
 from vinesim.kernels.articulation.kinematics import forward_kinematics
 from vinesim.kernels.articulation.prediction import predict
 from vinesim.kernels.launch import bind_launch
+from vinesim.physics.parameters import PhysicsParameters
 
 if TYPE_CHECKING:
     from vinesim.physics.plants.articulation_solver import ArticulationSolver
@@ -41,6 +43,17 @@ SCRATCH = {
 """Rows that only kernels see."""
 
 
+def kernel_parameters(
+    p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
+) -> dict[str, Any]:
+    """Fields of :class:`vinesim.kernels.articulation.structs.SolverParameters`."""
+    return {
+        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
+        "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
+        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
+    }  # fmt: skip
+
+
 class KernelLaunches:
     """Launches of the articulation kernels on the arrays of one solver.
 
@@ -49,9 +62,11 @@ class KernelLaunches:
     :meth:`upload_changed` carries over when :attr:`changed` says so. Everything else a GPU reads where it is.
     """
 
-    def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], threads: int) -> None:
+    def __init__(
+        self, solver: ArticulationSolver, parameters: dict[str, float], threads: int, max_substeps: int
+    ) -> None:
         """``parameters``: numbers of :class:`vinesim.kernels.articulation.structs.SolverParameters` but gravity."""
-        self.buffers, self._threads = solver.buffers, threads
+        self.buffers, self._threads, self._max_substeps = solver.buffers, threads, max_substeps
         self.changed = False
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
         self._seldom: list[str] = []
@@ -131,13 +146,13 @@ class KernelLaunches:
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
         partitioned = {"index_list": "trees", "partitions": self._threads}
         self.predict = record(
-            predict, parameters, self._model, "stepping", "tree_phi", "tree_euler_steps", self._forces, joints,
-            "phi_used",
+            predict, parameters, self._model, "stepping", "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
+            joints, "phi_used",
             self._bodies, self._factors, scratch, prediction, **partitioned,
         )  # fmt: skip
         self.integrate = record(
-            integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", joints, prediction, "tree_rate",
-            "tree_euler_steps", joints, **partitioned,
+            integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
+            "tree_rate", "tree_euler_steps", joints, **partitioned,
         )  # fmt: skip
         self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
         self.apply_wrenches = record(
@@ -145,8 +160,14 @@ class KernelLaunches:
             scratch, prediction,
         )  # fmt: skip
         self.correct_floating_momentum = record(
-            correct_floating_momentum, parameters, self._model, "floating", "phi_used", "tree_rate", self._forces,
-            self._bodies, "body_acceleration", "lever", fill(s.FloatingScratch), joints,
+            correct_floating_momentum, parameters, self._model, "floating", "phi_used", "tree_rate", "tree_steps",
+            self._forces, self._bodies, "body_acceleration", "lever", fill(s.FloatingScratch), joints,
+            index_list="roots",
+        )  # fmt: skip
+
+        self.count_substeps = record(
+            first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
+            self._factors, scratch, fill(s.WrenchScratch), "tree_substeps",
         )  # fmt: skip
 
     def _record_impact(self, parameters: Any) -> None:
@@ -155,8 +176,8 @@ class KernelLaunches:
         joints, scratch = fill(s.JointState), fill(s.Scratch)
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         self.factor_impact = self.record(
-            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", self._forces, joints,
-            "impact_phi",
+            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
+            joints, "impact_phi",
             self._bodies, self._factors, scratch, prediction, index_list="trees",
         )  # fmt: skip
         self.apply_impulses = self.record(
@@ -209,6 +230,6 @@ class KernelLaunches:
         buffers.add_shared("joint_bodies", self._joint_bodies, wp.int32)
         buffers.add_shared("joint_wrench", self._joint_wrench, wrench)
         self._sum_joint_wrenches = self.record(
-            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", self._forces, self._bodies,
+            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", "tree_steps", self._forces, self._bodies,
             "body_acceleration", "joint_wrench",
         )  # fmt: skip
