@@ -40,7 +40,7 @@ def test_a_kicked_tree_swings_then_sleeps_and_the_others_stay_asleep() -> None:
         tick(plants, sleep)
         ticks += 1
         assert ticks < 1000
-    assert ticks > 60  # it swung before
+    assert ticks > 55  # it swung before
     assert not state.joint_qd.any()
     assert not state.tree_awake.any()
     after = [getattr(state, name)[others].tobytes() for name in ("joint_q", "joint_qd", "body_q", "body_qd")]

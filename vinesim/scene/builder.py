@@ -375,8 +375,8 @@ def solve_rest_pose(model: Model) -> Model:
 
     Each spring must carry the weight that hangs below its joint, so its slack axes are turned by the theta at which
     the gradient of theta^T K theta / 2 is the torque, and ``joint_settled`` turns them back: drawn = rest * settled.
-    Writes both fields of the model and returns it. The weight of a bunch with clusters is that of its head and its clusters. :class:`ValueError` if a
-    joint has no stiffness.
+    Writes both fields of the model and returns it. The weight of a bunch with clusters is that of its head and its
+    clusters. :class:`ValueError` if a joint has no stiffness.
     """
     if not (model.joint_stiffness > 0.0).all():
         body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])

@@ -35,7 +35,6 @@ from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
-
 _NO_TREES = np.zeros(0, np.int32)
 
 
@@ -43,10 +42,9 @@ class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
     ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
-    a
-    tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after a contact
-    began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
-    ``predict()`` before them.
+    a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after a
+    contact began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to
+    the ``predict()`` before them.
 
     Args:
         model: constants; :class:`ValueError` in words if a tree cannot be simulated.
@@ -62,8 +60,7 @@ class ArticulationSolver:
         fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
-        substeps: divide the step of trees whose first mode is too fast for it, while nothing touches them; off only to
-            compare with solvers of one step.
+        substeps: divide the step of trees whose first mode is too fast for it; off only to compare with other solvers.
         buffers: where arrays live, instead of what ``device`` says.
     """
 
@@ -139,8 +136,7 @@ class ArticulationSolver:
         """Fastest joint that the last integration found [tree] rad/s, and m/s of what falls; NaN or above
         ``fault_rate`` for a tree that it stopped."""
         self.tree_substeps = np.ones(trees, np.int32)
-        """Into how many substeps the step of each tree is divided while nothing touches it [tree]; counted while it is
-        awake."""
+        """Into how many substeps the step of each awake tree is divided while nothing touches it [tree]."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -312,8 +308,7 @@ class ArticulationSolver:
         """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts."""
         self._checked = None
         self._list_stepping()
-        count = len(self._runner.stepped)
-        self.launches.upload_step(count)
+        self.launches.upload_step(count := len(self._runner.stepped))
         self._runner.predict()
         self.launches.download_prediction(count)
         self.buffers.synchronize()
@@ -336,7 +331,7 @@ class ArticulationSolver:
         launches, count, touched = self.launches, len(self._runner.stepped), _NO_TREES
         changed = len(self._loaded_bodies) > 0
         self._wrench[self._loaded_bodies] = 0.0
-        self._loaded_bodies = np.zeros(0, np.int32)
+        self._loaded_bodies = _NO_TREES
         if bodies is not None and len(bodies):
             self._require_stepped(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
@@ -363,11 +358,11 @@ class ArticulationSolver:
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
+        if len(self._roots) == 0:
+            return _NO_TREES, _NO_TREES
         tree = self.model.body_tree[self._roots]
-        if len(tree):
-            moves = self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)
-            return self.buffers.slots[self._roots[moves]], tree[moves]
-        return _NO_TREES, _NO_TREES
+        moves = self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)
+        return self.buffers.slots[self._roots[moves]], tree[moves]
 
     def advance(self, steps: int) -> None:
         """Many steps of the awake trees with nothing in between: no contacts, no sleep, no fault guard.
@@ -380,10 +375,11 @@ class ArticulationSolver:
         self._list_stepping()
         floating = self._floating_roots()
         if len(self._loaded_bodies) and steps > 0:  # the next prediction still knows the last contacts
-            self._runner.advance(1, *floating)
+            self._runner.predict()
             self._wrench[self._loaded_bodies] = 0.0
-            self._loaded_bodies = np.zeros(0, np.int32)
+            self._loaded_bodies = _NO_TREES
             self.launches.upload_wrenches(len(self._runner.stepped))
+            self._runner.integrate(_NO_TREES, *floating)
             self._runner.advance(steps - 1, *floating)
         else:
             self._runner.advance(steps, *floating)
@@ -402,8 +398,7 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
-        """Use phi = 1 in the next steps of trees about to be touched, for ``contact_onset_duration`` (``integrate()``
-        sees to new contacts)."""
+        """Use phi = 1 in the next steps of trees about to be touched (``integrate()`` sees to new contacts)."""
         self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self._onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
@@ -426,11 +421,9 @@ class ArticulationSolver:
         bodies = self._checked = np.asarray(bodies)
         trees = self.model.body_tree[bodies]
         at = np.searchsorted(self._runner.stepped, trees)
-        if (
-            len(self._runner.stepped) == 0
-            or (self._runner.stepped[np.minimum(at, len(self._runner.stepped) - 1)] != trees).any()
-        ):
-            late = next(i for i, tree in enumerate(trees) if tree not in self._runner.stepped)
+        stepped = self._runner.stepped
+        if len(stepped) == 0 or (stepped[np.minimum(at, len(stepped) - 1)] != trees).any():
+            late = next(i for i, tree in enumerate(trees) if tree not in stepped)
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
         riding = bodies - self.model.tree_first[trees] >= self.tree_moving[trees]
         if riding.any():

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.articulation import structs
-from vinesim.kernels.articulation import first_mode
+from vinesim.kernels.articulation import first_mode, structs
 from vinesim.kernels.articulation.floating_components import correct_floating_momentum
 from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.articulation.integration import integrate
@@ -230,6 +229,6 @@ class KernelLaunches:
         buffers.add_shared("joint_bodies", self._joint_bodies, wp.int32)
         buffers.add_shared("joint_wrench", self._joint_wrench, wrench)
         self._sum_joint_wrenches = self.record(
-            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", "tree_steps", self._forces, self._bodies,
-            "body_acceleration", "joint_wrench",
+            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", "tree_steps", self._forces,
+            self._bodies, "body_acceleration", "joint_wrench",
         )  # fmt: skip

@@ -1,13 +1,14 @@
 """Launches over the awake trees: dealt out to threads on a CPU, captured into a graph on a GPU.
 
-A tree whose first mode is too fast for the step takes substeps instead, of which the rest of the program sees the sum:
-:mod:`vinesim.kernels.articulation.first_mode` says how many. While contacts act on it, it takes the whole step that they
-were solved for.
+A tree whose first mode is too fast for the step takes substeps instead, of which all others see the sum:
+:mod:`vinesim.kernels.articulation.first_mode` says how many. While contacts act on it, it takes the whole step that
+they were solved for.
 """
 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -30,7 +31,7 @@ Levels = tuple[int, ...]
 class StepRunner:
     """Runs predictions and integrations of the listed trees.
 
-    The list that the kernels read has the trees of one step first, then those of substeps, those of most substeps first.
+    The list that the kernels read has the trees of one step first, then the others, those of most substeps first.
 
     Args:
         buffers: of the solver.
@@ -189,9 +190,7 @@ class StepRunner:
         """For each thread where its fast trees begin in the list, and how many take each substep."""
         fast = self._list[self._whole : len(self.stepped)]
         ends = np.arange(self._threads + 1) * len(fast) // self._threads
-        return [
-            (self._whole + int(a), _levels(self._steps_of[fast[a:b]])) for a, b in zip(ends, ends[1:], strict=False)
-        ]
+        return [(self._whole + int(a), _levels(self._steps_of[fast[a:b]])) for a, b in itertools.pairwise(ends)]
 
     def _steps(self, steps: int) -> None:
         for _ in range(steps):
