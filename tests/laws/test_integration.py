@@ -64,7 +64,9 @@ def test_a_twisted_ring_comes_to_rest(ratio: float) -> None:
     assert abs(angle[1] - angle[0]) < 0.1
 
 
-def swinging_canes(lengths: tuple[float, ...], zeta: float) -> tuple[ArticulationSolver, np.ndarray, np.ndarray]:
+def swinging_canes(
+    lengths: tuple[float, ...], zeta: float, *, substeps: bool = True
+) -> tuple[ArticulationSolver, np.ndarray, np.ndarray]:
     """Canes of these lengths [m] released in the shape of their first mode, bent by at most 3 mrad a joint.
 
     The solver, the first frequency [Hz] of each chain by its eigenvalues, and the tips [tick, cane, 3] m of 1.2 s.
@@ -78,7 +80,7 @@ def swinging_canes(lengths: tuple[float, ...], zeta: float) -> tuple[Articulatio
         trees.append(tree)
         frequencies.append(frequency)
         shapes.append(beam_theory.first_shape(tree))
-    plants = beam_theory.standing(trees)
+    plants = beam_theory.standing(trees, substeps=substeps)
     bend = frames.exp(0.003 * np.concatenate(shapes)[:, None] * np.array([0.0, 0.0, 1.0]))
     plants.state.joint_q[:] = frames.multiply(plants.state.joint_q.astype(float), bend)
     swings = beam_theory.run(plants, 120, watch=beam_theory.last_bodies(plants))
@@ -89,22 +91,31 @@ LENGTHS = (0.95, 0.77, 0.65, 0.58, 0.5, 0.45, 0.42)
 """[m] of canes with a first mode of 3.3 to 17 Hz."""
 
 
+def first_modes(zeta: float, *, substeps: bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of canes of :data:`LENGTHS`: substeps; first frequency [Hz] by the chain's eigenvalues, and as measured; damping
+    ratio as measured."""
+    plants, expected, swings = swinging_canes(LENGTHS, zeta, substeps=substeps)
+    fits = []
+    for cane, frequency in enumerate(expected):
+        ticks = int(np.clip(3.0 / zeta / frequency, 40, 120))
+        swing = swings[:ticks, cane, 1] - plants.model.tree_pose[cane, 1]
+        fits.append(beam_theory.fitted_swing(0.01 * np.arange(ticks), swing, frequency))
+    measured, damping = np.array(fits).T
+    return plants.tree_substeps.copy(), expected, measured, damping
+
+
 @pytest.mark.parametrize("zeta", [0.03, 0.06, 0.12])
 def test_first_mode_and_its_damping_at_the_shipped_step(zeta: float) -> None:
     """100 Hz, shipped phi, 3 to 17 Hz: the first mode within 1 %, its damping ratio within 0.005 of what is asked.
 
     With one step a tick 16.6 Hz come out 8 % slow, and a damping ratio of 0.12 as 0.10.
     """
-    plants, expected, swings = swinging_canes(LENGTHS, zeta)
+    substeps, expected, measured, damping = first_modes(zeta)
     assert expected[0] < 4.0 < 16.0 < expected[-1]
-    assert plants.tree_substeps.tolist() == sorted(plants.tree_substeps.tolist())
-    assert plants.tree_substeps[0] == 1  # what swings below 5 Hz costs what it did
-    for cane, frequency in enumerate(expected):
-        ticks = int(np.clip(300.0 * 0.01 / zeta / frequency, 40, 120))
-        swing = swings[:ticks, cane, 1] - plants.model.tree_pose[cane, 1]
-        measured, damping = beam_theory.fitted_swing(0.01 * np.arange(ticks), swing, frequency)
-        assert measured == pytest.approx(frequency, rel=0.01), frequency
-        assert damping == pytest.approx(zeta, abs=0.005), frequency
+    assert substeps[0] == 1  # what swings below 4 Hz costs what it did
+    assert (np.diff(substeps) >= 0).all()
+    np.testing.assert_allclose(measured / expected, 1.0, atol=0.01)
+    np.testing.assert_allclose(damping, zeta, atol=0.005)
 
 
 def test_substeps_are_counted_for_the_chains_first_mode() -> None:
