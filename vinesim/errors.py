@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import operator
+import os
+from collections.abc import Iterator
 from typing import SupportsIndex
 
 
@@ -20,6 +23,18 @@ class WriteError(RuntimeError):
     """
 
     exit_code = 5
+
+
+@contextlib.contextmanager
+def writing(place: str | os.PathLike[str]) -> Iterator[None]:
+    """What is written here goes to ``place``: an :class:`OSError` becomes a :class:`WriteError` that names it."""
+    try:
+        yield
+    except BrokenPipeError:
+        raise  # the reader of a stream is gone, which is no matter of files
+    except OSError as bad:
+        reason = bad.strerror or str(bad)
+        raise WriteError(f"{place} cannot be written: {reason}; make room there or give another place") from None
 
 
 def checked_index(what: str, index: SupportsIndex, count: int, error: type[ValueError] = ValueError) -> int:

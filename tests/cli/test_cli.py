@@ -193,7 +193,7 @@ def test_the_server_reports_actors_and_ends_cleanly(tmp_path):
     ):
         assert line.startswith("listening on tcp/127.0.0.1:")
         assert "udp/127.0.0.1:" in line
-        assert process.stdout.readline().startswith("nobody: 0 links")
+        assert process.stdout.readline().startswith("no actors: 0 links")
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=TIMEOUT) == 0
 

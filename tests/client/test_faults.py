@@ -12,6 +12,7 @@ from vinesim.cli.client_session import status_line
 from vinesim.client.client import Client
 from vinesim.client.faults import DESCRIPTIONS
 from vinesim.client.rate_loop import RateLoop
+from vinesim.client.sensing.robot_processes import loop_status
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -52,6 +53,30 @@ def test_a_tree_that_is_stopped_is_counted_shown_and_logged_once(client, caplog)
     assert [r.getMessage() for r in caplog.records if "trees_stopped" in r.getMessage()] == [
         f"1 {DESCRIPTIONS['trees_stopped']} (further ones are only counted: trees_stopped)"
     ]
+
+
+def test_diagnostics_warn_of_what_occurred_lately_and_always_count_it(client, monkeypatch) -> None:
+    loop = RateLoop(0.01)
+    status, now = Status(client, loop), 1.0
+    monkeypatch.setattr(RateLoop, "elapsed", property(lambda _: now))
+    client.replicator.counters.malformed = 3
+    for now, malformed, trouble in (
+        (1.0, 3, "messages refused"), (60.0, 3, "messages refused"), (61.0, 3, ""), (1000.0, 3, ""),
+        (1001.0, 4, "messages refused"), (1061.0, 4, ""),
+    ):  # fmt: skip
+        client.replicator.counters.malformed = malformed
+        loop.ticks = round(now / loop.dt)  # no step was missed
+        shown = loop_status(status.current())
+        assert (shown.level, shown.message) == ("warning" if trouble else "ok", trouble or "well"), now
+        assert shown.values["messages_refused"] == malformed
+
+
+def test_diagnostics_warn_while_a_loop_is_behind_and_no_longer(client, monkeypatch) -> None:
+    loop = RateLoop(0.01)
+    status, now = Status(client, loop), 1.0
+    monkeypatch.setattr(RateLoop, "elapsed", property(lambda _: now))
+    for now, loop.ticks, message in ((1.0, 100, "well"), (2.0, 150, "behind"), (3.0, 250, "well")):  # noqa: B007
+        assert loop_status(status.current()).message == message
 
 
 def test_what_cannot_be_read_from_another_actor_is_counted(client) -> None:

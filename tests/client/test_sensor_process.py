@@ -22,6 +22,7 @@ from vinesim.client.sensing import worker_process
 from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.sensing.worker_process import WorkerError
 from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.errors import WriteError
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
@@ -117,6 +118,24 @@ def test_a_killed_process_is_started_again(robot, caplog):
     assert [r.message for r in caplog.records] == [
         "the sensor process of robot failed: it ended with exit code -9; starting it again"
     ]
+
+
+def test_pictures_go_on_after_a_process_that_hangs(robot, monkeypatch):
+    robot.run_for_pictures(1)
+    monkeypatch.setattr(worker_process, "HANG_TIMEOUT", 3)
+    os.kill(robot.sensors.worker.current().process.pid, signal.SIGSTOP)
+    robot.run_until(lambda: robot.sensors.report()["sensor_restarts"] >= 1, "a restart")
+    robot.run_for_pictures(3)
+
+
+def test_a_picture_that_finds_no_room_is_one_line_and_the_process_goes_on(robot, tmp_path):
+    robot.run_for_pictures(1)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(WriteError, match="file/out cannot be written: Not a directory; make room there"):
+        robot.sensors.save_picture(tmp_path / "file" / "out")
+    robot.sensors.save_picture(tmp_path / "out")
+    assert (tmp_path / "out" / "rgb.png").exists()
+    assert robot.sensors.report()["sensor_restarts"] == 0
 
 
 def test_repeated_failures_are_logged_twice_and_counted(robot, caplog, monkeypatch):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import concurrent.futures
+import errno
 from collections.abc import Callable
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -14,7 +16,9 @@ from vinesim.client.remote.spawner import RemoteSpawner, resolve_description
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 
@@ -45,7 +49,10 @@ def vinebot() -> RobotDescription:
 
 
 def hello(description: RobotDescription, name: str = "guest", **change) -> Hello:
-    defaults = {"robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7}
+    defaults = {
+        "robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7,
+        "sidecar": encode_sidecar(description.base_limits, description.groups),
+    }  # fmt: skip
     return Hello(name, **{**defaults, **change})
 
 
@@ -66,11 +73,11 @@ def test_no_tick_waits_for_a_robot_that_joins(vinebot):
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
     for tick in range(5):
-        assert spawner.spawn("guest", update_at(vinebot, 0.1 * tick)) is None
+        assert spawner.spawn({"guest": update_at(vinebot, 0.1 * tick)}).get("guest") is None
         physics.step()
     assert physics.rigid.robots == ("host",)
     deferred.work()
-    guest = spawner.spawn("guest", update_at(vinebot, 0.5))
+    guest = spawner.spawn({"guest": update_at(vinebot, 0.5)}).get("guest")
     assert guest is not None
     assert guest.name == "guest"
     assert "guest" not in spawner
@@ -105,14 +112,14 @@ def test_a_world_that_changed_during_compilation_is_compiled_again(vinebot):
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
     update = update_at(vinebot, 0.0)
-    spawner.spawn("guest", update)
+    spawner.spawn({"guest": update}).get("guest")
     deferred.work()
     physics.rigid.add_robot(vinebot.to_spec("other", 2, frames.pose([0.0, -3.0, 0.0])))
-    assert spawner.spawn("guest", update) is None
+    assert spawner.spawn({"guest": update}).get("guest") is None
     assert physics.rigid.robots == ("host", "other")
-    assert spawner.spawn("guest", update) is None
+    assert spawner.spawn({"guest": update}).get("guest") is None
     deferred.work()
-    assert spawner.spawn("guest", update) is not None
+    assert spawner.spawn({"guest": update}).get("guest") is not None
     assert physics.rigid.robots == ("host", "other", "guest")
 
 
@@ -120,7 +127,7 @@ def test_an_actor_that_leaves_before_being_ready_is_not_spawned(vinebot):
     physics, deferred = world(vinebot), DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
-    spawner.spawn("guest", update_at(vinebot, 0.0))
+    spawner.spawn({"guest": update_at(vinebot, 0.0)}).get("guest")
     spawner.cancel("guest")
     deferred.work()
     assert "guest" not in spawner
@@ -139,7 +146,7 @@ def test_a_robot_that_cannot_be_loaded_is_logged_once(vinebot, caplog, change, r
     physics = world(vinebot)
     spawner = RemoteSpawner(physics.rigid, vinebot)
     spawner.enqueue(hello(vinebot, **change))
-    assert spawner.spawn("guest", update_at(vinebot, 0.0)) is None
+    assert spawner.spawn({"guest": update_at(vinebot, 0.0)}).get("guest") is None
     assert "guest" not in spawner
     (record,) = caplog.records
     assert reason in record.getMessage()
@@ -154,3 +161,65 @@ def test_a_robot_name_from_the_network_is_not_a_path(vinebot, tmp_path, monkeypa
     found = resolve_description(hello(vinebot, urdf=text, robot="../escaped"), vinebot)
     assert found.joints == vinebot.joints
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_robot_of_another_client_has_the_gains_that_its_sender_gave_it(vinebot):
+    """The sender's TOML file does not exist here: groups, gains and limits come with the hello."""
+    stiffer = {
+        name: msgspec.structs.replace(group, stiffness=tuple(1234.0 for _ in group.joints))
+        for name, group in vinebot.groups.items()
+    }
+    base = msgspec.structs.replace(vinebot.base_limits, effort=(500.0, 300.0))
+    there = hello(vinebot, sidecar=encode_sidecar(base, stiffer))
+    found = resolve_description(there, vinebot)
+    assert found is not vinebot
+    assert found.base_limits == base
+    assert found.joints == vinebot.joints
+    grouped = {joint for group in stiffer.values() for joint in group.joints}
+    assert {drive.stiffness for drive in found.drives if drive.joint in grouped} == {1234.0}
+    np.testing.assert_allclose(found.home, vinebot.home)
+    assert resolve_description(hello(vinebot), vinebot) is vinebot
+
+
+def with_group(vinebot: RobotDescription, **change) -> str:
+    name, group = next(iter(vinebot.groups.items()))
+    return encode_sidecar(vinebot.base_limits, {name: msgspec.structs.replace(group, **change)})
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        (lambda _: "{", "truncated"),
+        (lambda _: '{"cameras": [], "unknown": 1}', "unknown"),
+        (lambda _: " " * (1 << 17), "B; send at most"),
+        (lambda robot: with_group(robot, joints=("no such joint",), stiffness=None, damping=None, armature=None,
+                                  series_stiffness=None, series_damping=None, home=None), "no drive moves"),
+        (lambda robot: with_group(robot, stiffness=(1e300,) * 9), "stiffness"),
+        (lambda robot: with_group(robot, damping=(-1.0,) * 9), "damping"),
+    ],
+)  # fmt: skip
+def test_a_sidecar_that_no_robot_has_is_refused(vinebot, text, reason):
+    with pytest.raises(DescriptionError, match=reason):
+        resolve_description(hello(vinebot, sidecar=text(vinebot)), vinebot)
+
+
+def test_a_sidecar_from_the_network_names_no_sensor_file(vinebot):
+    """Sensors act where the robot is simulated; a file name in their place is not read."""
+    sidecar = '{"cameras": [{"name": "x", "frame": "base_link", "type": "../../etc/passwd"}], "groups": {}}'
+    found = resolve_description(hello(vinebot, sidecar=sidecar), vinebot)
+    assert all("passwd" not in camera.type for camera in found.cameras)
+
+
+def test_a_full_disk_costs_the_robot_that_joins_and_not_the_tick(vinebot, monkeypatch, caplog):
+    physics = world(vinebot)
+    spawner = RemoteSpawner(physics.rigid, None)
+    spawner.enqueue(hello(vinebot, robot="other", urdf=vinebot.urdf.replace("vinebot", "other")))
+
+    def full(*_: object, **__: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pathlib.Path.write_text", full)
+    assert spawner.spawn({"guest": update_at(vinebot, 2.0)}) == {}
+    assert "guest" not in spawner
+    assert "the robot of guest cannot be shown" in caplog.text
+    physics.step()

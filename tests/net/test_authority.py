@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim.net.replication import authority
-from vinesim.net.replication.authority import NOBODY, SEQUENCE_COUNT, UNTOUCHED, Claim
+from vinesim.net.replication.authority import NO_OWNER, SEQUENCE_COUNT, UNTOUCHED, Claim
 
 sequence = st.integers(0, SEQUENCE_COUNT - 1)
-name = st.sampled_from([NOBODY, "ada", "bob", "cleo"])
+name = st.sampled_from([NO_OWNER, "ada", "bob", "cleo"])
 claims = st.builds(Claim, sequence, sequence, name)
 # claims whose sequence numbers differ by less than half of their range, anywhere in it: also across the wrap
 close = st.builds(
@@ -81,7 +81,7 @@ def test_a_touch_wins_over_the_held_claim_and_a_release_over_the_touch(held, nam
     assert touch == held or authority.wins(touch, held)
     assert authority.wins(authority.claim_by_grab(held, name_), held)
     rest = authority.release(touch)
-    assert rest.owner == NOBODY
+    assert rest.owner == NO_OWNER
     assert authority.wins(rest, touch)
     assert authority.wins(authority.claim_by_touch(rest, "zoe", owner_touches=True), rest)
 
@@ -104,4 +104,4 @@ def test_the_successor_is_the_nearest_then_the_lowest_name():
     assert authority.choose_successor(np.zeros(3), where) == "zoe"
     del where["zoe"]
     assert authority.choose_successor(np.zeros(3), where) == "ada"
-    assert authority.choose_successor(np.zeros(3), {}) == NOBODY
+    assert authority.choose_successor(np.zeros(3), {}) == NO_OWNER

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, assume, given, settings
@@ -11,11 +13,13 @@ from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper,
 from vinesim import frames
 from vinesim.physics.contact.plant_capsules import plant_capsules
 from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.values import HumanSpec
 
 
 def test_spheres_of_a_bunch_fill_its_spheroid():
@@ -261,7 +265,7 @@ def test_a_remote_robot_touches_only_trees_that_its_owner_reports():
     assert len(physics.plants.awake) == 0
     assert np.array_equal(physics.state.joint_q, asleep)
 
-    physics.contact_solver.remote_trees[20] = True
+    physics.contact_solver.trees_touched_by_copies[20] = True
     physics.step()
     assert {tree for tree, _ in physics.touched} == {20}
 
@@ -283,6 +287,46 @@ def test_static_objects_neither_wake_a_tree_nor_keep_it_awake():
         physics.step()
     assert len(physics.plants.awake) == 0
     assert physics.contact_solver.near_trees.tolist() == []
+
+
+@pytest.mark.parametrize(("room", "skipped"), [(256, 0), (2, 2)])
+def test_static_geoms_for_which_there_is_no_room_are_counted(room, skipped):
+    """Five poles pass through the box of one cane: those beyond the room for them and for a bar are left out."""
+    start = np.array([[0.2 * i, 0.0, 0.0] for i in range(1, 6)])
+    model = assemble(
+        [cane((0.0, 0.0, 1.0))], fixed_start=start, fixed_end=start + np.array([0.0, 0.0, 2.0]),
+        fixed_radius=[[0.03, 0.03]] * 5, fixed_organ=[int(Organ.POLE)] * 5, fixed_index=np.arange(5),
+    )  # fmt: skip
+    physics = Physics(model, parameters=PhysicsParameters(max_static_geoms_per_tree=room))
+    physics.add_robot(bar((9.0, 9.0, 0.0)))
+    physics.plants.wake(0)
+    physics.step()
+    assert physics.faults["geoms_skipped"] == skipped
+
+
+def test_kernels_stay_bound_while_hands_close_and_bunches_take_bodies():
+    """What changes is written into the arrays that they are bound to, and gives the same bits as arrays made anew."""
+
+    def run(make_anew: bool) -> bytes:
+        model = assemble([cane((0.0, 0.4 * i, 1.2), bunch=0.5) for i in range(4)])
+        physics = Physics(model, detachment=False)
+        spec = HumanSpec("eva", 1, standing_pose(frames.pose([0.4, 0.1, 0.0])))
+        physics.add_human(spec)
+        physics.step()
+        launches = physics.contact_solver.detection._find_rigid_contacts
+        for tick in range(60):
+            if tick in (5, 25):
+                physics.pick(tick // 10)
+            if tick in (10, 30):
+                physics.move_human("eva", dataclasses.replace(spec.pose, right_closed=tick == 10))
+            if make_anew and physics.contact_solver._generation != physics.rigid.generation:
+                physics.contact_solver._rigid_arrays.world = None
+            physics.step()
+        assert (physics.contact_solver.detection._find_rigid_contacts is launches) != make_anew
+        data = physics.rigid.mj_data
+        return physics.state.joint_q.tobytes() + data.qpos.tobytes() + data.qvel.tobytes()
+
+    assert run(False) == run(True)
 
 
 def test_a_swinging_cane_stops_at_a_pole():

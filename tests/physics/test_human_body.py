@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import mujoco
 import numpy as np
@@ -12,6 +13,7 @@ from tests.physics.test_rigid_world import arm, step, yard
 from tests.support.contact_scenes import probe
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.rigid import static_world
 from vinesim.physics.rigid.human_body import HumanError
 from vinesim.physics.rigid.human_posture import VISUAL_PARTS, body_posture, standing_pose
 from vinesim.physics.rigid.human_shapes import BODY_PARTS, HAND_HALF_THICKNESS
@@ -599,3 +601,27 @@ def test_errors_are_one_line():
     with pytest.raises(HumanError, match="has no 'third' hand"):
         rigid.hand_sample("eva", "third")
     assert rigid.humans == ("eva",)
+
+
+def test_more_than_twenty_five_actors_touch_each_other_and_never_themselves():
+    """40 actors in a row, each overlapping the next: exactly these pairs touch, in every combination of kinds."""
+    rigid = RigidWorld(yard())
+    names = [f"{'robot' if i % 4 < 2 else 'human'}{i}" for i in range(40)]
+    for i, name in enumerate(names):
+        x = 10.0 + 0.25 * i
+        if name.startswith("robot"):
+            rigid.add_robot(arm(name, x=x))
+        else:
+            rigid.add_human(eva(x, name=name), is_remote=i % 8 == 3)
+    rigid.predict()
+    pairs = {tuple(sorted((a, b))) for a, b, _ in rigid.penetrations()}
+    assert all(a != b for a, b in pairs)
+    assert {tuple(sorted(pair)) for pair in itertools.pairwise(names)} <= pairs
+
+
+def test_codes_of_actors_tell_each_from_all_others():
+    codes = (*static_world.ROBOT_CODES, *static_world.HUMAN_CODES)
+    assert len(set(codes)) == len(codes) >= 64
+    a, b = np.array(codes)[:, None], np.array(codes)[None, :]
+    touches = (a & ~b & static_world.ALL_BITS) != 0
+    assert (touches == ~np.eye(len(codes), dtype=bool)).all()

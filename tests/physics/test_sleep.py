@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from vinesim import frames
@@ -21,10 +23,10 @@ def row(count: int) -> ArticulationSolver:
     return ArticulationSolver(model, State.at_rest(model))
 
 
-def tick(plants: ArticulationSolver, sleep: SleepMonitor, busy: np.ndarray | None = None) -> np.ndarray:
+def tick(plants: ArticulationSolver, sleep: SleepMonitor, *keep_awake: Any) -> np.ndarray:
     plants.predict()
     plants.integrate()
-    return sleep.update(busy)
+    return sleep.update(*keep_awake)
 
 
 def test_a_kicked_tree_swings_then_sleeps_and_the_others_stay_asleep() -> None:
@@ -52,11 +54,11 @@ def test_a_kicked_tree_swings_then_sleeps_and_the_others_stay_asleep() -> None:
 
 def test_a_tree_at_rest_sleeps_after_the_sleep_duration() -> None:
     plants = row(2)
-    sleep = SleepMonitor(plants, PhysicsParameters(sleep_duration=0.07))
+    sleep = SleepMonitor(plants, PhysicsParameters(sleep_duration=0.1))
     sleep.wake(np.array([0, 1]))
     drawn = plants.state.body_q.copy()
-    slept = [tick(plants, sleep).tolist() for _ in range(7)]
-    assert slept == [[]] * 6 + [[0, 1]]
+    slept = [tick(plants, sleep).tolist() for _ in range(10)]
+    assert slept == [[]] * 9 + [[0, 1]]
     np.testing.assert_allclose(plants.state.body_q, drawn, atol=1e-5)
 
 
@@ -65,5 +67,53 @@ def test_busy_trees_stay_awake() -> None:
     sleep = SleepMonitor(plants, PhysicsParameters(sleep_duration=0.05))
     sleep.wake(np.array([0, 2]))
     for _ in range(20):
-        tick(plants, sleep, busy=np.array([2]))
+        tick(plants, sleep, np.array([False, True, True]))
     assert plants.awake.tolist() == [2]
+    assert sleep.restless.tolist() == []
+
+
+def test_trees_in_contact_sleep_together() -> None:
+    """1 touches 0 and 2, 3 touches none: while 2 moves, 0 and 1 stay awake, however quiet."""
+    plants = row(4)
+    sleep = SleepMonitor(plants, PhysicsParameters(sleep_duration=0.05))
+    sleep.wake(np.arange(4))
+    pairs = np.array([[0, 1], [2, 1]])
+    for _ in range(20):
+        plants.state.joint_qd[plants.model.bodies_of(2), 1] += 0.2
+        tick(plants, sleep, None, pairs)
+    assert plants.awake.tolist() == [0, 1, 2]
+    assert sleep.restless.tolist() == [2]
+    ticks = 0
+    while len(plants.awake):
+        slept = tick(plants, sleep, None, pairs).tolist()
+        ticks += 1
+        assert ticks < 2000
+    assert slept == [0, 1, 2]
+
+
+def test_a_tree_is_moved_to_rest_but_not_while_a_contact_bears_it() -> None:
+    """Equilibrium is where the net moment of every joint is zero: a step from there moves nothing."""
+    plants = row(2)
+    sleep = SleepMonitor(plants)
+    for pressed in (False, True):
+        sleep.wake(0)
+        plants.body_load[5, 2] = 0.05 if pressed else -0.05
+        slept = []
+        for _ in range(3000):
+            plants.predict()
+            plants.integrate(*((np.array([4]), np.array([[0, 0, 0.01, 0, 0, 0]])) if pressed else ()))
+            slept = sleep.update()
+            if len(slept):
+                break
+        assert slept.tolist() == [0]
+        assert not plants.state.joint_qd.any()
+        sleep.wake(0)
+        before = plants.state.body_q[:6, :3].copy()
+        for _ in range(40):
+            plants.predict()
+            plants.integrate(*((np.array([4]), np.array([[0, 0, 0.01, 0, 0, 0]])) if pressed else ()))
+        plants.forward_kinematics()
+        np.testing.assert_allclose(plants.state.body_q[:6, :3], before, atol=3e-5 if pressed else 2e-6)
+        while not len(sleep.update()):
+            plants.predict()
+            plants.integrate()

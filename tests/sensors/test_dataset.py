@@ -107,6 +107,33 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
     assert _files(out) == _files(whole)
 
 
+@pytest.mark.slow
+def test_a_killed_worker_is_one_line_and_the_same_command_goes_on(
+    scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    out = tmp_path / "set"
+    with subprocess.Popen(
+        _command(scene, out, 1), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as run:
+        _until(lambda: _records(out))
+        (worker,) = _spawned_by(run.pid)
+        os.kill(worker, signal.SIGKILL)
+        errors = run.communicate(timeout=120)[1]
+    assert run.returncode == 5
+    assert [line for line in errors.splitlines() if line.strip()] == [
+        "vinesim: a worker was killed by SIGKILL; what is done is kept, the same command goes on"
+    ]
+    last = subprocess.run(_command(scene, out, 1), capture_output=True, text=True, timeout=120)
+    assert last.returncode == 0, last.stderr
+    assert _files(out) == _files(whole)
+
+
+def _spawned_by(parent: int) -> list[int]:
+    """Workers of a process; multiprocessing's resource tracker is none."""
+    children = pathlib.Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return [int(pid) for pid in children if b"spawn_main" in pathlib.Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
 def test_pycocotools_reads_it(whole: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     read = COCO(str(whole / "annotations.json"))
     capsys.readouterr()

@@ -20,6 +20,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.bench.support.fake_client import FakeClient, swinging_state, tree_row
 from vinesim.net.codec import messages
+from vinesim.net.codec.couplings import MAX_COUPLINGS, CouplingMessage, encode_couplings
 from vinesim.net.codec.human import encode_pose
 from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
@@ -29,7 +30,7 @@ from vinesim.net.replication.streams import object_counts
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
-from vinesim.scene.values import Measurement
+from vinesim.scene.values import Coupling, Measurement
 
 ATTACKER = "evil"
 MESSAGE_COUNT = 100_000
@@ -48,6 +49,8 @@ def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Ra
     claim = Claim(chance.randrange(3), chance.randrange(1 << 16), actor.name)
     if kind == "a":
         return kind, encode_pose(actor.pose(now))
+    if kind == "force" and chance.random() < 0.5:
+        return kind, _couplings_message(model, now, chance)
     if kind == "force":
         links = chance.sample(
             ("base_link", "arm_left_1_link", "arm_left_7_link", "no such link", ""), chance.randint(0, 3)
@@ -96,6 +99,20 @@ def _trees_message(model: Model, tree: int, claim: Claim, now: float, chance: ra
         root_xd=np.array([[chance.uniform(-30.0, 30.0) for _ in range(3)] for _ in range(count)]).reshape(-1, 3),
     )  # fmt: skip
     return messages.encode_trees(states)[0][0]
+
+
+def _couplings_message(model: Model, now: float, chance: random.Random) -> bytes:
+    """Springs on any bodies, wood, bunches, clusters, now and then one that there is not."""
+    bodies = sorted(chance.sample(range(len(model.body_tree) + 1), chance.randint(0, MAX_COUPLINGS)))
+    return encode_couplings(
+        CouplingMessage(
+            now,
+            tuple(
+                Coupling(body, *(np.array([chance.uniform(-3.0, 3.0) for _ in range(3)]) for _ in range(2)))
+                for body in bodies
+            ),
+        )
+    )
 
 
 def _record(model: Model, claim: Claim, now: float, chance: random.Random) -> RetainedRecord:
@@ -257,7 +274,7 @@ def fuzz() -> Iterator[Measurement]:
     counters, spent, arrived = result.clients[0].replicator.counters, result.step_times, result.arrived
     for case, value, unit in (
         ("broken messages sent", MESSAGE_COUNT, ""),
-        ("arrived where somebody listens, newest poses only", arrived, ""),
+        ("arrived at a subscriber, newest poses only", arrived, ""),
         ("counted as malformed", counters.malformed, ""),
         ("counted as sound and of no use", counters.dropped, ""),
         ("a tick with 50 of them, p50", 1e3 * np.percentile(spent, 50), "ms"),

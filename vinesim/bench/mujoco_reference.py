@@ -14,7 +14,7 @@ from vinesim.physics.contact.plant_capsules import plant_capsules
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.robot_body import RobotBody
-from vinesim.physics.rigid.static_world import FIRST_ACTOR, FIXED, build_static_world, contact_friction
+from vinesim.physics.rigid.static_world import FIXED, ROBOT_CODES, build_static_world, contact_friction
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -77,8 +77,8 @@ class MujocoScene:
         spec = build_static_world(model, mine.parameters)
         spec.memory = 1 << 29
         spec.option.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
-        for bit, robot in enumerate(robots, FIRST_ACTOR):
-            RobotBody(robot, bit, mine.parameters).add_to(spec)
+        for code, robot in zip(ROBOT_CODES, robots, strict=False):
+            RobotBody(robot, code, mine.parameters).add_to(spec)
         made = _add_plants(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
         shapes = plant_capsules(model)
         for body, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):

@@ -112,7 +112,7 @@ class Pair:
         return reach
 
     def enable_naive_authority(self) -> None:
-        """For comparison: whoever touches the tree takes it from its owner, again and again."""
+        """For comparison: each touch takes the tree from its owner, again and again."""
         for client in self.clients:
             rule = functools.partial(_grab, client, client.replicator.send)
             client.replicator.send = rule  # pyright: ignore[reportAttributeAccessIssue] a bench replaces the method
@@ -310,7 +310,8 @@ def extrapolation(rows: RunRows, ahead: float) -> tuple[tuple[float, float], tup
     shift = round(ahead / DT)
     tree = rows.tree[:, 0]
     later = tree[shift:]
-    told = dead_reckoning.extrapolate(tree, dead_reckoning.quaternion_rate(tree, rows.rate), ahead)[:-shift]
+    rate = dead_reckoning.quaternion_rate(tree, rows.rate)
+    told = dead_reckoning.extrapolate(tree, rate, dead_reckoning.faded_age(ahead))[:-shift]
     errors = [dead_reckoning.angle_between(later, guess).max(-1) for guess in (told, tree[:-shift])]
     moves = np.abs(rows.rate).max((1, 2))[:-shift] > 0.02
     own, speed = rows.joints[:, 0], rows.speed

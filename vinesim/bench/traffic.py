@@ -5,7 +5,7 @@ Ten robots and five people work on a block of about ten thousand bunches. Each t
 without, all of which swing. The replicators are real, the network is the bus in memory with the delay of a LAN, and
 what moves is scripted: no physics is needed to count bytes.
 
-The broadcast is the cost of sending everything to everybody: the pose of every actor and a rigid record of 26 B for
+The broadcast is the cost of sending everything to all: the pose of every actor and a rigid record of 26 B for
 every bunch, at 60 Hz.
 """
 
@@ -72,7 +72,7 @@ def place_actors(hub: MemoryHub, model: Model, where: np.ndarray) -> list[FakeCl
 
 
 def broadcast(model: Model, fake_clients: list[FakeClient]) -> float:
-    """Bytes a second that a client receives if everything is sent to everybody at 60 Hz."""
+    """Bytes a second that a client receives if everything is sent to all at 60 Hz."""
     poses = sum(len(encode_pose(fake_client.pose(0.0))) for fake_client in fake_clients[1:])
     return HZ * (poses + RIGID * len(model.bunch_body))
 

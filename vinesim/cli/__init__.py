@@ -20,6 +20,7 @@ from typing import Annotated
 
 import typer
 
+from vinesim import allocator
 from vinesim.cli.commands.client import client
 from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, render, scene_show
@@ -69,6 +70,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # MuJoCo draws nothing here, and looking for a window system takes 0.1 s.
     os.environ.setdefault("MUJOCO_GL", "disable")
+    allocator.keep_large_blocks_apart()
     # A shell lets processes in the background ignore SIGINT; a sender means it to end them, and so with SIGTERM.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)

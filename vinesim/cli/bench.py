@@ -8,6 +8,7 @@ import pathlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
+from vinesim.errors import UsageError
 from vinesim.scene.values import Measurement
 
 
@@ -85,6 +86,12 @@ def _load() -> Iterator[Measurement]:
     return load()
 
 
+def _actors() -> Iterator[Measurement]:
+    from vinesim.bench.many_actors import actors
+
+    return actors()
+
+
 def _fuzz() -> Iterator[Measurement]:
     from vinesim.bench.message_fuzz import fuzz
 
@@ -102,7 +109,27 @@ def _live(rows: Sequence[str] = ()) -> Iterator[Measurement]:
 
     if unknown := sorted(set(rows) - ROWS.keys()):
         raise NoSuchBench(f"bench live has no row {unknown[0]!r}; there are: {', '.join(ROWS)}")
-    return live(rows, lambda line: print(line, file=sys.stderr, flush=True))
+    return live(rows, _announce)
+
+
+def _kill(times: int = 50, seed: int = 1) -> Iterator[Measurement]:
+    from vinesim.bench.kill import kill
+
+    if times < 1:
+        raise UsageError(f"--times is {times}: give 1 or more")
+    if seed < 0:
+        raise UsageError(f"--seed is {seed}: give 0 or more")
+    return kill(times, seed, _announce)
+
+
+def _announce(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _soak(minutes: float | None = None) -> Iterator[Measurement]:
+    from vinesim.bench.soak import MINUTES, soak
+
+    return soak(MINUTES if minutes is None else minutes, _announce)
 
 
 RAISED = {
@@ -125,7 +152,10 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "link": _link,
     "traffic": _traffic,
     "load": _load,
+    "actors": _actors,
     "fuzz": _fuzz,
+    "kill": _kill,
+    "soak": _soak,
 }
 
 
@@ -133,11 +163,17 @@ class NoSuchBench(ValueError):
     """There is no benchmark of that name; the text lists all."""
 
 
-def _measurements(name: str, plot: pathlib.Path | None, rows: Sequence[str]) -> Iterator[Measurement]:
+def _measurements(
+    name: str, plot: pathlib.Path | None, rows: Sequence[str], minutes: float | None, times: int, seed: int
+) -> Iterator[Measurement]:
     drawn = {"sync": _sync, "sensors": _sensors}.get(name)
     try:
         if name == "live":
             yield from _live(rows)
+        elif name == "soak":
+            yield from _soak(minutes)
+        elif name == "kill":
+            yield from _kill(times, seed)
         else:
             yield from drawn(plot) if drawn else BENCHES[name]()
     except ModuleNotFoundError as missing:
@@ -148,18 +184,24 @@ def _measurements(name: str, plot: pathlib.Path | None, rows: Sequence[str]) -> 
         ) from None
 
 
-def run(names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = ()) -> int:
+def run(
+    names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = (),
+    minutes: float | None = None, times: int = 50, seed: int = 1,
+) -> int:  # fmt: skip
     """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
-    ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none.
+    ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none;
+    ``minutes`` of soak; ``times`` and ``seed`` of kill.
     """
     if rows and "live" not in names:
         raise NoSuchBench("--row chooses rows of the bench live; leave it out")
+    if minutes is not None and "soak" not in names:
+        raise NoSuchBench("--minutes is how long the bench soak runs; leave it out")
     for name in names:
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in _measurements(name, plot, rows):
+        for m in _measurements(name, plot, rows, minutes, times, seed):
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

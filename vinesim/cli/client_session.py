@@ -14,12 +14,14 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
 
+from vinesim import allocator
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
+from vinesim.errors import writing
 from vinesim.kernels.compilation import compile_kernels
 from vinesim.net.transport.bus import Bus
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -34,7 +36,7 @@ SWITCH_INTERVAL = 2e-4
 STATUS_PERIOD = 1.0
 """Wall time between two status lines [s]."""
 FIRST_STATUS = 0.1
-"""Wall time from the first step to the first status line [s]: whoever waits for a client learns that it runs."""
+"""Wall time from the first step to the first status line [s]: shows early that the client runs."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -127,7 +129,8 @@ class ClientSession:
                 raise
             raise DeviceLost(f"{device} failed after {client.physics.time:.1f} s: {fault}") from failure
         if self.options.tick_log is not None:
-            loop.log().save(self.options.tick_log)
+            with writing(self.options.tick_log):
+                loop.log().save(self.options.tick_log)
         return status
 
 
@@ -142,7 +145,7 @@ def run_loop(
     is_done: Callable[[], bool] = lambda: False,
 ) -> None:  # fmt: skip
     """Step in real time until ``stop`` (set by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until done."""
-    gc.collect()
+    allocator.release_free_memory()
     gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
     gc.enable()
     # until here Ctrl-C simply interrupts; from now on it ends the run in order
@@ -157,9 +160,10 @@ def run_loop(
 
 def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
     """Write ``report.json``, whole or not at all."""
-    partial = out / "report.json.part"
-    partial.write_text(json.dumps(report, indent=2) + "\n")
-    partial.replace(out / "report.json")
+    with writing(out / "report.json"):
+        partial = out / "report.json.part"
+        partial.write_text(json.dumps(report, indent=2) + "\n")
+        partial.replace(out / "report.json")
 
 
 def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form: str, stop: threading.Event) -> None:
@@ -185,6 +189,6 @@ def status_line(values: dict[str, Any]) -> str:
         f"{values['time']:7.1f} s  {values['tick_hz']:6.2f} Hz  p99 {values['tick_p99_ms']:5.2f} ms  "
         f"awake {values['awake']:3d}  force {values['force']:6.2f} N  "
         f"dropped {values['frames_dropped']} frames {values['messages_dropped']} messages  "
-        f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'nobody'}"
+        f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'no others'}"
         f"{'  FAULTS: ' if faults else ''}{faults}"
     )

@@ -25,6 +25,13 @@ from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.export.files import remove_partial_files
 from vinesim.sensors.raster import renderer_selection
 
+
+class WorkerDied(RuntimeError):
+    """A worker was killed or crashed before its images were written; the text says what to do."""
+
+    exit_code = 5
+
+
 Worker = tuple[BaseProcess, Any]
 """A process and the end of the pipe on which it reports."""
 
@@ -130,13 +137,17 @@ def _wait_for(workers: list[Worker], advance: Callable[[], None]) -> None:
                 process = working.pop(pipe)
                 process.join()
                 if process.exitcode:
-                    raise DatasetError(
-                        f"a worker ended with code {process.exitcode}; what is done is kept, the same command goes on"
+                    raise WorkerDied(
+                        f"a worker {_how_it_ended(process.exitcode)}; what is done is kept, the same command goes on"
                     ) from None
                 continue
             if isinstance(message, Exception):
                 raise message
             advance()
+
+
+def _how_it_ended(code: int) -> str:
+    return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
 
 
 def _stop_workers(workers: list[Worker], out: pathlib.Path) -> None:

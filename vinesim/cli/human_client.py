@@ -11,6 +11,7 @@ from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch
+from vinesim.errors import writing
 
 REACH = 0.55
 """Horizontal distance from a bunch at which a human stands to take hold of it [m]. GUESSED."""
@@ -20,6 +21,9 @@ def run(options: ClientOptions) -> int:
     """Walk, reach for a bunch, hold it, pull at it, let go, until a signal; then write report.json; the exit code."""
     with ClientSession(options) as session:
         validate_bunch(session.model, options.reach)
+        if options.out is not None:
+            with writing(options.out):
+                options.out.mkdir(parents=True, exist_ok=True)
         start = start_pose(session.scene, session.spawn)
         human = ScriptedHuman(start, options.height)
         client = Client(
@@ -36,10 +40,10 @@ def run(options: ClientOptions) -> int:
             human.do(pull_repeatedly(human, trace.centre))
         status = session.run(client)
         if options.out is not None:
-            options.out.mkdir(parents=True, exist_ok=True)
-            if client.trace is not None:
-                client.trace.rows().save(options.out / "trace.npz")
             save_report(options.out, status.report())
+            if client.trace is not None:
+                with writing(options.out / "trace.npz"):
+                    client.trace.rows().save(options.out / "trace.npz")
     return 0
 
 

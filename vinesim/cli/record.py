@@ -90,7 +90,7 @@ def _progress(recorder: Recorder, elapsed: float, alone: bool) -> None:
     if not sys.stderr.isatty():
         return
     trouble = recorder.bus.status_message
-    company = ", ".join(sorted(recorder.actors)) or "nobody"
+    company = ", ".join(sorted(recorder.actors)) or "no actors"
     hint = "  (with fewer than two actors nothing is sent; --area asks for it)" if alone else ""
     line = f"{elapsed:7.1f} s  {recorder.recording.count} messages  {recorder.recording.size / 1e6:.2f} MB  {company}"
     width = os.get_terminal_size(sys.stderr.fileno()).columns - 1

@@ -12,7 +12,7 @@ import time
 
 import numpy as np
 
-from vinesim.errors import UsageError
+from vinesim.errors import UsageError, writing
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.keys import sender_of
@@ -43,7 +43,7 @@ def run(
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    who = ", ".join(tape.actors) or "nobody"
+    who = ", ".join(tape.actors) or "no actors"
     print(f"{file}: {len(tape.messages)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
     if out is not None:
         return _look(tape, stop, out, pose, scene, seed, speed, start, end)
@@ -107,7 +107,8 @@ def _look(
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
     eyes = standing_view(*pose) if pose is not None else follow_view(_first_pose(tape))
-    out.mkdir(parents=True, exist_ok=True)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
     bus = ReplayBus(tape, "spectator", start=start, end=end)
     spectator = Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time)
     pictures = PictureWriter(spectator, out, 1.0)
@@ -132,4 +133,4 @@ def _first_pose(tape: Recording) -> np.ndarray:
         for entry in tape.messages:
             if entry.key.startswith("a/") and sender_of(entry.key) in such:
                 return decode_pose(entry.payload, "").base_q
-    raise UsageError(f"{tape.path} has no pose of anybody to look at: give --pose X Y YAW")
+    raise UsageError(f"{tape.path} has no pose of an actor to look from: give --pose X Y YAW")

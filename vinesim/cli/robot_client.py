@@ -13,6 +13,7 @@ from vinesim.client.sensing.robot_processes import RobotProcesses
 from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.client.tasks.task_registry import plan_task, validate_task_name
+from vinesim.errors import writing
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.push import PushBunch
@@ -33,7 +34,8 @@ def run(options: ClientOptions) -> int:
         for bunch in (options.push, options.watch):
             validate_bunch(session.model, bunch)
         if options.out is not None:
-            options.out.mkdir(parents=True, exist_ok=True)
+            with writing(options.out):
+                options.out.mkdir(parents=True, exist_ok=True)
         names = [session.name]
         if len(descriptions) > 1:
             names = [f"{session.name}_{i + 1}" for i in range(len(descriptions))]
@@ -51,10 +53,11 @@ def run(options: ClientOptions) -> int:
             report = status.report() | sensors[0].report()
             if task is not None:
                 report["job"] = task.report()
+            save_report(options.out, report)
             sensors[0].save_picture(options.out)
             if client.trace is not None:
-                client.trace.rows().save(options.out / "trace.npz")
-            save_report(options.out, report)
+                with writing(options.out / "trace.npz"):
+                    client.trace.rows().save(options.out / "trace.npz")
     return 0
 
 
@@ -82,7 +85,11 @@ def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
         key: sum(status[key] for status in statuses)
         for key in ("frames_dropped", "messages_dropped", "sensor_restarts", "ros_restarts")
     }
-    return {"sensors_ready": not awaited, "sensors_awaited": awaited, **counts}
+    return {
+        "sensors_ready": not awaited, "sensors_awaited": awaited, **counts,
+        "sensor_restart_s": max(status["sensor_restart_s"] for status in statuses),
+        "processes": {what: pid for status in statuses for what, pid in status["processes"].items()},
+    }  # fmt: skip
 
 
 def _build_client(

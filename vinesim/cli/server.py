@@ -46,7 +46,7 @@ def run(
             while not stop.wait(STATUS_PERIOD if status != "none" else None):
                 figures = server.figures()
                 print(json.dumps(figures) if status == "json" else _line(figures), flush=True)
-        except BrokenPipeError:  # whoever listened is gone: that ends the run, not the log
+        except BrokenPipeError:  # the reader is gone: that ends the run, not the log
             pass
     return 0
 
@@ -60,7 +60,7 @@ def _plan(scene: str, seed: int | None) -> SceneId:
 
 
 def _line(figures: dict[str, Any]) -> str:
-    company = ", ".join(figures["actors"]) or "nobody"
+    company = ", ".join(figures["actors"]) or "no actors"
     counts = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in figures.items() if isinstance(value, int))
     trouble = f"; {figures['trouble']}" if figures.get("trouble") else ""
     return f"{company}: {counts}{trouble}"

@@ -8,6 +8,7 @@ from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession
 from vinesim.client.spectator import PictureWriter, Spectator, standing_view
 from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.errors import writing
 
 
 def run(options: ClientOptions) -> int:
@@ -18,7 +19,8 @@ def run(options: ClientOptions) -> int:
             start = spawn_pose(session.scene, session.spawn)
             pose = float(start[0]), float(start[1]), 2.0 * float(np.arctan2(start[5], start[6]))
         if options.out is not None:
-            options.out.mkdir(parents=True, exist_ok=True)
+            with writing(options.out):
+                options.out.mkdir(parents=True, exist_ok=True)
         spectator = Spectator(
             session.scene, session.model, None, session.bus(session.name), pose=standing_view(*pose),
             **session.client_options(),

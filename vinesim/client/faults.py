@@ -14,7 +14,9 @@ DESCRIPTIONS = {
     "trees_slowed": "trees turned faster than max_joint_rate and were slowed below it, which takes energy from them",
     "robots_stopped": "robots or boxes moved by a number that is not finite and were put back",
     "contacts_dropped": "contacts were left out, as there were more than there is room for",
+    "geoms_skipped": "poles or trunks near a tree were left out, as there are more than max_static_geoms_per_tree",
     "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",
+    "couplings_refused": "forces of other actors on plants were refused, as too many bodies of plants were held",
     "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",
     "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
     "deadlines_dropped": "steps were skipped after the process had stood still",
@@ -26,6 +28,7 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
     """How often each fault of :data:`DESCRIPTIONS` occurred; faults that did not are left out."""
     counters = [replicator.counters for replicator in client.replicators.values()]
     counts = client.physics.faults | {
+        "couplings_refused": client.couplings.refused,
         "messages_refused": sum(one.malformed for one in counters),
         "wrenches_refused": sum(one.wrenches_refused for one in counters),
         "deadlines_dropped": deadlines_dropped,
@@ -33,14 +36,24 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
     return {name: count for name, count in counts.items() if count}
 
 
+RECENT_TIME = 60.0
+"""A fault is recent for this long after its last occurrence [s]."""
+
+
 class FaultLog:
-    """Logs the first fault of each kind; later ones are only counted."""
+    """Logs the first fault of each kind, later ones are only counted; knows which kinds occurred lately."""
 
     def __init__(self) -> None:
-        self._known: set[str] = set()
+        self._counts: dict[str, int] = {}
+        self._risen: dict[str, float] = {}
+        """Time at which each count was last seen to have risen [s]."""
 
-    def update(self, counts: Mapping[str, int]) -> None:
-        """Log what is new in ``counts``. Call it outside the step."""
-        for name in counts.keys() - self._known:
-            self._known.add(name)
-            log.warning("%d %s (further ones are only counted: %s)", counts[name], DESCRIPTIONS[name], name)
+    def update(self, counts: Mapping[str, int], time: float) -> list[str]:
+        """Log what is new in ``counts`` at ``time`` [s]; the kinds that are recent. Call it outside the step."""
+        for name, count in counts.items():
+            if name not in self._counts:
+                log.warning("%d %s (further ones are only counted: %s)", count, DESCRIPTIONS[name], name)
+            if count > self._counts.get(name, 0):
+                self._risen[name] = time
+        self._counts = dict(counts)
+        return [name for name, risen in self._risen.items() if time - risen < RECENT_TIME]

@@ -64,8 +64,9 @@ class RateLoop:
         """Steps whose work took longer than ``dt``."""
         self.dropped = 0
         """Deadlines dropped after a stall."""
-        self._work = np.zeros(capacity, np.float32)
-        self._begins = np.zeros(capacity)
+        # filled, not np.zeros: their pages are there from the start, and the memory of a run does not grow
+        self._work = np.full(capacity, 0.0, np.float32)
+        self._begins = np.full(capacity, 0.0)
         self._began = self._start = self._deadline = 0.0
 
     def begin(self) -> None:

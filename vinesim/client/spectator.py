@@ -9,6 +9,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.client import Client, label_index
+from vinesim.errors import writing
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.replication_state import SPECTATOR
 from vinesim.net.replication.replicator import Replicator
@@ -120,10 +121,12 @@ class PictureWriter:
         eye = images.look_at(spectator.pose[:3], spectator.pose[:3] + ahead)
         self.last = self._camera.render(self._primitives, eye, view.time)
         self.count += 1
-        images.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
+        with writing(self.folder):
+            images.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
 
     def save(self, spectator: Spectator) -> None:
         """Render what is seen now: ``rgb``, ``depth``, ``depth_mm`` and ``labels`` PNGs."""
         self._draw(spectator)
         assert self.last is not None
-        images.save_frame(self.last, self.folder, "")
+        with writing(self.folder):
+            images.save_frame(self.last, self.folder, "")

@@ -15,7 +15,7 @@ from vinesim.robot.tasks.task import Task
 
 _WITHOUT_SENSORS = {
     "sensors_ready": True, "sensors_awaited": [], "frames_dropped": 0, "messages_dropped": 0, "sensor_restarts": 0,
-    "ros_restarts": 0,
+    "ros_restarts": 0, "sensor_restart_s": 0.0, "processes": {},
 }  # fmt: skip
 """Status of sensors of a client that has none."""
 
@@ -39,19 +39,24 @@ class Status:
         self._sent: Callable[[], dict[str, int]] = sent or dict
         self._before: dict[str, int] = {}
         self._before_time = 0.0
+        self._before_ticks = 0
 
     def current(self) -> dict[str, Any]:
-        """The present values, for JSON; rates of topics are since the last call."""
+        """The present values, for JSON; rates of topics and recent values are since the last call.
+
+        Recent faults are the kinds that occurred within the last minute.
+        """
         client, loop = self.client, self.rate_loop
         sent, time = dict(self._sent()), loop.elapsed
         span = max(time - self._before_time, 1e-9)
         rates = {topic: (count - self._before.get(topic, 0)) / span for topic, count in sent.items() if count}
-        self._before, self._before_time = sent, time
+        recent_factor = (loop.ticks - self._before_ticks) * loop.dt / span
+        self._before, self._before_time, self._before_ticks = sent, time, loop.ticks
         traffic = self.client.replicator.counters
         families = (traffic.actor, traffic.environment, traffic.event)
         p50, p99 = loop.work_ms(50, 99)
         faults = count_faults(client, loop.dropped)
-        self._fault_log.update(faults)
+        recent_faults = self._fault_log.update(faults, time)
         force = np.sum([np.linalg.norm(c.force) for c in client.physics.contacts if c.actor == client.name] or [0.0])
         return {
             "name": client.name,
@@ -61,6 +66,7 @@ class Status:
             "tick_p99_ms": p99,
             "overruns": loop.overruns,
             "real_time_factor": loop.real_time_factor,
+            "recent_real_time_factor": recent_factor,
             "awake": len(client.physics.plants.awake),
             "force": float(force),
             "displacement_mm": 1e3 * client.trace.displacement if client.trace is not None else 0.0,
@@ -69,6 +75,8 @@ class Status:
             "environment_bytes_in": traffic.environment.bytes_in,
             "environment_bytes_out": traffic.environment.bytes_out,
             "faults": faults,
+            "recent_faults": recent_faults,
+            "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "phase": "" if self._task is None else self._task.phase,
             "others": sorted(client.remote_actors),
             "topics": rates,
@@ -84,7 +92,6 @@ class Status:
         values |= {
             "environment_bytes_when_far": client.interest_audit.bytes,
             "ticks_touching_when_far": client.interest_audit.ticks_touching,
-            "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "malformed": client.replicator.counters.malformed,
             "network": client.replicator.counters.to_report(),
             "deadlines_dropped": self.rate_loop.dropped,

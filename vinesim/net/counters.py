@@ -39,7 +39,7 @@ class Counters:
     retained: Traffic = dataclasses.field(default_factory=Traffic)
     """Retained records: these leave even if no peer is near, because the server keeps them."""
     force: Traffic = dataclasses.field(default_factory=Traffic)
-    """Wrenches of hands on robots of other clients."""
+    """Wrenches of hands on robots of other clients, and couplings of two actors to one tree."""
     control: Traffic = dataclasses.field(default_factory=Traffic)
     """Hellos, clock replies and snapshots (received only)."""
     malformed: int = 0
@@ -51,6 +51,9 @@ class Counters:
     """Wrenches of peers on links that their hands do not reach, or that there are not."""
     wrenches_limited: int = 0
     """Messages and steps whose wrenches were reduced to what hands can do."""
+
+    couplings_refused: int = 0
+    """Couplings of peers to trees that neither side owns, or that their arms do not reach."""
 
     lost: int = 0
     """Received samples that the bus discarded: its store was full, or the sample too large."""

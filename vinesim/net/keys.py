@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def sender_of(key: str) -> str:
-    """Name of the actor that published under a key; empty for the server and for a key that names nobody."""
+    """Name of the actor that published under a key; empty for the server and for a key that names no actor."""
     family, *rest = key.split("/")
     if not rest or family == "snap":
         return ""

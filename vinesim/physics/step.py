@@ -120,6 +120,7 @@ class Physics:
             "trees_slowed": self.fault_guard.slowed,
             "robots_stopped": self.rigid.faults,
             "contacts_dropped": self.contact_solver.dropped_contacts,
+            "geoms_skipped": self.contact_solver.skipped_geoms,
             "grasps_refused": self.grasp_manager.refused_grasps,
         }
 
@@ -132,7 +133,9 @@ class Physics:
             self.wind.update(self.plants, self.time, observers, self.parameters)
 
     def _refine_bunches(self) -> None:
-        self.level_of_detail.update(self.contact_solver.near_trees)
+        coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
+        if len(coarsened):  # those that sleep collide with other shapes now
+            self.contact_solver.update_tree_bounds(coarsened)
 
     def _integrate_plants(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
@@ -153,8 +156,10 @@ class Physics:
 
     def _put_to_sleep(self) -> None:
         if self.parameters.sleep:
-            near, held = self.contact_solver.near_trees, self.grasp_manager.held_trees
-            self.sleep_monitor.update(np.union1d(near, held) if len(held) else near)
+            keep_awake = self.contact_solver.remote_trees.copy()
+            keep_awake[self.contact_solver.near_trees] = True
+            keep_awake[self.model.body_tree[self.plants.held_bodies]] = True
+            self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs)
 
     # ------------------------------------------------------------------ results of a step
 

@@ -13,6 +13,8 @@ import os
 import pathlib
 import sys
 
+from vinesim.ros.dead_segments import remove_dead_segments
+
 PROFILE_FILE = pathlib.Path(__file__).resolve().parent / "shared_memory.xml"
 """Fast DDS profile with a shared-memory segment that large messages fit into."""
 
@@ -58,11 +60,13 @@ def unavailable_reason() -> str | None:
 def configure(*, large_messages: bool = True) -> None:
     """Set the environment for the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
 
+    Shared memory that killed processes left is removed.
     ``large_messages``: whether the process sends pictures or clouds. A profile that the user has chosen stays.
     """
     reason = unavailable_reason()
     if reason is not None:
         raise RosUnavailableError(reason)
+    remove_dead_segments()
     os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE_FILE if large_messages else SMALL_PROFILE_FILE))
 
 

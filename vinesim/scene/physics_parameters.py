@@ -61,9 +61,14 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     # ------------------------------------------------------------------ sleep of plants
     sleep_rate: Positive = 0.02
-    """[rad/s] A tree is quiet while every joint turns slower than this. TUNED."""
+    """[rad/s] Trees are looked at only while all their joints turn slower than this. TUNED."""
     sleep_duration: Positive = 0.5
-    """[s] A tree that has been quiet for so long falls asleep. DERIVED: longer than the turning point of any swing."""
+    """[s] A tree whose joints have been slow for so long is looked at. DERIVED: longer than the turning point of any
+    swing."""
+    sleep_speed: Positive = 2e-3
+    """[m/s] No point of a tree that falls asleep is faster than this. TUNED: 0.07 mm between two pictures."""
+    sleep_distance: Positive = 2e-4
+    """[m] No point of a tree that falls asleep is further than this from where it would rest. TUNED."""
 
     # ------------------------------------------------------------------ wind
     wind_radius: Positive = 4.0
@@ -113,8 +118,6 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """Islands of more contacts take no Newton step: it costs the cube of their number, sweeps the square."""
     solver_tolerance: Positive = 1e-6
     """[1] Sweeps end when none changes an impulse by more than this share of the largest. TUNED."""
-    wake_speed: Positive = 1e-3
-    """[m/s] A box or a free bunch that moves slower than this wakes no plant. TUNED."""
 
     # ------------------------------------------------------------------ free bunches
     bunch_rolling_arm: NotNegative = 0.004

@@ -1,7 +1,7 @@
 """What a scene file says: a vineyard's layout, season, fruit, boxes, sun, and where robots start.
 
 Lengths in metres, angles in radians, axes as in :mod:`vinesim.frames`. The first vine of the first row stands at the
-origin; vines follow along +x, rows along +y, so that a longer row or one row more moves nobody.
+origin; vines follow along +x, rows along +y, so that a longer row or one row more moves no other vine.
 """
 
 from __future__ import annotations

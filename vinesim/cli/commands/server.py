@@ -39,7 +39,7 @@ def server(
         typer.Option(help="MESSAGES/s and BYTES/s of retained records (cuts, resting objects) for each actor."),
     ] = (200.0, 200_000.0),
     tls: Annotated[
-        pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): nobody else gets in.")
+        pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): all others are refused.")
     ] = None,
     insecure: Insecure = False,
     status: StatusFormat = "none",

@@ -15,16 +15,23 @@ def bench(
         list[str] | None,
         typer.Option(help="Of live: demo, camera, lidar, tendone, start, generate, tick, link, cold; may repeat."),
     ] = None,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.1, help="Of soak: how long it measures; 60 unless given.")
+    ] = None,
     plot: Annotated[
         pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
     ] = None,
+    times: Annotated[int, typer.Option(help="Of kill: how many programs are killed.")] = 50,
+    seed: Annotated[int, typer.Option(help="Of kill: of the order and the moments.")] = 1,
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
 
     What a user waits for: start. Of physics: plants, contact, tick, asleep. Of sensors: camera and lidar (speed),
     sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
     beside budgets). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links;
-    needs root), traffic (bytes a client receives), load (many clients), fuzz (broken messages).
+    needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz
+    (broken messages), kill (programs killed at random moments, while all others go on).
+    Of a long run: soak (memory, threads and open files of robots, people and a recorder; Linux).
 
     \b
     Examples:
@@ -32,12 +39,14 @@ def bench(
       vinesim bench plants camera
       vinesim bench live --json
       vinesim bench live --row demo --row camera
+      vinesim bench kill --times 12 --json
       vinesim bench sync --json --plot docs/pictures/network-sync.png
       vinesim bench sensors --plot docs/pictures
+      vinesim bench soak --minutes 20 --json
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json, plot, row or ()))
+    raise typer.Exit(run(names, json, plot, row or (), minutes, times, seed))
 
 
 def ros_build_interfaces(

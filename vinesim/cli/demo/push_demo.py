@@ -16,6 +16,7 @@ from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, process_group
 from vinesim.client.processes.ros_listener import RosListener
+from vinesim.errors import writing
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
@@ -24,7 +25,7 @@ from vinesim.scene.spec import load_scene, with_seed
 
 CAMERA_TOPICS = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info")
 COSTLY_TOPICS = ("depth/points", "labels")
-"""Topics of a camera that the listener leaves after the first message: nobody looks at so much all the time."""
+"""Topics of a camera that the listener leaves after the first message: no user looks at so much all the time."""
 VISITOR_SENSOR_HZ = "1"
 """The visitor has come to see a bunch move; its own sensors only have to be there."""
 
@@ -37,7 +38,7 @@ class ListenedTopics:
     once: tuple[str, ...]
     """Only until their first message."""
     events: tuple[str, ...]
-    """Nobody waits for these: they may stay silent."""
+    """The start does not wait for these: they may stay silent."""
     owners: Mapping[str, str]
     """Topic: the sensor that it comes from, in words."""
 
@@ -56,7 +57,8 @@ def run_push(
     plan = with_seed(load_scene(scene), seed)
     description = load_description(robot)  # refused once, and before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
-        folder.mkdir(parents=True, exist_ok=True)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
     no_ros = middleware.unavailable_reason()
     if no_ros:

@@ -16,6 +16,7 @@ from vinesim.cli.demo.progress import PICKER, VISITOR
 from vinesim.client.rate_loop import TickLog
 from vinesim.client.recording import contact_force_plot
 from vinesim.client.recording.bunch_trace import Rows, remote_error
+from vinesim.errors import writing
 
 SMALL_TOPICS = ("/clock", "/joint_states", "/tf")
 """Topics that every step publishes, and every ROS program needs."""
@@ -46,11 +47,12 @@ class Window:
 
 def write_summary(out: pathlib.Path, summary: dict[str, Any]) -> None:
     """Write ``summary.json``, whole or not at all, and copy the picker's pictures beside it."""
-    for picture in (out / PICKER).glob("*.png"):
-        shutil.copyfile(picture, out / picture.name)
-    partial = out / "summary.json.part"
-    partial.write_text(json.dumps(summary, indent=2) + "\n")
-    partial.replace(out / "summary.json")
+    with writing(out):
+        partial = out / "summary.json.part"
+        partial.write_text(json.dumps(summary, indent=2) + "\n")
+        partial.replace(out / "summary.json")
+        for picture in (out / PICKER).glob("*.png"):
+            shutil.copyfile(picture, out / picture.name)
 
 
 def report_of(out: pathlib.Path, name: str) -> dict[str, Any]:
@@ -69,7 +71,8 @@ def push_summary(
     """
     reports = {name: report_of(out, name) for name in (PICKER, VISITOR)}
     traces = {name: Rows.load(out / name / "trace.npz") for name in (PICKER, VISITOR)}
-    contact_force_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
+    with writing(out / "touch.png"):
+        contact_force_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
     touch_keys = (
         "touch_to_motion_ticks", "force_peak_n", "environment_bytes_when_far", "ticks_touching_when_far",
         "environment_bytes_out",
@@ -128,9 +131,12 @@ def push_table(summary: dict[str, Any]) -> Table:
         ("largest force", f"{summary['force_peak_n']:.1f} N"),
         (
             "error of the remote copy",
-            "never compared" if error is None else f"{error['p50']:.1f} mm median, {error['p95']:.1f} p95",
+            # it starts beyond the interest radius, and comes near after some ten seconds
+            f"the visitor was not near in {summary['seconds']:.0f} s, give more --seconds"
+            if error is None
+            else f"{error['p50']:.1f} mm median, {error['p95']:.1f} p95",
         ),
-        ("bytes of touched plants, nobody near", f"{summary['environment_bytes_when_far']}"),
+        ("bytes of touched plants, no actor near", f"{summary['environment_bytes_when_far']}"),
         ("ROS messages received by a stock node", f"{sum(summary['ros_received'].values())}"),
         ("lost of /clock, /joint_states, /tf", "none came" if lost is None else f"{100.0 * lost:.2f} %"),
     ):

@@ -13,6 +13,7 @@ from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, process_group
 from vinesim.client.tasks.task_registry import UnknownTask
+from vinesim.errors import writing
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
 from vinesim.scene.spec import load_scene, with_seed
@@ -36,7 +37,8 @@ def run_job(
     robot, scene = robot or default_robot, scene or "harvest"
     plan = with_seed(load_scene(scene), seed)
     load_description(robot)  # refused once, and before any process starts
-    out.mkdir(parents=True, exist_ok=True)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
     with process_group() as group:
         server, endpoint = group.start_server()

@@ -102,7 +102,7 @@ class SceneComposer:
             from vinesim.physics.step import Physics  # the kernels of plants: half a second that few pictures need
 
             return self.populate(Physics(furnished, parameters=parameters))
-        rigid = RigidWorld(furnished, parameters=parameters)  # plants that nobody picks from need not be ready to move
+        rigid = RigidWorld(furnished, parameters=parameters)  # no robot picks: the plants need not move
         self._add_actors(rigid)
         return rest_snapshot(model, rigid.visuals(), rigid.visual_q())
 

@@ -23,11 +23,10 @@ class Trace:
         """The body of the bunch and those of its berry clusters, which are what a hand touches."""
         self._com = np.array([0.5 * float(model.bunch_length[bunch]), 0.0, 0.0])
         self._rest = self._centre(rest_q)
-        self._clock = np.zeros(capacity)
-        self._time = np.zeros(capacity)
-        self._force = np.zeros((capacity, 3))
-        self._position = np.zeros((capacity, 3))
-        self._is_remote = np.zeros(capacity, bool)
+        # filled, not np.zeros: their pages are there from the start, and the memory of a run does not grow
+        self._clock, self._time = np.full(capacity, 0.0), np.full(capacity, 0.0)
+        self._force, self._position = np.full((capacity, 3), 0.0), np.full((capacity, 3), 0.0)
+        self._is_remote = np.full(capacity, False)
         self.length = 0
 
     def _centre(self, pose: np.ndarray) -> np.ndarray:

@@ -299,7 +299,7 @@ class Replay:
             self._begun, self._begun_at = now, self._network_clock.time
         entries = self.playhead.play(self._start + (now - self._begun) * self._speed)
         self._update_actors()
-        if self._buses:  # what was true before is said once there is a world and somebody who keeps it
+        if self._buses:  # what was true before is said once there is a world and a server that keeps it
             self._initial_messages = [
                 (key, payload) for key, payload in self._initial_messages if not self._publish(key, payload)
             ]

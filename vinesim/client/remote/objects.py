@@ -12,6 +12,7 @@ import numpy as np
 
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.physics.rigid.support_tracking import GROUND
@@ -21,6 +22,12 @@ from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
 
 BLEND_PER_STEP = 0.2
 """Share of the difference to its owner's state by which a copy is corrected in one step."""
+TOUCHED_BLEND_PER_STEP = 0.05
+"""The same of a copy that an actor of this client touches: its own contacts count here, and reach the owner as forces;
+corrections must not pull the copy through the hand. TUNED."""
+FAR_ANGLE = 0.1
+"""Difference of a joint [rad] from which a touched copy is corrected as fast as any other, and between in proportion:
+one of the two has slipped off. TUNED."""
 ACTIVATION_PERIOD = 20
 """Ticks between two activations of dormant bunches."""
 ACTIVATION_BATCH = 4
@@ -191,8 +198,15 @@ class ObjectSync:
             for number, pose in zip(numbers, relative, strict=True):
                 tracker.set_at_rest(number, parent, pose)
 
-    def blend_tree(self, update: TreeUpdate, blend: float) -> None:
-        """Move a tree, and what was cut off it, towards its owner's state by the share ``blend`` (0 to 1)."""
+    def touched_blend(self, update: TreeUpdate) -> float:
+        """Share for :meth:`blend_tree` of a tree that an actor of this client touches."""
+        here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
+        away = float(dead_reckoning.angle_between(here, update.joint_q).max())
+        return max(TOUCHED_BLEND_PER_STEP, BLEND_PER_STEP * min(1.0, away / FAR_ANGLE))
+
+    def blend_tree(self, update: TreeUpdate, blend: float, rate_blend: float = 1.0) -> None:
+        """Move a tree, and what was cut off it, towards its owner's state by the share ``blend`` (0 to 1), its rates
+        by ``rate_blend``."""
         plants, state = self.physics.plants, self.physics.state
         first = int(self.physics.model.tree_first[update.tree])
         for body, x, xd in zip((first + update.root).tolist(), update.root_x, update.root_xd, strict=True):
@@ -201,7 +215,9 @@ class ObjectSync:
                 state.joint_x[body] = x
             state.joint_x[body] += blend * (x - state.joint_x[body])
             state.joint_xd[body] = xd
-        plants.blend_towards(update.tree, update.joint_q, update.joint_qd, blend)
+        here = self.physics.model.bodies_of(update.tree)
+        rates = state.joint_qd[here] + rate_blend * (update.joint_qd - state.joint_qd[here])
+        plants.blend_towards(update.tree, update.joint_q, rates if rate_blend < 1.0 else update.joint_qd, blend)
 
     # ------------------------------------------------------------------ to send
 

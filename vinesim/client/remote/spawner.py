@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import concurrent.futures
+import dataclasses
 import logging
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from vinesim.client.remote.remote_human import RemoteHuman, human_spec
@@ -15,17 +16,27 @@ from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.sidecar import decode_sidecar, encode_sidecar
 from vinesim.robot.drives.remote_robot import RemoteRobot
-from vinesim.scene.values import HumanUpdate, RobotUpdate
+from vinesim.scene.values import HumanSpec, HumanUpdate, RobotSpec, RobotUpdate
 
 log = logging.getLogger(__name__)
 
-Prepared = tuple[RobotDescription | None, CompiledWorld]
-"""A robot's description, or None for a human, and the compiled rigid world with it."""
+
+@dataclasses.dataclass(frozen=True)
+class Prepared:
+    """A compiled world with actors that have joined."""
+
+    actors: tuple[tuple[Hello, RobotDescription | None], ...]
+    """Those in it, each with its description; None for a human."""
+    refused: tuple[tuple[Hello, ValueError | OSError], ...]
+    """Those that cannot be compiled, each with the reason."""
+    world: CompiledWorld | None
+    """None if all were refused."""
 
 
 class RemoteSpawner:
-    """Remote actors that have joined but have no body here yet."""
+    """Remote actors that have joined but have no body here yet, and room for free bunches that runs short."""
 
     def __init__(
         self, rigid: RigidWorld, own: RobotDescription | None, executor: concurrent.futures.Executor | None = None
@@ -34,7 +45,7 @@ class RemoteSpawner:
         self.rigid, self.own = rigid, own
         self._executor = executor
         self._enqueued: dict[str, Hello] = {}
-        self._compiling: dict[str, concurrent.futures.Future[Prepared]] = {}
+        self._compiling: concurrent.futures.Future[Prepared] | None = None
 
     def __contains__(self, name: str) -> bool:
         return name in self._enqueued
@@ -46,64 +57,111 @@ class RemoteSpawner:
     def cancel(self, name: str) -> None:
         """Remove an actor that has left."""
         self._enqueued.pop(name, None)
-        self._compiling.pop(name, None)
 
-    def spawn(self, name: str, update: RobotUpdate | HumanUpdate) -> RemoteRobot | RemoteHuman | None:
-        """The body of an enqueued actor at the pose of ``update``; None until it is compiled.
+    def spawn(self, updates: Mapping[str, RobotUpdate | HumanUpdate]) -> dict[str, RemoteRobot | RemoteHuman]:
+        """The bodies of enqueued actors that became ready, at their poses in ``updates``; between steps.
 
-        An actor that cannot be shown is logged and removed.
+        All actors that wait are compiled together. One that cannot be shown is logged and removed.
         """
-        hello = self._enqueued[name]
-        if name not in self._compiling:
-            self._compiling[name] = self._submit(lambda: self._prepare(hello, update))
-        if not self._compiling[name].done():
-            return None
-        try:
-            description, draft = self._compiling.pop(name).result()
-        except ValueError as error:
-            log.warning("the %s of %s cannot be shown: %s", hello.kind, name, error)
-            self.cancel(name)
-            return None
-        if not self.rigid.adopt(draft):
-            return None  # another actor joined or left meanwhile: compiled again from the next step on
-        self.cancel(name)
+        if self._compiling is None:
+            arrived = [(hello, updates[name]) for name, hello in self._enqueued.items() if name in updates]
+            room_is_short = (
+                self._executor is not None and 2 * self.rigid.bunch_room < self.rigid.parameters.bunch_pool_size
+            )
+            if not arrived and not room_is_short:
+                return {}
+            self._compiling = self._submit(lambda: self._prepare(arrived))
+        if not self._compiling.done():
+            return {}
+        done, self._compiling = self._compiling, None
+        prepared = done.result()
+        for hello, error in prepared.refused:
+            if self._enqueued.get(hello.name) is hello:
+                log.warning("the %s of %s cannot be shown: %s", hello.kind, hello.name, error)
+                self.cancel(hello.name)
+        hellos = [hello for hello, _ in prepared.actors]
+        if any(self._enqueued.get(hello.name) is not hello or hello.name not in updates for hello in hellos):
+            return {}  # one has left meanwhile: compiled again from the next step on
+        if prepared.world is None or not self.rigid.adopt(prepared.world):
+            return {}  # another actor joined or left meanwhile: the same
+        spawned: dict[str, RemoteRobot | RemoteHuman] = {}
+        for hello, description in prepared.actors:
+            self.cancel(hello.name)
+            spawned[hello.name] = self._body_of(hello, description, updates[hello.name])
+        return spawned
+
+    def _body_of(
+        self, hello: Hello, description: RobotDescription | None, update: RobotUpdate | HumanUpdate
+    ) -> RemoteRobot | RemoteHuman:
+        """The copy of an actor that the rigid world contains now."""
         if description is None or not isinstance(update, RobotUpdate):
-            return RemoteHuman(self.rigid, name)
-        other = RemoteRobot(self.rigid, description, name, hello.index, update.base_q, is_in_world=True)
-        self.rigid.place_robot(name, update.base_q, update.position)
+            return RemoteHuman(self.rigid, hello.name)
+        other = RemoteRobot(self.rigid, description, hello.name, hello.index, update.base_q, is_in_world=True)
+        self.rigid.place_robot(hello.name, update.base_q, update.position)
         return other
 
     def _submit(self, work: Callable[[], Prepared]) -> concurrent.futures.Future[Prepared]:
         if self._executor is not None:
             return self._executor.submit(work)
         done: concurrent.futures.Future[Prepared] = concurrent.futures.Future()
-        try:
-            done.set_result(work())
-        except ValueError as error:
-            done.set_exception(error)
+        done.set_result(work())
         return done
 
-    def _prepare(self, hello: Hello, update: RobotUpdate | HumanUpdate) -> Prepared:
+    def _prepare(self, arrived: list[tuple[Hello, RobotUpdate | HumanUpdate]]) -> Prepared:
+        """Compile a world with all actors that can be compiled."""
+        refused: list[tuple[Hello, ValueError | OSError]] = []
+        loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]] = []
+        for hello, update in arrived:
+            try:
+                loaded.append((hello, *self._load(hello, update)))
+            except (ValueError, OSError) as error:  # OSError: no room for the file of its URDF
+                refused.append((hello, error))
+        try:
+            world = self._compile(loaded)
+        except ValueError:  # MuJoCo does not say which one it is
+            fine = []
+            for one in loaded:
+                try:
+                    self._compile([one])
+                    fine.append(one)
+                except ValueError as error:
+                    refused.append((one[0], error))
+            loaded, world = fine, self._compile(fine) if fine else None
+        return Prepared(tuple((hello, description) for hello, description, _ in loaded), tuple(refused), world)
+
+    def _compile(self, loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]]) -> CompiledWorld:
+        return self.rigid.compile_with(*(spec for _, _, spec in loaded), is_remote=True)
+
+    def _load(
+        self, hello: Hello, update: RobotUpdate | HumanUpdate
+    ) -> tuple[RobotDescription | None, RobotSpec | HumanSpec]:
+        """Description (None for a human) and specification of an actor; ValueError if it cannot be loaded."""
         if isinstance(update, HumanUpdate):
-            return None, self.rigid.compile_with(human_spec(hello, update), is_remote=True)
+            return None, human_spec(hello, update)
         description = resolve_description(hello, self.own)
         if hello.joints not in (-1, len(description.drives)):
             raise DescriptionError(f"it announces {hello.joints} joints, its URDF drives {len(description.drives)}")
-        return description, self.rigid.compile_with(description.to_spec(hello.name, hello.index, update.base_q))
+        return description, description.to_spec(hello.name, hello.index, update.base_q)
 
 
 def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDescription:
-    """The robot of another client: an installed one with the same URDF text, or one loaded from the text it sent."""
-    if own is not None and hello.urdf == own.urdf:
+    """The robot of another client: an installed one with the same URDF text and sidecar, or one loaded from what it
+    sent."""
+
+    def is_same(known: RobotDescription) -> bool:
+        return known.urdf == hello.urdf and encode_sidecar(known.base_limits, known.groups) == hello.sidecar
+
+    if own is not None and is_same(own):
         return own
     name = hello.robot if is_valid_name(hello.robot) else "robot"  # untrusted, and it becomes a file's name
     try:
         known = load_description(name)
-        if known.urdf == hello.urdf:
+        if is_same(known):
             return known
     except DescriptionError:
         pass
+    sidecar = decode_sidecar(hello.sidecar)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(hello.urdf)
-        return load_description(file, is_remote=True)
+        return load_description(file, is_remote=True, sidecar=sidecar)

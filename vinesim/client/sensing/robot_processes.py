@@ -20,6 +20,8 @@ from vinesim.scene.values import ComponentStatus
 
 log = logging.getLogger(__name__)
 
+BEHIND = 0.95
+"""A loop that has done a smaller share than this of the steps that were due since the last status is behind."""
 _LOOP_VALUES = ("tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "bytes_in", "bytes_out")
 """Values of a client's status that /diagnostics shows."""
 
@@ -73,8 +75,11 @@ class RobotProcesses:
         return self.sensors.awaited() + ros
 
     def status(self) -> dict[str, Any]:
-        """Whether the sensors are ready, and what was lost so far; for the status of a client."""
+        """Whether the sensors are ready, what was lost so far, and process ids; for the status of a client."""
         report, awaited = self.sensors.report(), self.awaited()
+        pids = {f"sensors of {self.sensors.name}": self.sensors.worker.pid}
+        if self.ros is not None:
+            pids[f"ROS node of {self.sensors.name}"] = self.ros.worker.pid
         return {
             "sensors_ready": not awaited,
             "sensors_awaited": awaited,
@@ -82,6 +87,8 @@ class RobotProcesses:
             "messages_dropped": sum(self.dropped_messages().values()),
             "sensor_restarts": report["sensor_restarts"],
             "ros_restarts": 0 if self.ros is None else self.ros.worker.restarts,
+            "sensor_restart_s": self.sensors.worker.restart_time,
+            "processes": pids,
         }
 
     def report(self) -> dict[str, Any]:
@@ -93,14 +100,11 @@ class RobotProcesses:
         """Publish a client's status on /diagnostics, with that of the sensors."""
         if self.ros is None:
             return
-        is_behind, faults = status["real_time_factor"] <= 0.99, status["faults"]
-        loop = {key: status[key] for key in _LOOP_VALUES} | faults
-        trouble = ["behind"] * is_behind + [name.replace("_", " ") for name in faults]
         report, awaited = self.report(), self.sensors.awaited()
         self.ros.publish_diagnostics(
             status["time"],
             [
-                ComponentStatus("simulation", "warning" if trouble else "ok", ", ".join(trouble) or "well", loop),
+                loop_status(status),
                 ComponentStatus(
                     "sensors", "error" if awaited else "ok", f"not ready: {awaited[0]}" if awaited else "well", report
                 ),
@@ -120,3 +124,11 @@ class RobotProcesses:
 
     def __exit__(self, *exception: Any) -> None:
         self._stack.__exit__(*exception)
+
+
+def loop_status(status: dict[str, Any]) -> ComponentStatus:
+    """A client's loop for /diagnostics: a warning while it is behind and after recent faults, the counts of all."""
+    trouble = ["behind"] * (status["recent_real_time_factor"] < BEHIND)
+    trouble += [name.replace("_", " ") for name in status["recent_faults"]]
+    values = {key: status[key] for key in _LOOP_VALUES} | status["faults"]
+    return ComponentStatus("simulation", "warning" if trouble else "ok", ", ".join(trouble) or "well", values)

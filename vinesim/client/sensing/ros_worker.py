@@ -17,7 +17,7 @@ import numpy as np
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
-from vinesim.client.sensing.worker_process import serve
+from vinesim.client.sensing.worker_process import report_ready, serve
 from vinesim.ros.names import ros_name
 
 STEP_TOPICS = ("/clock", "joint_states", "tf", "mobile_base_controller/odom", "vine/contacts")
@@ -75,7 +75,7 @@ class RosChannel:
 
 def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
     """Entry of the process: publish until told to stop."""
-    serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run(), NICENESS)
+    serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run())
 
 
 class RosWorker:
@@ -100,7 +100,7 @@ class RosWorker:
 
     def run(self) -> None:
         """Publish until a "stop"."""
-        self.pipe.send(("ready", None))
+        report_ready(self.pipe, NICENESS)
         with self.node:
             while self._take_requests():
                 record = self.channel.steps.take(POLL_PERIOD)

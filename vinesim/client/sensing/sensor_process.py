@@ -19,6 +19,7 @@ from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.sensor_worker import POSE_HISTORY, SensorChannel, SensorConfig, run_sensor_worker
 from vinesim.client.sensing.spawned_process import sensor_modules
 from vinesim.client.sensing.worker_process import Run, WorkerProcess
+from vinesim.errors import WriteError
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.ros import middleware
@@ -69,6 +70,8 @@ class SensorProcess:
         self._counts_before: dict[str, collections.Counter[str]] = {}
         """Counts of the runs of the process before this one."""
         self._saved = threading.Event()
+        self._save_failure = ""
+        """Why the last picture could not be written."""
         self._moved_trees = np.zeros(len(model.tree_first), bool)
         """[tree] whether it moved since the last snapshot that was written."""
         self._is_overdue = False
@@ -166,6 +169,7 @@ class SensorProcess:
         elif kind == "device":
             self._device = value
         elif kind == "saved":
+            self._save_failure = value
             self._saved.set()
 
     def _total(self, what: str) -> dict[str, int]:
@@ -200,12 +204,17 @@ class SensorProcess:
     def save_picture(self, folder: pathlib.Path) -> None:
         """Write the kept picture: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and ``labels`` PNGs.
 
-        A process that is not ready, or fails now, costs the picture and is logged.
+        A process that is not ready, or fails now, costs the picture and is logged. :class:`WriteError` if the folder
+        cannot be written.
         """
         self._saved.clear()
         if self.worker.is_ready:
             self.worker.send("save", folder)
             if self._saved.wait(SAVE_TIMEOUT):
+                if self._save_failure:
+                    raise WriteError(
+                        f"{folder} cannot be written: {self._save_failure}; make room there or give another"
+                    )
                 return
         log.error("no picture in %s: the sensor process of %s did not save it", folder, self.name)
 

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vinesim import allocator
 from vinesim.client.sensing.rigid_visual_list import VisualListMessage, VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
-from vinesim.client.sensing.worker_process import serve
+from vinesim.client.sensing.worker_process import report_ready, serve
 from vinesim.physics.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
@@ -108,7 +109,7 @@ def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connec
         with contextlib.ExitStack() as stack:
             SensorWorker(config, channel, pipe, stack).run()
 
-    serve("sensor process", pipe, work, NICENESS)
+    serve("sensor process", pipe, work)
 
 
 class SensorWorker:
@@ -213,9 +214,10 @@ class SensorWorker:
                 else:
                     for name in self.scheduler.warm_up(snapshot, poses):
                         self._awaits(name)
+                    allocator.release_free_memory()
                     is_ready = True
                     self._awaits()
-                    self.pipe.send(("ready", None))
+                    report_ready(self.pipe, NICENESS)
             self.channel.wanted["renders"][0] = any(sensor.wanted() for sensor in self.scheduler.sensors)
             if time.monotonic() >= self._next_statistics:
                 self._next_statistics = time.monotonic() + STATISTICS_PERIOD
@@ -297,9 +299,13 @@ class SensorWorker:
             self.node.publish_lidar(scan)
 
     def _save_best_frame(self, folder: pathlib.Path) -> None:
+        failure = ""
         if self._best_frame is not None:
             from vinesim.sensors.export import images
 
-            images.save_frame(self._best_frame, folder, "")
+            try:
+                images.save_frame(self._best_frame, folder, "")
+            except OSError as bad:
+                failure = bad.strerror or str(bad)
         self.pipe.send(("statistics", self._statistics()))
-        self.pipe.send(("saved", self._best_frame is not None))
+        self.pipe.send(("saved", failure))

@@ -57,7 +57,7 @@ class SharedArrays:
         """Release the memory; arrays taken from here must not be used any more. A second call does nothing."""
         if self._arrays:
             self._arrays = {}
-            with contextlib.suppress(BufferError):  # somebody still has a view, and the memory lives as long as that
+            with contextlib.suppress(BufferError):  # a view still exists, and the memory lives as long as that
                 self._memory.close()
             if self._is_owner:
                 self._memory.unlink()

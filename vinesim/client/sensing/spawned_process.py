@@ -17,6 +17,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
+from vinesim import allocator
+
 ROS_MODULES = ("vinesim.client.sensing.ros_worker", "vinesim.ros.robot_node")
 """What a ROS process needs."""
 CONTEXT = multiprocessing.get_context("spawn")
@@ -27,6 +29,7 @@ _started_early: dict[tuple[str, ...], SpawnedProcess] = {}
 def _import_and_run(modules: Sequence[str], pipe: Connection) -> None:
     """The life of the process; it ends if the parent ends before it has sent a function."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    allocator.keep_large_blocks_apart()
     gc.disable()  # a fifth of the time, and all that is imported stays
     for name in modules:
         with contextlib.suppress(ImportError):  # reported where it is needed

@@ -1,4 +1,4 @@
-"""A child process of the client that is started again when it fails or dies, and never ends the client's loop.
+"""A child process of the client that is started again when it fails, dies or hangs, and never ends the client's loop.
 
 Its threads here start it, send it messages and take its messages, so that the loop never waits for it. What the two
 share in memory is made anew for every run of the process: a process that dies while it holds a lock leaves no trace.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import pathlib
 import queue
 import signal
 import sys
@@ -28,6 +29,11 @@ EXIT_TIMEOUT = 1.2
 """How long a process may take to end [s]."""
 STABLE_TIME = 60.0
 """A process that ran this long before it failed is started again at once [s]; else there is a pause before."""
+HANG_TIMEOUT = 15
+"""A process that was ready and then sends nothing for this long hangs, and is started again [s]. It reports to the
+client five times a second, unless it renders a picture or writes files."""
+START_TIMEOUT = 300
+"""The same for a process that is not ready: a first run may compile kernels [s]."""
 LONGEST_PAUSE = 60.0
 """Pauses double with every failure, up to this [s]."""
 
@@ -38,16 +44,15 @@ class WorkerError(RuntimeError):
     exit_code = 3
 
 
-def serve(title: str, pipe: Connection, work: Callable[[], None], niceness: int) -> NoReturn:
+def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
     """The whole life of a process: ``work``, until it returns, fails, or the client's process has ended.
 
-    ``title`` names the process in its log: "sensor process". With its ``niceness`` and class it does not take the core
-    of the loop that wakes it (docs/decisions/sensor-process.md).
+    ``title`` names the process in its log and in ``ps -o comm``: "sensor process".
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    if hasattr(os, "nice"):
-        os.nice(niceness)
+    with contextlib.suppress(OSError):  # where there is no /proc, the process keeps Python's name
+        pathlib.Path("/proc/self/comm").write_text(title)
     if hasattr(os, "SCHED_BATCH"):
         os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     code = 0
@@ -64,6 +69,21 @@ def serve(title: str, pipe: Connection, work: Callable[[], None], niceness: int)
     logging.shutdown()
     sys.stdout.flush()
     os._exit(code)
+
+
+def report_ready(pipe: Connection, niceness: int) -> None:
+    """Tell the client that this process is ready, and let the client's loop come before it from now on.
+
+    With its ``niceness`` and class it does not take the core of the loop that wakes it (docs/decisions/
+    sensor-process.md). Until it is ready it has the niceness of the client: what is missed is urgent then.
+    """
+    if hasattr(os, "nice"):
+        os.nice(niceness)
+    if os.path.isdir("/proc/self/task"):  # Linux, where every thread has a niceness of its own
+        for thread in os.listdir("/proc/self/task"):
+            with contextlib.suppress(OSError):  # it may have ended by now
+                os.setpriority(os.PRIO_PROCESS, int(thread), os.getpriority(os.PRIO_PROCESS, 0))
+    pipe.send(("ready", None))
 
 
 class Shared(Protocol):
@@ -112,6 +132,7 @@ class WorkerProcess(Generic[S]):
 
     ``target(config, shared, pipe)`` runs in the process when that has imported ``modules``; it sends ("ready", None)
     when it is, ("failed", text) before it ends with an error, and ends at ("stop", None) or when the pipe is closed.
+    While it is ready it sends some message at least every :data:`HANG_TIMEOUT`, else it is killed and started again.
     ``share(context)`` makes what is shared with one run. ``receive(kind, value)`` takes all other messages, and
     ("restarted", None) before those of a further run, in a thread.
     """
@@ -123,9 +144,13 @@ class WorkerProcess(Generic[S]):
         self.title = title
         self.restarts = 0
         """How often the process was started again."""
+        self.restart_time = 0.0
+        """From the start of the last further run until it was ready [s]."""
         self._modules, self._target, self._config = modules, target, config
         self._share, self._receive = share, receive
         self._closing = threading.Event()
+        self._started = 0.0
+        """When the newest run started [s]."""
         self._first_result = threading.Event()
         self._failure = ""
         """Why the first run failed before it was ready."""
@@ -141,6 +166,11 @@ class WorkerProcess(Generic[S]):
             former, self._current = self._current, self._newest
             former.shared.close()
         return self._current
+
+    @property
+    def pid(self) -> int | None:
+        """Process id of the newest run."""
+        return self._newest.process.pid
 
     @property
     def is_ready(self) -> bool:
@@ -202,6 +232,7 @@ class WorkerProcess(Generic[S]):
                 return
             self.restarts += 1
             self._receive("restarted", None)
+            self._started = time.monotonic()
             self._newest = self._start()
 
     def _log_failure(self, failures: int, reason: str) -> None:
@@ -211,15 +242,18 @@ class WorkerProcess(Generic[S]):
             log.error("%s failed again: %s; further attempts follow without a message", self.title, reason)
 
     def _serve(self, run: Run[S]) -> str:
-        """Take the messages of a run until it ends; why it did."""
+        """Take the messages of a run until it ends or hangs; why it did."""
         reason = ""
-        while True:
-            connection.wait([run.pipe, run.process.sentinel])
+        silent = 0  # seconds, counted one by one: when both processes were stopped for long, only one has passed
+        while silent < (START_TIMEOUT if run.ready_since is None else HANG_TIMEOUT):
+            silent = 0 if connection.wait([run.pipe, run.process.sentinel], 1.0) else silent + 1
             try:
                 while run.pipe.poll():
                     kind, value = run.pipe.recv()
                     if kind == "ready":
                         run.ready_since = time.monotonic()
+                        if self._first_result.is_set():
+                            self.restart_time = run.ready_since - self._started
                         self._first_result.set()
                     elif kind == "failed":
                         reason = value
@@ -230,3 +264,5 @@ class WorkerProcess(Generic[S]):
                 return reason or f"it ended with exit code {run.process.exitcode}"
             if not run.process.is_alive():
                 return reason or f"it ended with exit code {run.process.exitcode}"
+        run.process.kill()
+        return reason or f"it hung: nothing came from it for {silent} s"

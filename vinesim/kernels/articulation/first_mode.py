@@ -8,7 +8,7 @@ import math
 import warp as wp
 
 from vinesim.kernels.articulation.spatial import world_inertia
-from vinesim.kernels.articulation.structs import ArticulationModel, Factors, Scratch, WrenchScratch
+from vinesim.kernels.articulation.structs import ArticulationModel, Scratch, WrenchScratch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,26 +39,25 @@ def compliance(stiffness: wp.vec3, torque: wp.vec3):
 
 
 @wp.func
-def place_relaxed(model: ArticulationModel, k: int, factors_out: Factors):
-    """Axes of body k in its tree, and the lever to it, with all springs relaxed."""
+def place_relaxed(model: ArticulationModel, k: int, scratch_out: Scratch):
+    """Axes of body k in its tree (in ``J``), and the lever to it (``tension``), with all springs relaxed."""
     parent = model.body_parent[k]
-    axes = model.body_rest[k]
+    axes = wp.quat_to_matrix(model.body_rest[k])
     lever = wp.vec3()
     if parent >= 0:
-        axes = factors_out.axes[parent] * axes
-        lever = wp.quat_rotate(factors_out.axes[parent], model.body_offset[k])
-    factors_out.axes[k] = axes
-    factors_out.lever[k] = lever
+        lever = scratch_out.J[parent] * model.body_offset[k]
+        axes = scratch_out.J[parent] * axes
+    scratch_out.J[k] = axes
+    scratch_out.tension[k] = lever
 
 
 @wp.func
-def inertial_wrench(model: ArticulationModel, k: int, axes: wp.quat, acceleration: wp.spatial_vector):
+def inertial_wrench(model: ArticulationModel, k: int, axes: wp.mat33, acceleration: wp.spatial_vector):
     """Wrench at its origin that accelerates body k from rest."""
-    rotation = wp.quat_to_matrix(axes)
-    com = rotation * model.body_com[k]
+    com = axes * model.body_com[k]
     alpha = wp.spatial_bottom(acceleration)
     force = model.body_mass[k] * (wp.spatial_top(acceleration) + wp.cross(alpha, com))
-    inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+    inertia = world_inertia(axes, model.body_inertia[k], model.body_product[k])
     return wp.spatial_vector(force, inertia * alpha + wp.cross(com, force))
 
 
@@ -72,7 +71,6 @@ def count_substeps(
     # in
     trees: wp.array(dtype=wp.int32),
     # out
-    factors_out: Factors,
     scratch_out: Scratch,
     work_out: WrenchScratch,
     tree_substeps_out: wp.array(dtype=wp.int32),
@@ -84,13 +82,13 @@ def count_substeps(
     left out, and what a floating root would do if free. x^T M x / x^T M K^-1 M x bounds w^2 from above.
 
     trees: [thread] which tree. tree_substeps_out: [tree] 1 to ``max_substeps``, such that the mode turns by at most
-    ``max_angle`` [rad] in a substep. All other arrays are scratch.
+    ``max_angle`` [rad] in a substep. All other arrays are scratch; the factors of the last prediction stay.
     """
     tree = trees[wp.tid()]
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
     for k in range(first, first + size * model.pitch, model.pitch):
-        place_relaxed(model, k, factors_out)
+        place_relaxed(model, k, scratch_out)
         scratch_out.Du[k] = compliance(model.joint_stiffness[k], wp.vec3(0.6, 1.0, 0.8))
     square = float(0.0)
     for _ in range(ITERATIONS):
@@ -101,11 +99,11 @@ def count_substeps(
                 above = work_out.added_acceleration[parent]
             alpha = wp.spatial_bottom(above)
             acceleration = wp.spatial_vector(
-                wp.spatial_top(above) + wp.cross(alpha, factors_out.lever[k]),
-                alpha + wp.quat_rotate(factors_out.axes[k], scratch_out.Du[k]),
+                wp.spatial_top(above) + wp.cross(alpha, scratch_out.tension[k]),
+                alpha + scratch_out.J[k] * scratch_out.Du[k],
             )
             work_out.added_acceleration[k] = acceleration
-            work_out.subtree_wrench[k] = inertial_wrench(model, k, factors_out.axes[k], acceleration)
+            work_out.subtree_wrench[k] = inertial_wrench(model, k, scratch_out.J[k], acceleration)
         kinetic = float(0.0)
         elastic = float(0.0)
         largest = float(0.0)
@@ -113,7 +111,7 @@ def count_substeps(
             k = first + (size - 1 - i) * model.pitch
             parent = model.body_parent[k]
             wrench = work_out.subtree_wrench[k]
-            torque = wp.quat_rotate_inv(factors_out.axes[k], wp.spatial_bottom(wrench))
+            torque = wp.transpose(scratch_out.J[k]) * wp.spatial_bottom(wrench)
             angle = compliance(model.joint_stiffness[k], torque)
             kinetic += wp.dot(scratch_out.Du[k], torque)
             elastic += wp.dot(angle, torque)
@@ -121,7 +119,7 @@ def count_substeps(
             scratch_out.Du[k] = angle
             if parent >= 0:
                 force = wp.spatial_top(wrench)
-                moment = wp.spatial_bottom(wrench) + wp.cross(factors_out.lever[k], force)
+                moment = wp.spatial_bottom(wrench) + wp.cross(scratch_out.tension[k], force)
                 work_out.subtree_wrench[parent] = work_out.subtree_wrench[parent] + wp.spatial_vector(force, moment)
         if elastic > 0.0 and largest > 0.0:
             square = kinetic / elastic

@@ -167,25 +167,26 @@ def tree_aabbs(
 @wp.kernel
 def actor_aabbs(
     # model
-    parameters: Parameters,
     actors: Actors,
+    geoms: Geoms,
     # in
+    rigid: RigidBodies,
     geom_states: GeomStates,
     # out
     actor_boxes_out: Aabbs,
 ):
-    """One thread per actor: the box around it; an empty one for a box or a free bunch that does not move."""
+    """One thread per actor: the box around it; an empty one for a box or a free bunch that MuJoCo has put to sleep.
+
+    MuJoCo puts none to sleep on which plants press.
+    """
     actor = wp.tid()
+    first = actors.start[actor]
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
-    fastest = wp.float64(0.0)
-    for g in range(actors.start[actor], actors.start[actor + 1]):
-        low = wp.min(low, geom_states.low[g])
-        high = wp.max(high, geom_states.high[g])
-        fastest = wp.max(fastest, geom_states.speed[g])
-    if actors.wakes_only_moving[actor] and fastest < parameters.wake_speed:
-        low = wp.vec3(FAR)
-        high = wp.vec3(-FAR)
+    if not actors.may_sleep[actor] or rigid.tree_asleep[rigid.dof_tree[geoms.dof[first]]] < 0:
+        for g in range(first, actors.start[actor + 1]):
+            low = wp.min(low, geom_states.low[g])
+            high = wp.max(high, geom_states.high[g])
     actor_boxes_out.low[actor] = low
     actor_boxes_out.high[actor] = high
 
@@ -227,7 +228,7 @@ def mark_near_trees(
     A remote actor counts at remote trees only.
     """
     block = wp.tid()
-    for actor in range(actors.start.shape[0] - 1):
+    for actor in range(actors.count[0]):
         actor_low = actor_boxes.low[actor]
         actor_high = actor_boxes.high[actor]
         if not aabbs_disjoint(block_boxes.low[block], block_boxes.high[block], actor_low, actor_high):

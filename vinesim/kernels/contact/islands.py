@@ -13,6 +13,7 @@ from vinesim.kernels.contact.structs import (
     IMPACTED_TREES,
     ISLANDS,
     OVERFLOW,
+    SKIPPED_GEOMS,
     Candidates,
     Capsules,
     Contacts,
@@ -38,9 +39,11 @@ def compact_candidates(
     count = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
     overflow = int(0)  # noqa: RUF046
     impacted = int(0)  # noqa: RUF046
+    skipped = int(0)  # noqa: RUF046
     for row in range(counters_out[AWAKE_TREES]):
         kept = wp.min(candidates.count[row], slots)
         overflow = overflow + candidates.count[row] - kept
+        skipped = skipped + candidates.skipped_geoms[row]
         if candidates.is_impact[row]:
             impacted = impacted + 1
         for slot in range(kept):
@@ -50,6 +53,7 @@ def compact_candidates(
     counters_out[CONTACTS] = count
     counters_out[OVERFLOW] = overflow
     counters_out[IMPACTED_TREES] = impacted
+    counters_out[SKIPPED_GEOMS] = skipped
 
 
 @wp.func

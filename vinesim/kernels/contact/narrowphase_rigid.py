@@ -57,26 +57,28 @@ def list_near_geoms(
     low: wp.vec3,
     high: wp.vec3,
     is_remote: bool,
-    movable: int,
+    most: int,
     geoms: Geoms,
     geom_states: GeomStates,
     static_blocks: Aabbs,
     near_geoms_out: wp.array2d(dtype=wp.int32),
 ):
-    """List the geoms whose boxes overlap that of a tree; returns their number."""
+    """List the geoms whose boxes overlap that of a tree, at most ``most`` static ones; returns the number of all."""
     count = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    movable = geoms.count[0]
     for g in range(movable):
         counts = is_remote or not geoms.is_remote[g]
         if counts and not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
             near_geoms_out[row, count] = g
             count = count + 1
+    room = wp.min(movable + most, near_geoms_out.shape[1])
     for block in range(static_blocks.low.shape[0]):
         if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
             first = movable + block * AABB_BLOCK
-            for g in range(first, wp.min(first + AABB_BLOCK, geoms.id.shape[0])):
-                has_room = count < near_geoms_out.shape[1]
-                if has_room and not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
-                    near_geoms_out[row, count] = g
+            for g in range(first, wp.min(first + AABB_BLOCK, geoms.count[1])):
+                if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
+                    if count < room:
+                        near_geoms_out[row, count] = g
                     count = count + 1
     return count
 
@@ -210,7 +212,7 @@ def contact_ends(
 def find_rigid_contacts(
     # model
     parameters: Parameters,
-    movable: int,
+    max_static_geoms: int,
     capsules: Capsules,
     geoms: Geoms,
     # in
@@ -232,9 +234,12 @@ def find_rigid_contacts(
     row = order[wp.tid()]
     tree = trees.awake[row]
     near_count = list_near_geoms(
-        row, tree_boxes.low[tree], tree_boxes.high[tree], trees.is_remote[tree], movable, geoms, geom_states,
+        row, tree_boxes.low[tree], tree_boxes.high[tree], trees.is_remote[tree], max_static_geoms, geoms, geom_states,
         static_blocks, candidates_out.near_geoms,
     )  # fmt: skip
+    room = wp.min(geoms.count[0] + max_static_geoms, candidates_out.near_geoms.shape[1])
+    candidates_out.skipped_geoms[row] = wp.max(near_count - room, 0)
+    near_count = wp.min(near_count, room)
     is_impact = bool(False)
     count = int(0)  # noqa: RUF046
     last = capsules.tree_start[tree + 1]
@@ -278,7 +283,7 @@ def find_rigid_contacts(
                                     geoms.kind[g], geoms.size[g], rotation, center, p, p
                                 )
                             candidate = rigid_candidate(
-                                parameters, pair, nearest, ends[end], g >= movable, bodies, capsules, capsule_states,
+                                parameters, pair, nearest, ends[end], g >= geoms.count[0], bodies, capsules, capsule_states,
                                 geoms, geom_states,
                             )  # fmt: skip
                             if candidate.exists:

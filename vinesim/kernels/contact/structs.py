@@ -23,7 +23,9 @@ IS_CONSTRAINED = wp.constant(5)
 ISLANDS = wp.constant(6)
 SORT_AXIS = wp.constant(7)
 """World axis (0, 1, 2) along which the boxes of trees are sorted."""
-COUNTERS = 8
+SKIPPED_GEOMS = wp.constant(8)
+"""Static geoms beyond what one tree can be near to."""
+COUNTERS = 9
 
 AABB_BLOCK = wp.constant(32)
 """So many static boxes share one box around them, and are skipped by one comparison."""
@@ -49,8 +51,6 @@ class Parameters:
     """[m/s]"""
     impact_speed: wp.float64
     """[m/s] A contact that closes faster is an impact."""
-    wake_speed: wp.float64
-    """[m/s] Boxes and free bunches that are slower wake no plant."""
     plant_friction: wp.float64
     """[1] Coulomb coefficient between plants."""
 
@@ -69,6 +69,8 @@ class Trees:
 
     awake: wp.array(dtype=wp.int32)
     """[k] numbers of the trees that this step is about; as many as the thread count says."""
+    is_awake: wp.array(dtype=wp.bool)
+    """[tree]"""
     is_fine: wp.array(dtype=wp.bool)
     """[tree] whether the clusters of its bunches are free to move."""
     is_remote: wp.array(dtype=wp.bool)
@@ -122,7 +124,7 @@ class Capsules:
 
 @wp.struct
 class CapsuleStates:
-    """The capsules of awake trees at the start of the step [capsule]."""
+    """The capsules at the start of the step [capsule]; of sleeping trees, where they fell asleep."""
 
     start: wp.array(dtype=wp.vec3)
     end: wp.array(dtype=wp.vec3)
@@ -134,9 +136,24 @@ class CapsuleStates:
 
 
 @wp.struct
+class Clearances:
+    """How far capsules of awake trees were from contact with sleeping trees when they were last compared [capsule]."""
+
+    start: wp.array(dtype=wp.vec3)
+    """[m] then."""
+    end: wp.array(dtype=wp.vec3)
+    distance: wp.array(dtype=float)
+    """[m] that they may move from there; negative if they must be compared in any case."""
+    reach: wp.array(dtype=float)
+    """[m] around the capsule to be searched in this step; 0 for none."""
+
+
+@wp.struct
 class Geoms:
     """Rigid geoms that plants collide with [geom]: first those that can move, then static ones."""
 
+    count: wp.array(dtype=wp.int32)
+    """[2] number of those that can move, and of all; there is room for more."""
     id: wp.array(dtype=wp.int32)
     """number in MuJoCo's arrays."""
     body: wp.array(dtype=wp.int32)
@@ -180,11 +197,13 @@ class GeomStates:
 class Actors:
     """Robots, people, boxes and free bunches [actor]: each a range of the movable geoms."""
 
+    count: wp.array(dtype=wp.int32)
+    """[1] number of actors; there is room for more."""
     start: wp.array(dtype=wp.int32)
     """[actor + 1] first geom of each."""
     is_remote: wp.array(dtype=wp.bool)
-    wakes_only_moving: wp.array(dtype=wp.bool)
-    """Boxes and free bunches wake plants only while they are faster than ``wake_speed``."""
+    may_sleep: wp.array(dtype=wp.bool)
+    """Boxes and free bunches wake plants only while MuJoCo has them awake."""
 
 
 @wp.struct
@@ -203,6 +222,8 @@ class RigidBodies:
     """[MuJoCo body]"""
     dof_parent: wp.array(dtype=wp.int32)
     dof_tree: wp.array(dtype=wp.int32)
+    tree_asleep: wp.array(dtype=wp.int32)
+    """[MuJoCo tree] negative while it is awake."""
     velocity_free: wp.array(dtype=wp.float64)
     """[dof] at the end of the step if there were no plants."""
     correction: wp.array(dtype=wp.float64)
@@ -246,6 +267,8 @@ class Candidates:
     """[awake tree] whether one of them is an impact."""
     near_geoms: wp.array2d(dtype=wp.int32)
     """[awake tree, k] scratch: geoms whose box overlaps that of the tree."""
+    skipped_geoms: wp.array(dtype=wp.int32)
+    """[awake tree] static geoms whose box overlaps it as well, for which ``near_geoms`` has no room."""
     feature: wp.array2d(dtype=wp.int32)
     """2 * capsule + end of the part along a face; -1 for an empty slot."""
     other: wp.array2d(dtype=wp.int32)

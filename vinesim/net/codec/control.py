@@ -48,6 +48,8 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Name of the robot description."""
     urdf: str = ""
     """The URDF as text."""
+    sidecar: str = ""
+    """What a URDF cannot express, as JSON: see :func:`vinesim.robot.description.sidecar.encode_sidecar`."""
     scene: str = ""
     """Name of its scene."""
     digest: str = ""

@@ -28,14 +28,15 @@ class MessageKind(enum.IntEnum):
     OBJECTS = 5
     HUMAN = 6
     WRENCHES = 7
+    COUPLINGS = 8
     HELLO = 16
     CLOCK = 17
     WELCOME = 18
 
 
-TIMESTAMPED = frozenset(
-    (MessageKind.ROBOT, MessageKind.TREES, MessageKind.OBJECTS, MessageKind.HUMAN, MessageKind.WRENCHES)
-)
+_RARE = (MessageKind.CLAIMS, MessageKind.RETAINED, MessageKind.HELLO, MessageKind.CLOCK, MessageKind.WELCOME)
+
+TIMESTAMPED = frozenset(MessageKind).difference(_RARE)
 """Kinds whose header holds the network time [s] at which the content was sampled."""
 
 MAX_DATAGRAM = 1100

@@ -1,7 +1,8 @@
 """All encoders and decoders of network messages under one name; the modules beside this one define them.
 
-``header`` (magic, version, kind, count, time), ``robot``, ``human``, ``trees``, ``objects`` and ``wrenches`` hold
-packed binary messages that travel many times a second; ``control`` holds the rare messages in msgpack.
+``header`` (magic, version, kind, count, time), ``robot``, ``human``, ``trees``, ``objects``, ``wrenches`` and
+``couplings`` hold packed binary messages that travel many times a second; ``control`` holds the rare messages in
+msgpack.
 """
 
 from __future__ import annotations

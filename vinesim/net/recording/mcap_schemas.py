@@ -49,6 +49,14 @@ _LINKS = _list(
     )
 )  # fmt: skip
 
+_COUPLINGS = _list(
+    _object(
+        "coupling", "a spring that holds a body of a tree", body=_COUNT,
+        point={**_list(_NUMBER), "description": "in the body's frame [m]"},
+        anchor={**_list(_NUMBER), "description": "where it is pulled to, in the world [m]"},
+    )
+)  # fmt: skip
+
 _CLAIMS = _list(_object("claim", "who says to own a thing", owner=_TEXT, touched=_YES, **_THING))
 
 _FACTS = _list(
@@ -83,7 +91,10 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "force": (
         "vinesim.Push",
-        _object("vinesim.Push", "What an actor does to a robot.", timestamp=_TIME, links=_LINKS, **_COMMON),
+        _object(
+            "vinesim.Push", "What an actor does to a robot, or to a tree that another touches, too.", timestamp=_TIME,
+            links=_LINKS, couplings=_COUPLINGS, **_COMMON,
+        ),
     ),
     "fact": ("vinesim.Facts", _object("vinesim.Facts", "What stays true.", facts=_FACTS, **_COMMON)),
     "snap": ("vinesim.Facts", _object("vinesim.Facts", "What was true before.", facts=_FACTS, **_COMMON)),
@@ -91,8 +102,8 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
         "vinesim.Greeting",
         _object(
             "vinesim.Greeting", "How an actor introduced itself.", name=_TEXT, kind=_TEXT, robot=_TEXT, urdf=_TEXT,
-            scene=_TEXT, digest=_TEXT, seed=_COUNT, protocol=_COUNT, index=_COUNT, joints=_COUNT, height=_NUMBER,
-            **_COMMON,
+            sidecar=_TEXT, scene=_TEXT, digest=_TEXT, seed=_COUNT, protocol=_COUNT, index=_COUNT, joints=_COUNT,
+            height=_NUMBER, **_COMMON,
         ),
     ),
     "live": ("vinesim.Live", _object("vinesim.Live", "An actor came or went.", live=_YES, **_COMMON)),

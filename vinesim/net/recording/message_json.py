@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from vinesim.net.codec import messages
+from vinesim.net.codec.couplings import decode_couplings
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.wrenches import decode_wrenches
 from vinesim.net.keys import sender_of
@@ -112,6 +113,16 @@ def _describe_wrenches(payload: bytes, _: str) -> dict[str, Any]:
     }
 
 
+def _describe_couplings(payload: bytes, _: str) -> dict[str, Any]:
+    message = decode_couplings(payload)
+    return {
+        "timestamp": _stamp(message.time),
+        "couplings": [
+            {"body": one.body, "point": one.point.tolist(), "anchor": one.anchor.tolist()} for one in message.couplings
+        ],
+    }
+
+
 def _describe_hello(payload: bytes, _: str) -> dict[str, Any]:
     return msgspec.to_builtins(messages.decode_hello(payload))
 
@@ -124,6 +135,7 @@ _DESCRIBE: dict[int, Callable[[bytes, str], dict[str, Any]]] = {
     messages.MessageKind.OBJECTS: _describe_objects,
     messages.MessageKind.HUMAN: _describe_pose,
     messages.MessageKind.WRENCHES: _describe_wrenches,
+    messages.MessageKind.COUPLINGS: _describe_couplings,
     messages.MessageKind.HELLO: _describe_hello,
 }
 

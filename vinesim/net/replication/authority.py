@@ -20,7 +20,7 @@ SEQUENCE_COUNT = 1 << 16
 """Sequence numbers before they wrap."""
 _HALF = SEQUENCE_COUNT >> 1
 
-NOBODY = ""
+NO_OWNER = ""
 """Owner of an object at rest or without an owner."""
 
 
@@ -29,11 +29,11 @@ class Claim(NamedTuple):
 
     ownership: int = 0
     authority: int = 0
-    owner: str = NOBODY
+    owner: str = NO_OWNER
 
 
 UNTOUCHED = Claim()
-"""Claim on an object before anybody touched it."""
+"""Claim on an object before any touch."""
 
 
 def is_newer(a: int, b: int) -> bool:
@@ -63,7 +63,7 @@ def claim_by_touch(held: Claim, me: str, owner_touches: bool) -> Claim:
 
     That condition keeps two actors that press the same cane from taking it from each other for ever.
     """
-    if held.owner == me or (held.owner != NOBODY and owner_touches):
+    if held.owner == me or (held.owner != NO_OWNER and owner_touches):
         return held
     return Claim(held.ownership, (held.authority + 1) % SEQUENCE_COUNT, me)
 
@@ -75,11 +75,11 @@ def claim_by_grab(held: Claim, me: str) -> Claim:
 
 def release(held: Claim) -> Claim:
     """The same sequences without an owner: the object is at rest, or its owner has left."""
-    return Claim(held.ownership, held.authority, NOBODY)
+    return Claim(held.ownership, held.authority, NO_OWNER)
 
 
 def choose_successor(position: np.ndarray, actors: dict[str, np.ndarray]) -> str:
     """Name of the actor nearest to ``position`` [m] on the ground, then the lowest name; empty without ``actors``."""
     if not actors:
-        return NOBODY
+        return NO_OWNER
     return min((float(np.hypot(*(where[:2] - position[:2]))), name) for name, where in actors.items())[1]

@@ -62,7 +62,13 @@ class ClockEstimate:
     """Server's clock minus own clock as used now [s]."""
 
     def with_ping(self, ping: Ping) -> ClockEstimate:
-        """With one more ping. Until the first eight have arrived the best estimate is used at once."""
+        """With one more ping. Until the first eight have arrived the best estimate is used at once.
+
+        One that contradicts the offset in use by more than its round trip explains is of another server, or of one
+        whose clock was set: the earlier pings are forgotten.
+        """
+        if self.pings and abs(ping.offset - self.offset) >= STEP_THRESHOLD + 0.5 * ping.round_trip:
+            return ClockEstimate((ping,), ping.offset)
         settling = len(self.pings) < PING_WINDOW
         pings = (*self.pings, ping)[-PING_WINDOW:]
         best = estimate(pings)

@@ -11,6 +11,10 @@ import numpy as np
 MAX_EXTRAPOLATION = 0.150
 """States are extrapolated by at most this time [s]; then the copy stands still. GUESSED."""
 
+TREE_VELOCITY_DECAY = 0.080
+"""Time in which the velocity of a tree, as others extrapolate it, falls to 37 % [s]. TUNED on a bunch that is pushed:
+from 60 to 120 ms the errors differ by 4 %."""
+
 POSITION_ERROR = 0.005
 """A state is due when copies are wrong by more than this [m] ..."""
 
@@ -51,6 +55,12 @@ def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
 def clamp_age(age: float | np.ndarray) -> float | np.ndarray:
     """Time [s] by which a state of ``age`` [s] is extrapolated: from 0 to :data:`MAX_EXTRAPOLATION`."""
     return np.minimum(np.maximum(age, 0.0), MAX_EXTRAPOLATION)
+
+
+def faded_age(age: float | np.ndarray) -> float | np.ndarray:
+    """Time [s] by which the joints of a tree are extrapolated after ``age`` [s]: the integral of a velocity that decays
+    with :data:`TREE_VELOCITY_DECAY`, for a hand stops a branch, and a branch swings back."""
+    return TREE_VELOCITY_DECAY * -np.expm1(-clamp_age(age) / TREE_VELOCITY_DECAY)
 
 
 def extrapolate(q: np.ndarray, rate: np.ndarray, dt: float | np.ndarray) -> np.ndarray:

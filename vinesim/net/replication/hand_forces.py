@@ -17,7 +17,7 @@ import numpy as np
 from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
 from vinesim.net.counters import Counters
-from vinesim.net.transport.bus import KEEP_LAST_1, Bus, Publisher
+from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 SEND_PERIOD = 1.0 / 60.0
@@ -82,7 +82,7 @@ class WrenchSync:
         self._bus, self._name, self._counters = bus, name, counters
         self._pushed: dict[str, _PushedRobot] = {}
         self._received: dict[str, tuple[float, WrenchMessage]] = {}
-        bus.subscribe(f"force/{name}/*", KEEP_LAST_1)
+        bus.subscribe(f"force/{name}/*", KEEP_LAST_64)  # couplings to trees come under the same keys
 
     def receive(
         self, payload: bytes, sender: Hello, pose: HumanUpdate | RobotUpdate | None, now: float, link_centre: LinkCentre
@@ -107,6 +107,11 @@ class WrenchSync:
         reached, is_limited = limit(reached)
         self._counters.wrenches_limited += is_limited
         self._received[sender.name] = now, WrenchMessage(message.time, reached)
+
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+        for sender, (arrived, message) in self._received.items():
+            self._received[sender] = arrived, dataclasses.replace(message, time=message.time + step)
 
     def net_wrenches(self, now: float) -> dict[str, np.ndarray]:
         """Sum of the wrenches [6] of all people on each own link, by link name; limited as a whole."""

@@ -1,11 +1,11 @@
 """Interest management: cells of the ground, windows of cells around actors, and exact distances; pure.
 
-The ground is divided into square cells. The owner of a moving object publishes under the object's cell; whoever needs
-states subscribes to the 3x3 cells around itself. A publisher without a subscriber sends nothing (CANOPIES D6.4, section
-5.1).
+The ground is divided into square cells. The owner of a moving object publishes under the object's cell; a client that
+needs states subscribes to the 3x3 cells around itself. A publisher without a subscriber sends nothing (CANOPIES D6.4,
+section 5.1).
 
 A cell is 6 m wide. With 1 m of hysteresis 3x3 cells then guarantee 5 m on all sides: an arm, a bunch and a camera's
-good range, about two vines of a tendone. Larger cells reach farther but carry more that is not near anybody: with ten
+good range, about two vines of a tendone. Larger cells reach farther but carry more that is near no actor: with ten
 robots and five people on 60 x 40 m, each moving five trees, a client receives 7.9 kB/s of trees with cells of 6 m and
 15.1 kB/s with cells of 8 m. Smaller ones would not cover 5 m. Inside the window the exact distance decides.
 """
@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 CELL_SIZE = 6.0
-"""Edge of a cell [m]; equal for everybody, because cells are part of the keys."""
+"""Edge of a cell [m]; equal for all clients, because cells are part of the keys."""
 
 HYSTERESIS = 1.0
 """A window moves only when its actor is this far outside of the middle cell [m]."""

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Callable, Container
 
 from vinesim.net.replication import authority, dead_reckoning
-from vinesim.net.replication.authority import NOBODY, UNTOUCHED, Claim
+from vinesim.net.replication.authority import NO_OWNER, UNTOUCHED, Claim
 
 CORRECTION_PERIOD = 0.2
 """Shortest time between two corrections of one object [s]. GUESSED."""
@@ -91,7 +91,7 @@ class Ownership:
             self._take(object_id, claim)
 
     def grab(self, object_id: int) -> None:
-        """Claim an object by grabbing, picking or cutting it, whoever owns it."""
+        """Claim an object by grabbing, picking or cutting it, whatever its owner."""
         self._take(object_id, authority.claim_by_grab(self.claim(object_id), self.name))
 
     def take_over(self, object_id: int) -> None:
@@ -135,7 +135,7 @@ class Ownership:
         published_at = min(published_at, time + dead_reckoning.MAX_CLOCK_SKEW)
         fresh = published_at > known.published_at
         if claim != known.claim and not authority.wins(claim, known.claim):
-            if fresh and claim.owner != NOBODY:
+            if fresh and claim.owner != NO_OWNER:
                 self._losing_claims.append((object_id, claim))
             return False
         if not fresh and claim == known.claim:
@@ -172,7 +172,7 @@ class Ownership:
             self.owned.add(object_id)
             return
         self.owned.discard(object_id)
-        if claim.owner != NOBODY:
+        if claim.owner != NO_OWNER:
             self.remote.add(object_id)
 
     # ------------------------------------------------------------ what follows
@@ -189,6 +189,13 @@ class Ownership:
             known.silent = True
             if recent and successor(object_id) == self.name:
                 self.take_over(object_id)
+
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+        for known in self._known.values():
+            known.published_at += step
+            known.received_at += step
+            known.corrected_at += step
 
     def expire(self, time: float) -> None:
         """Mark owners as silent that have timed out; their claims still hold."""

@@ -17,14 +17,14 @@ from vinesim.net.codec.messages import (
     TreeStates,
     is_valid_name,
 )
-from vinesim.net.replication.authority import NOBODY, Claim
+from vinesim.net.replication.authority import NO_OWNER, Claim
 from vinesim.net.replication.early_messages import EarlyMessages
 from vinesim.net.replication.hand_forces import MAX_POSE_AGE, LinkCentre
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.model_check import check_record, check_tree_states
 from vinesim.net.replication.replication_state import ReplicationState, put_counted
 from vinesim.net.transport.bus import Reply
-from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values import Coupling, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 
 
 def _no_link(_: str) -> None:
@@ -43,6 +43,8 @@ class Inbox:
     """The same for people."""
     wrenches: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Sum of the wrenches [6] of peers on each own link: :class:`vinesim.net.codec.wrenches.WrenchMessage`."""
+    couplings: dict[str, tuple[Coupling, ...]] = dataclasses.field(default_factory=dict)
+    """Couplings of peers to trees that they or this actor own, by actor."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
     """Trees with a new state: the last state of each, extrapolated by at most 150 ms."""
     objects: list[ObjectUpdate] = dataclasses.field(default_factory=list)
@@ -88,6 +90,7 @@ class Receiver:
         for name in inbox.left:
             state.ownership.remove_actor(name, time, state.successor_of)
             state.wrench_sync.remove_peer(name)
+            state.coupling_sync.remove_peer(name)
         inbox.joined, replies = peers.process_replies()
         for reply in replies:
             self._receive_snapshot(reply, step)
@@ -105,6 +108,7 @@ class Receiver:
         inbox.robots = {update.actor: update for update in poses if isinstance(update, RobotUpdate)}
         inbox.people = {update.actor: update for update in poses if isinstance(update, HumanUpdate)}
         inbox.wrenches = state.wrench_sync.net_wrenches(now)
+        inbox.couplings = state.coupling_sync.couplings(now)
         for object_id in state.ownership.corrections(time):
             if not state.is_spectator:
                 self._publish_correction(object_id)
@@ -132,7 +136,10 @@ class Receiver:
             elif family == "force":
                 assert peer is not None
                 pose = peer.update if peer.update and step.time - peer.update.time <= MAX_POSE_AGE else None
-                state.wrench_sync.receive(payload, peer.hello, pose, step.now, step.link_centre)
+                if messages.kind_of(payload) == MessageKind.COUPLINGS:
+                    state.coupling_sync.receive(payload, peer.hello, pose, step.now, state.ownership.owner)
+                else:
+                    state.wrench_sync.receive(payload, peer.hello, pose, step.now, step.link_centre)
             else:
                 self._receive_in_cell(family, (int(chunks[0]), int(chunks[1])), payload, sender, step)
         except MessageError as error:
@@ -170,7 +177,7 @@ class Receiver:
         is_near = state.cells.is_within_radius(state.tree_stream.middle[trees.tree])
         columns = (trees.tree, trees.ownership, trees.authority, trees.flags)
         for row, (tree, ownership, sequence, flags) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
-            claim = Claim(ownership, sequence, NOBODY if flags & messages.RESTING else sender)
+            claim = Claim(ownership, sequence, NO_OWNER if flags & messages.RESTING else sender)
             touching = bool(flags & messages.TOUCHED)
             is_accepted = state.ownership.receive_state(tree, claim, touching, trees.time, step.time)
             if is_accepted and is_near[row]:
@@ -208,7 +215,7 @@ class Receiver:
             return
         if not state.retained.merge(cell, record):
             return
-        claim = Claim(record.ownership, record.authority, record.author if record.moving else NOBODY)
+        claim = Claim(record.ownership, record.authority, record.author if record.moving else NO_OWNER)
         holds = state.ownership.receive_retained(record.object, claim, record.moving, step.time)
         if is_remote:
             step.inbox.records.append((state.retained.state.get(record.object) or record, holds))

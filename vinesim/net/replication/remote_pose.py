@@ -70,6 +70,15 @@ class RemotePose:
             self.moved_at = time
         return True
 
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]; a jitter buffer begins anew."""
+        if self.update is not None:
+            self.update = dataclasses.replace(self.update, time=self.update.time + step)
+            self.moved_at += step
+        if self._buffer.states:
+            assert self.update is not None
+            self._buffer = JitterBuffer(self._buffer.delay).insert(self.update.time, self._state, self._rate)
+
     def sample(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
         """The pose at network ``time``, to be shown at own time ``now`` [s]; of a distant peer up to 100 ms old."""
         if self._cached is None or self.near is not None or not 0.0 <= now - self._cached.time < FAR_SAMPLE_PERIOD:

@@ -8,6 +8,7 @@ from vinesim.net.codec.messages import Hello
 from vinesim.net.counters import Counters, Traffic
 from vinesim.net.replication import authority, interest
 from vinesim.net.replication.cell_channels import CellChannels
+from vinesim.net.replication.couplings import CouplingSync
 from vinesim.net.replication.hand_forces import WrenchSync
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.ownership import Ownership
@@ -31,6 +32,7 @@ class ReplicationState:
         self.counters = Counters()
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
         self.wrench_sync = WrenchSync(bus, hello.name, self.counters)
+        self.coupling_sync = CouplingSync(bus, hello.name, model, self.counters)
         self.ownership = Ownership(hello.name, self.peers.known)
         self.retained = RetainedSync(bus, self.counters)
         self.tree_stream = TreeStream(model)
@@ -62,6 +64,15 @@ class ReplicationState:
     def successor_of(self, object_id: int) -> str:
         """The actor that takes over an object whose owner has left."""
         return authority.choose_successor(self.position_of(object_id), self.owner_candidates())
+
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]: times that were noted by it follow."""
+        for peer in self.peers.known.values():
+            peer.shift_time(step)
+        self.ownership.shift_time(step)
+        self.object_stream.shift_time(step)
+        self.wrench_sync.shift_time(step)
+        self.coupling_sync.shift_time(step)
 
     def count_listeners(self, positions: np.ndarray) -> np.ndarray:
         """Number of peers within the interest radius of each position [k, 3] m: [k] int."""

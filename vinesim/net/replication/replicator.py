@@ -20,6 +20,7 @@ from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.counters import Counters
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.clock_sync import STEP_THRESHOLD
 from vinesim.net.replication.hand_forces import LinkCentre
 from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
@@ -27,7 +28,7 @@ from vinesim.net.replication.sender import LocalStep, Sender
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots, StateReader
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.model import Model
-from vinesim.scene.values import HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values import Coupling, HumanUpdate, RobotUpdate, TreeUpdate
 
 
 class Replicator:
@@ -54,6 +55,7 @@ class Replicator:
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
         self._last_sent = -1e9
+        self._offset = self.offset
 
     @property
     def counters(self) -> Counters:
@@ -114,6 +116,7 @@ class Replicator:
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
         self._state.peers.clock.advance(now)
+        self._follow_clock()
         return self._receiver.receive(now, self.offset, link_centre)
 
     def send(
@@ -131,6 +134,7 @@ class Replicator:
         is_changed: Callable[[int], bool] = lambda _: False,
         wrenches: dict[str, dict[str, np.ndarray]] | None = None,
         has_body: Callable[[int], bool] = lambda _: True,
+        couplings: Iterable[Coupling] = (),
     ) -> list[TreeUpdate]:
         """Publish one step; return the states of trees at rest that left, as all copies hold them.
 
@@ -145,12 +149,16 @@ class Replicator:
         ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
         ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
         ``wrenches``: wrench [6] of this actor's hands on other clients' robots in this step, by robot and link.
+        ``couplings``: of this actor's contacts with trees; sent if other actors touch them, too.
         """
         state = self._state
+        self._follow_clock()
         time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
         state.cells.position = np.asarray(pose.base_q[:3], float)
         state.peers.publish_pose(pose, now, time)
         for payload in state.wrench_sync.publish(wrenches or {}, now, time):
+            state.counters.force.count_out(payload)
+        for payload in state.coupling_sync.publish(self._by_partner(couplings, now), now, time):
             state.counters.force.count_out(payload)
         touched, moving, grabbed, detached = (
             {int(object_id) for object_id in ids} for ids in (touched, moving, grabbed, detached)
@@ -161,3 +169,26 @@ class Replicator:
                 has_body,
             )
         )  # fmt: skip
+
+    def _by_partner(self, couplings: Iterable[Coupling], now: float) -> dict[str, list[Coupling]]:
+        """Couplings by the peer that gets them: the owner of the tree, or who touches the own tree, too."""
+        found: dict[str, list[Coupling]] = {}
+        for coupling in couplings:
+            tree = int(self.model.body_tree[coupling.body])
+            owner = self.owner(tree)
+            partners = self._state.coupling_sync.partners(tree, now) if owner == self.hello.name else [owner]
+            for name in partners:
+                if name is not None and name in self._state.peers.known:
+                    found.setdefault(name, []).append(coupling)
+        return found
+
+    def _follow_clock(self) -> None:
+        """Shift all times of peers and objects when the network clock was set, as by a server that was restarted.
+
+        Otherwise everything that arrives after a step back would count as older than what is known.
+        """
+        step = self.offset - self._offset
+        self._offset = self.offset
+        if abs(step) >= STEP_THRESHOLD:
+            self._last_sent += step
+            self._state.shift_time(step)

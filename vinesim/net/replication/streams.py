@@ -85,7 +85,7 @@ class TreeStream:
         self._qd = np.concatenate([joint_qd for _, joint_qd in state]).astype(np.float64)
         self._roots = [cut(tree) for tree in active]
         bodies, horizon = self._order, dead_reckoning.clamp_age(silence)
-        dt = np.repeat(horizon, self._sizes)[:, None]
+        dt = np.repeat(dead_reckoning.faded_age(silence), self._sizes)[:, None]
         angle = dead_reckoning.angle_between(
             self._q, dead_reckoning.extrapolate(self._published_q[bodies], self._published_rate[bodies], dt)
         )
@@ -129,7 +129,7 @@ class TreeStream:
             if age > 0.0 and not (trees.flags & messages.RESTING).any():
                 here = dataclasses.replace(
                     here,
-                    joint_q=dead_reckoning.extrapolate(trees.joint_q, rate, age),
+                    joint_q=dead_reckoning.extrapolate(trees.joint_q, rate, dead_reckoning.faded_age(age)),
                     root_x=trees.root_x + age * trees.root_xd,
                 )
             first = 0
@@ -210,6 +210,11 @@ class ObjectStream:
     def remove(self, object_id: int) -> None:
         """Forget the received state of an object that is at rest or has lost its owner."""
         self._received.pop(object_id, None)
+
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+        for object_id, update in self._received.items():
+            self._received[object_id] = dataclasses.replace(update, time=update.time + step)
 
     def extrapolated(self, remote: set[int], now: float, time: float) -> list[ObjectUpdate]:
         """All objects that peers move, extrapolated to now; after 150 ms without a message they stand still."""

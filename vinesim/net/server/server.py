@@ -80,7 +80,7 @@ class Server:
         if linked and (state_folder is not None or scene is not None or max_actors is not None):
             raise UsageError(
                 f"a server linked to {linked[0]} only carries: give --state-dir, --scene and --max-clients "
-                "to the one server that connects to nobody"
+                "to the one server that connects to no other"
             )
         settings: dict[str, Any] = {}
         if certificates is not None:

@@ -70,7 +70,8 @@ def create(
             written += _signed(folder, SERVER, Role.SERVER, (), days)
         return written + _signed(folder, name, role, hosts, days)
     except OSError as error:
-        raise CertificateError(f"{error.filename}: {error.strerror}: the certificate cannot be made there") from error
+        place = error.filename or folder  # a full disk names no file
+        raise CertificateError(f"{place}: {error.strerror}: the certificate cannot be made there") from error
 
 
 def roles(folder: pathlib.Path) -> dict[str, Role]:

@@ -193,7 +193,7 @@ class MemoryBus:
 
     def publisher(self, key: str, reliable: bool = False) -> MemoryPublisher:
         if "*" in key:
-            raise ValueError(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
+            raise ValueError(f"publisher key {key!r} has a wildcard: only exact keys send nothing without a subscriber")
         return MemoryPublisher(self, key, reliable)
 
     def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> MemorySubscription:

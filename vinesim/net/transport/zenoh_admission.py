@@ -46,7 +46,7 @@ class ServerAdmission:
             raise JoinRejected(next(welcome.refused for welcome in welcomes if welcome.refused))
         if not welcomes and self._is_secured:
             raise JoinRejected(
-                f"the server at {self._endpoint} lets nobody named {self._name!r} in: its folder of certificates must "
+                f"the server at {self._endpoint} refuses actors named {self._name!r}: its folder of certificates must "
                 f"hold {self._name}.pem, and it reads them when it starts"
             )
         if not welcomes:

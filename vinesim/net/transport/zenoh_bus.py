@@ -283,7 +283,7 @@ class ZenohBus:
 
     def publisher(self, key: str, reliable: bool = False) -> BusPublisher:
         if "*" in key:
-            raise UsageError(f"publisher key {key!r} has a wildcard: only exact keys send nothing when nobody listens")
+            raise UsageError(f"publisher key {key!r} has a wildcard: only exact keys send nothing without a subscriber")
 
         def declare(session: zenoh.Session) -> zenoh.Publisher:
             return session.declare_publisher(

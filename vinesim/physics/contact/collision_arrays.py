@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
     made.compliance = 1.0 / (p.dt * (stiffness * p.dt + damping))
     made.margin, made.static_margin = p.contact_margin, p.static_contact_margin
     made.max_separation_speed, made.impact_speed = p.max_separation_speed, p.impact_speed
-    made.wake_speed, made.plant_friction = p.wake_speed, p.friction
+    made.plant_friction = p.friction
     return made
 
 
@@ -37,6 +38,7 @@ class PlantArrays:
         self.trees = SharedArrays(
             structs.Trees,
             awake=np.zeros(count, np.int32),
+            is_awake=state.tree_awake,
             is_fine=state.tree_fine,
             is_remote=np.zeros(count, np.bool_),
             bunch_attached=state.bunch_attached,
@@ -75,28 +77,27 @@ class PlantArrays:
         self.capsule_states = SharedArrays.zeros(structs.CapsuleStates, len(capsules.body))
 
 
+_GEOM_FIELDS = tuple(field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link"))
+
+
 class RigidArrays:
-    """Geoms and degrees of freedom of the rigid world, from one recompilation or listing of it to the next."""
+    """Geoms and degrees of freedom of the rigid world, from one recompilation of it to the next.
+
+    There is room for all geoms that the world can list, so that kernels stay bound to the arrays when hands open and
+    close and when bunches take bodies: :meth:`update` writes what is listed now.
+    """
 
     def __init__(self, rigid: RigidWorld, remote_actors: set[str], previous: RigidArrays | None) -> None:
         """``previous``: where the velocities of the last step are taken from, by the names of degrees of freedom."""
-        world, data = rigid.mj_model, rigid.mj_data
-        listed = self.listed = concatenate(rigid.geoms, rigid.static_geoms)
-        self.count, self.movable = len(listed.id), len(rigid.geoms.id)
-        self.names = persistent_names(listed)
-        fields = {f.name: getattr(listed, f.name) for f in dataclasses.fields(RigidGeoms)}
-        actor, _ = fields.pop("actor"), fields.pop("link")
-        is_remote = np.array([name in remote_actors for name in actor], np.bool_)
-        self.geoms = SharedArrays(structs.Geoms, is_remote=is_remote, **fields)
-        self.geom_states = SharedArrays.zeros(structs.GeomStates, self.count)
-        first = [i for i in range(self.movable) if i == 0 or actor[i] != actor[i - 1]]
-        self.actor_count = len(first)
-        self.actors = SharedArrays(
-            structs.Actors,
-            start=np.array([*first, self.movable], np.int32),
-            is_remote=is_remote[first],
-            wakes_only_moving=np.array([actor[i] not in rigid.actors for i in first], np.bool_),
+        self.world, data = rigid.mj_model, rigid.mj_data
+        world = self.world
+        self.capacity, self.static = world.ngeom, len(rigid.static_geoms.id)
+        self.geoms = SharedArrays.zeros(structs.Geoms, self.capacity, count=np.zeros(2, np.int32))
+        self.geom_states = SharedArrays.zeros(structs.GeomStates, self.capacity)
+        self.actors = SharedArrays.zeros(
+            structs.Actors, self.capacity, start=np.zeros(self.capacity + 1, np.int32), count=np.zeros(1, np.int32)
         )
+        self._list(rigid, remote_actors)
         self.dof_names = rigid.dof_names
         velocity, correction, before = rigid.velocity_free, np.zeros(world.nv), np.zeros(world.nv)
         if previous is not None:
@@ -115,6 +116,7 @@ class RigidArrays:
             subtree_com=data.subtree_com,
             dof_parent=world.dof_parentid,
             dof_tree=world.dof_treeid,
+            tree_asleep=data.tree_asleep,
             velocity_free=velocity,
             correction=correction,
             correction_before=before,
@@ -132,6 +134,41 @@ class RigidArrays:
             plain=data.qLD,
             plain_inverse=data.qLDiagInv,
         )
+
+    def _list(self, rigid: RigidWorld, remote_actors: set[str]) -> None:
+        """Write the geoms and actors that are listed now."""
+        listed = self.listed = concatenate(rigid.geoms, rigid.static_geoms)
+        count, movable = self.count, self.movable = len(listed.id), len(rigid.geoms.id)
+        for name in _GEOM_FIELDS:
+            getattr(self.geoms, name)[:count] = getattr(listed, name)
+        actor = listed.actor
+        is_remote = self.geoms.is_remote
+        is_remote[:count] = [name in remote_actors for name in actor]
+        self.geoms.count[:] = movable, count
+        first = [i for i in range(movable) if i == 0 or actor[i] != actor[i - 1]]
+        self.actor_count = self.actors.count[0] = len(first)
+        self.actors.start[: len(first) + 1] = [*first, movable]
+        self.actors.is_remote[: len(first)] = is_remote[first]
+        self.actors.may_sleep[: len(first)] = [actor[i] not in rigid.actors for i in first]
+
+    @functools.cached_property
+    def names(self) -> list[tuple[str, str, int]]:
+        """[geom] names of the listed geoms that outlive a recompilation."""
+        return persistent_names(self.listed)
+
+    def update(self, rigid: RigidWorld, remote_actors: set[str]) -> np.ndarray:
+        """Take over that the same world has listed its geoms anew; the new number [geom] of each former one, or -1."""
+        former = self.geoms.id[: self.count].copy()
+        self._list(rigid, remote_actors)
+        self.__dict__.pop("names", None)
+        number = np.full(self.capacity, -1)
+        number[self.geoms.id[: self.count]] = np.arange(self.count)
+        before, self.dof_names = self.dof_names, rigid.dof_names
+        if before != self.dof_names:
+            other = [i for i, (old, new) in enumerate(zip(before, self.dof_names, strict=True)) if old != new]
+            self.bodies.velocity_free[other] = rigid.velocity_free[other]
+            self.bodies.correction[other] = self.bodies.correction_before[other] = 0.0
+        return number[former]
 
     def begin_step(self, rigid: RigidWorld) -> None:
         """Take over the free velocities of the coming step, and what plants changed in the last one."""

@@ -55,10 +55,8 @@ def static_geoms(m: mujoco.MjModel) -> RigidGeoms:
 
 def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> RigidGeoms:
     """The properties of some geoms ``ids`` [k]; ``names``: actor and link of each."""
-    last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1).tolist()
-    for body, parent in enumerate(m.body_parentid.tolist()):  # parents come first
-        if last[body] < 0:
-            last[body] = last[parent]
+    moved_by = m.body_weldid  # a body without joints moves with the one that it is welded to
+    last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1)[moved_by]
     body, kind, size = m.geom_bodyid[ids], m.geom_type[ids].copy(), m.geom_size[ids].copy()
     mesh = kind == mujoco.mjtGeom.mjGEOM_MESH
     kind[mesh], size[mesh] = mujoco.mjtGeom.mjGEOM_BOX, m.geom_aabb[ids][mesh, 3:]
@@ -80,7 +78,7 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
         center=center,
         radius=radius,
         friction=m.geom_friction[ids, 0].copy(),
-        dof=np.array(last, np.int32)[body],
+        dof=last.astype(np.int32)[body],
         root=m.body_rootid[body].astype(np.int32),
         actor=tuple(actor for actor, _ in names),
         link=tuple(link for _, link in names),

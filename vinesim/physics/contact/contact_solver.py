@@ -29,12 +29,10 @@ class ContactSolver:
     ``wake_near_trees()`` (before ``plants.predict()``) wakes the trees that an actor is near to; ``solve()`` (after it)
     leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.integrate()``.
 
-    Robots, people, boxes and free bunches wake the trees that they are near to. Static geoms (ground, poles, trunks)
-    and
-    other plants only hold back what moves already. What overlaps in the scene as generated is in contact only beyond
-    that. All numbers come from ``rigid.parameters``; of more contacts than ``contact_capacity``, the deepest are kept,
-    and
-    ``dropped_contacts`` and ``overflow_message`` report it.
+    Robots, people, boxes and free bunches wake the trees that they are near to, awake trees those that they touch.
+    Static geoms (ground, poles, trunks) only hold back what moves already. What overlaps in the scene as generated is
+    in contact only beyond that. All numbers come from ``rigid.parameters``; of more contacts than
+    ``contact_capacity``, the deepest are kept, and ``dropped_contacts`` and ``overflow_message`` report it.
     """
 
     def __init__(self, model: Model, plants: ArticulationSolver, rigid: RigidWorld) -> None:
@@ -48,12 +46,16 @@ class ContactSolver:
         """Contacts left out since the start, for want of room."""
         self.overflow_message = ""
         """When contacts were last left out and how many: empty if never."""
+        self.skipped_geoms = 0
+        """Static geoms left out since the start, as more of them were near one tree than there is room for."""
         self.near_trees = np.zeros(0, np.int32)
         """Trees [k] whose box a robot or a moving box reaches into: these must not fall asleep."""
         self.remote_actors: set[str] = set()
         """Robots and people that another client controls. Their contacts are computed by that client: here they touch
         only remote trees, so that each contact counts once and a distant copy disturbs nothing.
         """
+        self.remote_trees = np.zeros(len(model.tree_first), np.bool_)
+        """[tree] whether another client owns its state; to be written by the client."""
         self._awake = np.zeros(0, np.int32)
         self._reported: tuple[Contact, ...] | None = ()
         self._touched: tuple[tuple[int, str], ...] | None = ()
@@ -83,11 +85,12 @@ class ContactSolver:
             self.plants.wake(self.near_trees)
 
     def solve(self) -> None:
-        """Find the contacts of all awake trees and their forces."""
-        self._awake = awake = self.plants.awake
+        """Find the contacts of all awake trees, and of those that these wake, and their forces."""
         self.count, self._reported, self._touched = 0, (), ()
         self.impulses.clear()
-        if len(awake) and self._rigid_arrays is not None and self._rigid_arrays.count:
+        self._awake = self.plants.awake
+        if len(self._awake):
+            self._awake = awake = self._wake_reached_trees()
             self._find_contacts(awake)
             self._predict_impacted(awake)
         if self.count:
@@ -96,14 +99,28 @@ class ContactSolver:
         else:
             self.impulses.warm_start.count[0] = 0
 
+    def _wake_reached_trees(self) -> np.ndarray:
+        """Wake the sleeping trees that awake ones touch, those that these touch, and so on.
+
+        Returns all awake trees [k].
+        """
+        plants, detection = self.plants, self.detection
+        detection.list_awake(plants.awake)
+        while self.plant_plant_contacts and len(reached := detection.find_reached_trees()):
+            plants.wake(reached)
+            plants.predict(reached)
+            detection.list_awake(plants.awake)
+        return plants.awake
+
     def _find_contacts(self, awake: np.ndarray) -> None:
         """List the contacts of the awake trees; of too many, the deepest."""
         detection, capacity = self.detection, self.impulses.capacity
         candidates = detection.candidates
-        detection.find_candidates(awake, self.plant_plant_contacts)
+        detection.find_candidates(self.plant_plant_contacts)
         if detection.candidates is not candidates:
             self.impulses.bind_launches(detection)
         self.impulses.compact_candidates(1)
+        self.skipped_geoms += int(detection.counters[structs.SKIPPED_GEOMS])
         count, overflow = int(detection.counters[structs.CONTACTS]), int(detection.counters[structs.OVERFLOW])
         if count > capacity:
             overflow += count - capacity
@@ -126,9 +143,10 @@ class ContactSolver:
         """
         if self.detection.counters[structs.IMPACTED_TREES]:
             impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
-            if (self.plants.phi_used[impacted] < 1.0).any():
+            changed = impacted[self.plants.phi_used[impacted] < 1.0]
+            if len(changed):
                 self.plants.use_backward_euler(impacted)
-                self.plants.predict()
+                self.plants.predict(changed)
 
     # ------------------------------------------------------------------ results
 
@@ -148,8 +166,8 @@ class ContactSolver:
         return self.impulses.rigid_force
 
     @property
-    def remote_trees(self) -> np.ndarray:
-        """[tree] whether another client owns its state; to be written by the client."""
+    def trees_touched_by_copies(self) -> np.ndarray:
+        """[tree] whether copies of remote actors touch it; to be written by the client."""
         return self._arrays.trees.is_remote
 
     @property
@@ -171,6 +189,14 @@ class ContactSolver:
                 if pressure[c] > 0.0
             )  # fmt: skip
         return self._reported
+
+    @property
+    def contact_pairs(self) -> np.ndarray:
+        """[k, 2] Pairs of awake trees that were in contact in the last step."""
+        bodies = np.stack(
+            [self.impulses.contacts.body[: self.count], self.impulses.contacts.other_body[: self.count]], -1
+        )
+        return self.model.body_tree[bodies[bodies[:, 1] >= 0]]
 
     @property
     def touched_trees(self) -> tuple[tuple[int, str], ...]:
@@ -204,8 +230,13 @@ class ContactSolver:
         self.detection.update_tree_bounds(trees)
 
     def _update_rigid_world(self) -> None:
-        """Take over the rigid world after an actor came or went."""
+        """Take over the rigid world after an actor came or went, a hand opened or closed, or a bunch took a body."""
         previous = self._rigid_arrays
+        if previous is not None and previous.world is self.rigid.mj_model:
+            self._generation = self.rigid.generation
+            self.impulses.renumber_geoms(previous.update(self.rigid, self.remote_actors))
+            self.detection.update_rigid_geoms()
+            return
         self._rigid_arrays = arrays = RigidArrays(self.rigid, self.remote_actors, previous)
         self._generation = self.rigid.generation
         self.detection.set_rigid_world(arrays)

@@ -62,19 +62,26 @@ class ImpulseSolver:
     def set_rigid_world(
         self, rigid_arrays: RigidArrays, detection: ContactDetection, previous: RigidArrays | None
     ) -> None:
-        """Take over the rigid world after an actor came or went; the warm start follows the names of the geoms."""
+        """Take over the rigid world after it was compiled anew; the warm start follows the names of the geoms."""
         self.rigid_arrays = rigid_arrays
         if previous is not None:
             at = {name: i for i, name in enumerate(rigid_arrays.names)}
             other = self.warm_start.other
             for k, geom in enumerate(other[: self.warm_start.count[0]].tolist()):
-                if geom >= 0:
+                if 0 <= geom < len(previous.names):
                     other[k] = at.get(previous.names[geom], REMOVED_GEOM)
         size = (3 * self.capacity, self.rigid.mj_model.nv)
         self.rows = SharedArrays(
             structs.Rows, rigid_jacobian=np.zeros(size), rigid_response=np.zeros(size), **self._row_arrays
         )
         self.bind_launches(detection)
+
+    def renumber_geoms(self, number: np.ndarray) -> None:
+        """The same rigid world has listed its geoms anew: ``number`` [geom] of each former one, -1 if it is gone."""
+        other = self.warm_start.other[: self.warm_start.count[0]]
+        of_geoms = (other >= 0) & (other != REMOVED_GEOM)
+        now = number[other[of_geoms]]
+        other[of_geoms] = np.where(now >= 0, now, REMOVED_GEOM)
 
     def clear(self) -> None:
         """Forget the last solve, but for its warm start."""

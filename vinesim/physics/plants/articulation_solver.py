@@ -29,6 +29,7 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
 from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
+from vinesim.physics.plants.remote_pose import blend_towards
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
 from vinesim.physics.plants.validation import checked_trees, validate
@@ -42,9 +43,9 @@ class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
     ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
-    a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after a
-    contact began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to
-    the ``predict()`` before them.
+    a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after contact
+    began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
+    ``predict()`` before them.
 
     Args:
         model: constants; :class:`ValueError` in words if a tree cannot be simulated.
@@ -55,8 +56,7 @@ class ArticulationSolver:
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
         threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
-        fast_rate: [rad/s] see ``PhysicsParameters.fast_joint_rate``.
-        max_rate: [rad/s] see ``PhysicsParameters.max_joint_rate``.
+        fast_rate, max_rate: [rad/s] see ``fast_joint_rate`` and ``max_joint_rate`` of ``PhysicsParameters``.
         fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
@@ -219,16 +219,16 @@ class ArticulationSolver:
             self._list_awake()
 
     def put_to_sleep(self, trees: np.ndarray | int) -> None:
-        """Put trees to sleep where they are, with zero rates; their poses are brought up to date."""
-        trees = np.atleast_1d(trees)
+        """Put trees to sleep where they are, with zero rates; their poses are brought up to date.
+
+        :class:`ValueError` if there is no such tree.
+        """
+        trees = checked_trees(trees, len(self.state.tree_awake))
         if len(trees) == 0:
             return
         bodies = self.bodies_of(trees)
-        self.state.joint_qd[bodies] = 0.0
-        self.state.joint_xd[bodies] = 0.0
-        self.velocity_free[bodies] = 0.0
-        self.acceleration[bodies] = 0.0
-        self._wrench[bodies] = 0.0
+        for rows in (self.state.joint_qd, self.state.joint_xd, self.velocity_free, self.acceleration, self._wrench):
+            rows[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._euler_steps[trees] = 0
         self.forward_kinematics(trees)
@@ -248,6 +248,7 @@ class ArticulationSolver:
         """Let the clusters of these trees' bunches move, from where they ride and as fast as what they ride on.
 
         Pose, velocity and momentum go on. Nothing happens to trees that are fine or have no clusters; none wakes.
+        :class:`ValueError` if there is no such tree.
         """
         self._clusters.refine(trees)
 
@@ -304,13 +305,23 @@ class ArticulationSolver:
 
     # ------------------------------------------------------------------ one step
 
-    def predict(self) -> None:
-        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts."""
-        self._checked = None
+    def predict(self, trees: np.ndarray | None = None) -> None:
+        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts.
+
+        ``trees`` [k]: only these, woken or given another phi after the prediction of all.
+        """
+        self._checked, launches = None, self.launches
         self._list_stepping()
-        self.launches.upload_step(count := len(self._runner.stepped))
-        self._runner.predict()
-        self.launches.download_prediction(count)
+        if trees is None:
+            launches.upload_step(count := len(self._runner.stepped))
+            self._runner.predict()
+            launches.download_prediction(count)
+        else:
+            count = len(trees)
+            self.list_subset(trees)
+            launches.upload_subset_step(count)
+            launches.predict_subset(count)
+            launches.download_subset_prediction(count)
         self.buffers.synchronize()
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
@@ -352,9 +363,8 @@ class ArticulationSolver:
 
     def _list_stepping(self) -> None:
         """Step the awake trees from now on, as the model is now."""
-        changed = self.launches.changed
         self.launches.upload_changed()
-        self._runner.list_trees(self._awake, model_changed=changed)
+        self._runner.list_trees(self._awake)
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
@@ -420,10 +430,10 @@ class ArticulationSolver:
             return
         bodies = self._checked = np.asarray(bodies)
         trees = self.model.body_tree[bodies]
-        at = np.searchsorted(self._runner.stepped, trees)
         stepped = self._runner.stepped
+        at = np.searchsorted(stepped, trees)
         if len(stepped) == 0 or (stepped[np.minimum(at, len(stepped) - 1)] != trees).any():
-            late = next(i for i, tree in enumerate(trees) if tree not in stepped)
+            late = int(np.argmin(np.isin(trees, stepped)))
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
         riding = bodies - self.model.tree_first[trees] >= self.tree_moving[trees]
         if riding.any():
@@ -435,20 +445,7 @@ class ArticulationSolver:
 
     def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
-        bodies = self.model.bodies_of(tree)
-        there, rates = np.asarray(joint_q, np.float32), np.asarray(joint_qd, np.float32)
-        here = self.state.joint_q[bodies]
-        if there.shape != here.shape or rates.shape != (len(here), 3):
-            raise ValueError(f"tree {tree}: pulled by joints {there.shape}, {rates.shape}; it has {len(here)} bodies")
-        there = frames.normalize(there)
-        if not np.isfinite(there).all() or not np.isfinite(rates).all() or not (there != 0.0).any(-1).all():
-            raise ValueError(
-                f"tree {tree}: pulled to a pose that is not finite or has zero quaternions; drop the update"
-            )
-        turn = frames.log(frames.multiply(frames.conjugate(here), there))
-        self.state.joint_q[bodies] = frames.normalize(frames.multiply(here, frames.exp(blend * turn)))
-        self.state.joint_qd[bodies] = rates
-        self.state.joint_qd[bodies.start + self.tree_moving[tree] : bodies.stop] = 0.0  # what rides does not turn
+        blend_towards(self, tree, joint_q, joint_qd, blend)
 
     # ------------------------------------------------------------------ ties, wrenches, damping
 
@@ -466,6 +463,11 @@ class ArticulationSolver:
     def tie_damping(self) -> np.ndarray:
         """N s/m [tie]."""
         return self._ties.damping
+
+    @property
+    def held_bodies(self) -> list[int]:
+        """Bodies that ties of :meth:`add_tie` hold."""
+        return self._ties.held_bodies
 
     def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinesim import frames
+from vinesim.physics.plants.validation import checked_trees
 
 if TYPE_CHECKING:
     from vinesim.physics.plants.articulation_solver import ArticulationSolver
@@ -42,7 +43,7 @@ class BerryClusters:
 
     def clustered_trees(self, trees: np.ndarray | int, *, fine: bool) -> np.ndarray:
         """Those of some trees that have clusters and are fine or not [k], sorted."""
-        model, trees = self._solver.model, np.unique(np.atleast_1d(trees))
+        model, trees = self._solver.model, np.unique(checked_trees(trees, len(self._solver.state.tree_fine)))
         return trees[(self._solver.state.tree_fine[trees] == fine) & (model.tree_core[trees] < model.tree_size[trees])]
 
     def clusters_of(self, trees: np.ndarray) -> np.ndarray:

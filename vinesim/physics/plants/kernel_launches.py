@@ -68,6 +68,8 @@ class KernelLaunches:
         self.buffers, self._threads, self._max_substeps = solver.buffers, threads, max_substeps
         self.changed = False
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
+        self.substeps_due = False
+        """Whether they have changed since the substeps of trees were counted."""
         self._seldom: list[str] = []
         self._register_arrays(solver)
         self._record_transfers()
@@ -101,7 +103,7 @@ class KernelLaunches:
         """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
         if self.changed:
             self.buffers.upload(self._seldom)
-            self.changed = False
+            self.changed, self.substeps_due = False, True
 
     def fill(self, struct: Any, **values: Any) -> Any:
         """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named
@@ -126,6 +128,8 @@ class KernelLaunches:
 
         self.upload_step = copier("stepping", *STEP_INPUTS)
         self.download_prediction = copier("stepping", "body_q", "body_qd", "body_qd_free", to_host=True)
+        self.upload_subset_step = copier("subset", *STEP_INPUTS)
+        self.download_subset_prediction = copier("subset", "body_q", "body_qd", "body_qd_free", to_host=True)
         self.upload_wrenches = copier("stepping", "body_wrench")
         self.download_joints = copier(
             "stepping", "joint_x", "joint_xd", "joint_q", "joint_qd", "body_acceleration", to_host=True
@@ -144,10 +148,13 @@ class KernelLaunches:
         joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
         partitioned = {"index_list": "trees", "partitions": self._threads}
-        self.predict = record(
-            predict, parameters, self._model, "stepping", "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
-            joints, "phi_used",
-            self._bodies, self._factors, scratch, prediction, **partitioned,
+        self.predict, self.predict_subset = (
+            record(
+                predict, parameters, self._model, trees, "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
+                joints, "phi_used",
+                self._bodies, self._factors, scratch, prediction, **options,
+            )
+            for trees, options in (("stepping", partitioned), ("subset", {"index_list": "trees"}))
         )  # fmt: skip
         self.integrate = record(
             integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
@@ -166,7 +173,7 @@ class KernelLaunches:
 
         self.count_substeps = record(
             first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
-            self._factors, scratch, fill(s.WrenchScratch), "tree_substeps",
+            scratch, fill(s.WrenchScratch), "tree_substeps",
         )  # fmt: skip
 
     def _record_impact(self, parameters: Any) -> None:

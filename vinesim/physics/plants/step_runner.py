@@ -85,10 +85,11 @@ class StepRunner:
 
     # ------------------------------------------------------------------ which trees, in which order
 
-    def list_trees(self, trees: np.ndarray, *, model_changed: bool) -> None:
+    def list_trees(self, trees: np.ndarray) -> None:
         """Step these trees [k] from now on; count their substeps again if they are others, or the model is."""
-        if self.stepped is trees and not model_changed:
+        if self.stepped is trees and not self._launches.substeps_due:
             return
+        self._launches.substeps_due = False
         self.stepped = trees
         self._list[: len(trees)] = trees
         self._launches.count_substeps(len(trees))

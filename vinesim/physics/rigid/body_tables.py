@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import mujoco
 import numpy as np
 
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.human_body import HumanBody
 from vinesim.physics.rigid.human_posture import VISUAL_PARTS
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
+from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
@@ -20,7 +20,7 @@ from vinesim.scene.values import RigidVisual
 
 def list_visuals(
     model: Model,
-    m: mujoco.MjModel,
+    names: WorldNames,
     robots: Mapping[str, RobotBody],
     humans: Mapping[str, HumanBody],
     bunches: Mapping[int, tuple[FreeBunch, int]],
@@ -33,7 +33,7 @@ def list_visuals(
     for box, size in enumerate(model.box_size):
         length, width, height = map(float, size)
         visuals.append(RigidVisual(f"box/{box}", Organ.BOX, box, appearance.crate_shapes((length, width, height), box)))
-        bodies.append(m.body(f"box/{box}").id)
+        bodies.append(names.body[f"box/{box}"])
     for name, robot in robots.items():
         for link, shapes in robot.shapes.items():
             if shapes:
@@ -53,13 +53,13 @@ def list_visuals(
 
 def list_owners(
     model: Model,
-    m: mujoco.MjModel,
+    names: WorldNames,
     robots: Mapping[str, RobotBody],
     humans: Mapping[str, HumanBody],
     bunch_body: Mapping[int, int],
 ) -> dict[int, tuple[str, str]]:
     """By MuJoCo body: actor and link of everything that can be added, removed or moved."""
-    owners = {m.body(f"box/{i}").id: (f"box/{i}", "box") for i in range(len(model.box_size))}
+    owners = {names.body[f"box/{i}"]: (f"box/{i}", "box") for i in range(len(model.box_size))}
     actors: dict[str, RobotBody | HumanBody] = {**robots, **humans}
     for name, actor in actors.items():
         owners.update({body: (name, link) for link, body in actor.bodies.items()})

@@ -94,7 +94,6 @@ def _parking_pose(slot: int) -> np.ndarray:
     return np.array([float(slot), 0.0, PARKING_HEIGHT, 1.0, 0.0, 0.0, 0.0])
 
 
-@functools.lru_cache(maxsize=256)  # needed again whenever the world is compiled
 def compile_alone(bunch: FreeBunch, parameters: PhysicsParameters) -> mujoco.MjModel:
     """A bunch in a world of its own; ``ValueError`` if it has too many shapes or none."""
     spec = mujoco.MjSpec()

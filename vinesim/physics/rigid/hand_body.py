@@ -11,6 +11,7 @@ from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.human_shapes import HAND_HALF_THICKNESS
 from vinesim.physics.rigid.mujoco_sleep import wake_body
+from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.scene.values import HandSample
 
 
@@ -58,13 +59,13 @@ class HandBody:
         """Whether the spring pulls the hand: it touched something a short time ago."""
         return self.steps_since_contact < self.contact_steps
 
-    def find_indices(self, m: mujoco.MjModel, actor: str) -> None:
+    def find_indices(self, m: mujoco.MjModel, names: WorldNames, actor: str) -> None:
         """Find the hand of ``actor`` in a world that was compiled anew."""
         name = f"{actor}/{self.link}"
-        joint = m.joint(name)
-        self.body, self.weld = m.body(name).id, m.equality(name).id
-        self.qpos = slice(joint.qposadr[0], joint.qposadr[0] + 7)
-        self.dofs = slice(joint.dofadr[0], joint.dofadr[0] + 6)
+        joint = names.joint[name]
+        self.body, self.weld = names.body[name], names.equality[name]
+        qpos, dof = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
+        self.qpos, self.dofs = slice(qpos, qpos + 7), slice(dof, dof + 6)
 
     # ------------------------------------------------------------------ the step
 

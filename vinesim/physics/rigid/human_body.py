@@ -21,7 +21,8 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_posture import PostureSolver
 from vinesim.physics.rigid.human_shapes import BODY_PARTS, SIDES, body_shapes, hand_shapes
-from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction
+from vinesim.physics.rigid.recompile import WorldNames
+from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROBOTS, contact_friction
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
 
 KINEMATIC_MASS = 1e4
@@ -46,18 +47,21 @@ class HumanBody:
     def __init__(
         self,
         spec: HumanSpec,
-        bit: int,
+        code: int,
         parameters: PhysicsParameters = PhysicsParameters(),
         *,
         is_remote: bool = False,
     ) -> None:
-        """``bit``: collision bit; ``is_remote``: another client moves the person and computes what the hands hold."""
+        """``code``: of :data:`HUMAN_CODES`.
+
+        ``is_remote``: another client moves the person and computes what the hands hold.
+        """
         stiffness = parameters.hand_stiffness if spec.stiffness is None else spec.stiffness
         force = parameters.hand_force if spec.force is None else spec.force
         for name, value in (("height", spec.height), ("stiffness", stiffness), ("force", force)):
             if not (math.isfinite(value) and value > 0.0):
                 raise HumanError(f"human {spec.name!r}: {name} is {value}; give a number above 0")
-        self.spec, self.bit, self.is_remote, self.parameters = spec, bit, is_remote, parameters
+        self.spec, self.code, self.is_remote, self.parameters = spec, code, is_remote, parameters
         self.hands = tuple(HandBody(side, stiffness, force, parameters) for side in SIDES)
         self.bodies: dict[str, int] = {}
         self.part_bodies = np.zeros(0, int)
@@ -118,9 +122,9 @@ class HumanBody:
 
     # ------------------------------------------------------------------ in MuJoCo
 
-    def add_to(self, spec: mujoco.MjSpec, robots: int) -> None:
-        """Add the person's bodies to a world; ``robots``: the collision bits of all robots."""
-        name, me, p = self.spec.name, 1 << self.bit, self.parameters
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add the person's bodies to a world."""
+        name, me, p = self.spec.name, self.code, self.parameters
         meets = ALL_BITS & ~me & ~REMOTE_HAND if self.is_remote else ALL_BITS & ~me
         never = mujoco.mjtSleepPolicy.mjSLEEP_NEVER
         for part, shape, pose in zip(BODY_PARTS, body_shapes(self.spec.height), self.part_poses, strict=True):
@@ -131,7 +135,7 @@ class HumanBody:
             body.add_freejoint(name=f"{name}/{part}")
             _add_geom(body, shape, (me, meets & ~GROUND), p.friction)
         for hand in self.hands:
-            hand.collision_bits = (REMOTE_HAND, meets & ~robots) if self.is_remote else (me, meets)
+            hand.collision_bits = (REMOTE_HAND, meets & ~ROBOTS) if self.is_remote else (me, meets)
             at = self.controller_pose(hand)
             body = spec.worldbody.add_body(
                 name=f"{name}/{hand.link}", pos=at[:3], quat=frames.to_wxyz(at[3:]), mass=p.hand_mass,
@@ -145,16 +149,16 @@ class HumanBody:
                 name1=f"{name}/{hand.link}", active=False, solref=[0.02, 1.0], solimp=_SOLIMP,
             )  # fmt: skip
 
-    def find_indices(self, m: mujoco.MjModel) -> None:
+    def find_indices(self, m: mujoco.MjModel, names: WorldNames) -> None:
         """Find the person's bodies and joints in a world that was compiled anew."""
         name = self.spec.name
-        self.part_bodies = np.array([m.body(f"{name}/{part}").id for part in BODY_PARTS], int)
-        joints = [m.joint(f"{name}/{part}") for part in BODY_PARTS]
-        self._part_q = np.array([j.qposadr[0] for j in joints])[:, None] + np.arange(7)
-        self.part_dofs = np.array([j.dofadr[0] for j in joints])[:, None] + np.arange(6)
+        self.part_bodies = np.array([names.body[f"{name}/{part}"] for part in BODY_PARTS], int)
+        joints = [names.joint[f"{name}/{part}"] for part in BODY_PARTS]
+        self._part_q = m.jnt_qposadr[joints].astype(int)[:, None] + np.arange(7)
+        self.part_dofs = m.jnt_dofadr[joints].astype(int)[:, None] + np.arange(6)
         self.bodies = dict(zip(BODY_PARTS, self.part_bodies.tolist(), strict=True))
         for hand in self.hands:
-            hand.find_indices(m, name)
+            hand.find_indices(m, names, name)
             self.bodies[hand.link] = hand.body
         self._hand_q = np.stack([np.arange(hand.qpos.start, hand.qpos.stop) for hand in self.hands])
         self.update_hand_collisions(m)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import threading
+import weakref
 
 import mujoco
 import numpy as np
@@ -23,6 +24,7 @@ from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_posture import VISUAL_PARTS
 from vinesim.physics.rigid.link_sensors import LinkSensors
+from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidVisual
@@ -39,6 +41,9 @@ class CompiledWorld:
     bunch_slots: int
     """Number of free bunches that it has bodies for."""
     mj_model: mujoco.MjModel
+    names: WorldNames
+    bunches: dict[int, tuple[int, FreeBunch]]
+    """Free bunches that have bodies in it already, each with its slot."""
 
 
 def _log_mujoco_warnings() -> None:
@@ -58,6 +63,8 @@ class WorldCore:
         self._free_bunches: dict[int, FreeBunch] = {}
         self._bunch_slot: dict[int, int] = {}
         """By free bunch: the number of its body in the pool."""
+        self._derived: weakref.WeakKeyDictionary[FreeBunch, mujoco.MjModel] = weakref.WeakKeyDictionary()
+        """Constants that MuJoCo derives from the mass and shapes of each free bunch."""
         self._pool_size = 0
         self._static_spec = static_world.build_static_world(model, parameters)
         self._compile_lock = threading.Lock()
@@ -65,6 +72,7 @@ class WorldCore:
         self.mj_data: mujoco.MjData
         self.contact_force: np.ndarray
         """[dof] N or N m: generalised force of all contacts and of remote people in the last step."""
+        self._names: WorldNames
         self.generation = 0
         """Counts changes of MuJoCo's model: views of its arrays must be renewed when this changes."""
         self.owners: dict[int, tuple[str, str]] = {}
@@ -132,7 +140,7 @@ class WorldCore:
         kind, _, number = actor.partition("/")
         if actor == "world":
             return 0
-        return self.mj_model.body(free_bunch.slot_name(self._bunch_slot[int(number)]) if kind == "bunch" else actor).id
+        return self._names.body[free_bunch.slot_name(self._bunch_slot[int(number)]) if kind == "bunch" else actor]
 
     # ------------------------------------------------------------------ kinematics
 
@@ -175,13 +183,15 @@ class WorldCore:
 
     def _compile_world(self, robots: tuple[RobotBody, ...], humans: tuple[HumanBody, ...]) -> CompiledWorld:
         """Compile a world with these actors and a pool of bodies for free bunches; the world in use is not changed."""
-        slots = max(self._bunch_slot.values(), default=-1) + 1 + self.parameters.bunch_pool_size
+        slot_of, bodies = dict(self._bunch_slot), dict(self._free_bunches)  # steps may go on meanwhile
+        slots = max(slot_of.values(), default=-1) + 1 + self.parameters.bunch_pool_size
+        bunches = {bunch: (slot_of[bunch], body) for bunch, body in bodies.items() if bunch in slot_of}
         with self._compile_lock:
             spec = self._static_spec.copy()
             for robot in robots:
                 robot.add_to(spec)
             for human in humans:
-                human.add_to(spec, sum(1 << robot.bit for robot in robots))
+                human.add_to(spec)
             for slot in range(slots):
                 free_bunch.add_slot(spec, slot)
             mj_model = recompile.compile_without_contacts(spec)
@@ -190,7 +200,16 @@ class WorldCore:
         mj_model.stat.meaninertia = 1.0
         for slot in range(slots):
             free_bunch.disable_collision(mj_model, slot)
-        return CompiledWorld(robots, humans, slots, mj_model)
+        for slot, body in bunches.values():
+            free_bunch.activate(mj_model, slot, body, self._derive(body))
+        return CompiledWorld(robots, humans, slots, mj_model, WorldNames.of(mj_model), bunches)
+
+    def _derive(self, body: FreeBunch) -> mujoco.MjModel:
+        """Constants of a free bunch; ``ValueError`` if it has too many shapes or none."""
+        derived = self._derived.get(body)
+        if derived is None:
+            derived = self._derived[body] = free_bunch.compile_alone(body, self.parameters)
+        return derived
 
     def _recompile(self) -> None:
         """Compile the world anew with the present actors and use it."""
@@ -198,22 +217,27 @@ class WorldCore:
 
     def _replace_world(self, compiled: CompiledWorld) -> None:
         """Use another compiled world; the state of every joint and body is transferred by its name."""
-        before = (self.mj_model, self.mj_data, self.contact_force) if self.generation else None
-        self.mj_model, self._pool_size = compiled.mj_model, compiled.bunch_slots
+        before = (self.mj_model, self._names, self.mj_data, self.contact_force) if self.generation else None
+        self.mj_model, self._names, self._pool_size = compiled.mj_model, compiled.names, compiled.bunch_slots
         m = self.mj_model
+        for bunch, (slot, body) in compiled.bunches.items():
+            if self._free_bunches.get(bunch) is not body or self._bunch_slot[bunch] != slot:
+                free_bunch.disable_collision(m, slot)  # it was removed meanwhile
         for bunch, body in self._free_bunches.items():
-            free_bunch.activate(m, self._bunch_slot[bunch], body, free_bunch.compile_alone(body, self.parameters))
+            slot = self._bunch_slot[bunch]
+            if compiled.bunches.get(bunch) != (slot, body):
+                free_bunch.activate(m, slot, body, self._derive(body))
         if before is None:
             self.mj_data, self.contact_force = mujoco.MjData(m), np.zeros(m.nv)
         else:
             slots = set(range(self._pool_size)) - set(self._bunch_slot.values())
             unused = {free_bunch.slot_name(slot) for slot in slots}
-            self.mj_data, self.contact_force = recompile.transfer_state(*before, m, unused)
+            self.mj_data, self.contact_force = recompile.transfer_state(*before, m, self._names, unused)
         self._effective_mass = EffectiveMass(m)
         self._valid_qpos = self.mj_data.qpos.copy()
         self._kinematics_current = False
         for actor in (*self._robots.values(), *self._humans.values()):
-            actor.find_indices(m)
+            actor.find_indices(m, self._names)
         self._link_sensors.find_indices(m, self._robots)
         for human in self._humans.values():
             for hand in human.hands:
@@ -237,11 +261,11 @@ class WorldCore:
         """List all bodies and geoms anew after a change of MuJoCo's model, and count :attr:`generation`."""
         self.generation += 1
         m = self.mj_model
-        bunch_body = {i: m.body(free_bunch.slot_name(slot)).id for i, slot in self._bunch_slot.items()}
+        bunch_body = {i: self._names.body[free_bunch.slot_name(slot)] for i, slot in self._bunch_slot.items()}
         bunches = {i: (body, bunch_body[i]) for i, body in self._free_bunches.items()}
-        self._visuals, self._visual_body = list_visuals(self.model, m, self._robots, self._humans, bunches)
+        self._visuals, self._visual_body = list_visuals(self.model, self._names, self._robots, self._humans, bunches)
         self._visual_row = np.zeros(m.nbody, int)
         own = self._visual_body > 0
         self._visual_row[self._visual_body[own]] = np.flatnonzero(own)
-        self.owners = list_owners(self.model, m, self._robots, self._humans, bunch_body)
+        self.owners = list_owners(self.model, self._names, self._robots, self._humans, bunch_body)
         self.geoms = collision_geoms.movable_geoms(m, self.owners)

@@ -11,6 +11,8 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
@@ -71,42 +73,45 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         del self._humans[name]
         self._recompile()
 
-    def compile_with(self, spec: RobotSpec | HumanSpec, *, is_remote: bool = False) -> CompiledWorld:
-        """Compile the world with one more actor, for :meth:`adopt`; any thread may call this while steps go on.
+    def compile_with(self, *specs: RobotSpec | HumanSpec, is_remote: bool = False) -> CompiledWorld:
+        """Compile the world with more actors and a full pool of spare bodies for free bunches, for :meth:`adopt`.
 
-        Raises :class:`RobotError` if the URDF does not compile. ``is_remote``: see :meth:`add_human`.
+        Any thread may call this while steps go on. Raises :class:`RobotError` if a URDF does not compile, of several
+        robots without saying which. ``is_remote``: see :meth:`add_human`.
         """
-        robots, humans = tuple(self._robots.values()), tuple(self._humans.values())
-        if isinstance(spec, HumanSpec):
-            bit = self._free_collision_bit("human", spec.name, HumanError)
-            human = HumanBody(spec, bit, self.parameters, is_remote=is_remote)
-            return self._compile_world(robots, (*humans, human))
-        robot = RobotBody(spec, self._free_collision_bit("robot", spec.name, RobotError), self.parameters)
+        robots, humans = list(self._robots.values()), list(self._humans.values())
+        for spec in specs:
+            if isinstance(spec, HumanSpec):
+                code = _free_code(spec.name, "human", static_world.HUMAN_CODES, humans, robots, HumanError)
+                humans.append(HumanBody(spec, code, self.parameters, is_remote=is_remote))
+            else:
+                code = _free_code(spec.name, "robot", static_world.ROBOT_CODES, robots, humans, RobotError)
+                robots.append(RobotBody(spec, code, self.parameters))
         try:
-            return self._compile_world((*robots, robot), humans)
+            return self._compile_world(tuple(robots), tuple(humans))
         except ValueError as error:
-            raise build_error(spec, error) from error
+            added = [spec for spec in specs if isinstance(spec, RobotSpec)]
+            if not added:
+                raise
+            raise build_error(added[-1], error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
-        """Use a world that was compiled with one more actor; between steps.
+        """Use a world that was compiled with more actors or more room for free bunches; between steps.
 
         False, and nothing is changed, if other actors joined or left meanwhile: compile it anew.
         """
         present = (*self._robots.values(), *self._humans.values())
         planned = (*compiled.robots, *compiled.humans)
-        (added, *more) = [actor for actor in planned if actor not in present] or [None]
-        others = tuple(actor for actor in planned if actor is not added)
-        has_room = compiled.bunch_slots > max(self._bunch_slot.values(), default=-1)
-        if added is None or more or others != present or not has_room:
+        added = [actor for actor in planned if actor not in present]
+        stays = tuple(actor for actor in planned if actor not in added) == present
+        if not stays or compiled.bunch_slots <= max(self._bunch_slot.values(), default=-1):
             return False
-        if isinstance(added, HumanBody):
-            self._humans[added.spec.name] = added
-            self._replace_world(compiled)
-            return True
-        spec = added.spec
-        self._robots[spec.name] = added
+        self._robots = {robot.spec.name: robot for robot in compiled.robots}
+        self._humans = {human.spec.name: human for human in compiled.humans}
         self._replace_world(compiled)
-        self.place_robot(spec.name, spec.pose, spec.home)
+        for actor in added:
+            if isinstance(actor, RobotBody):
+                self.place_robot(actor.spec.name, actor.spec.pose, actor.spec.home)
         return True
 
     def actor_position(self, name: str) -> np.ndarray:
@@ -124,18 +129,6 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             names = [self.owners[body][0] if body in self.owners else m.geom(geom).name for body, geom in pairs]
             found.append((names[0], names[1], -float(contact.dist)))
         return found
-
-    def _free_collision_bit(self, kind: str, name: str, error: type[ValueError]) -> int:
-        """A collision bit that no actor has, for one that is added; ``error`` if there is none or the name is taken."""
-        if name in self.actors:
-            raise error(f"{kind} {name!r} is already here; give the newcomer another name")
-        if "/" in name or not name:
-            raise error(f"{kind} name {name!r} must not be empty nor contain '/', which parts actor and link")
-        used = {actor.bit for actor in (*self._robots.values(), *self._humans.values())}
-        free = [bit for bit in range(static_world.FIRST_ACTOR, static_world.LAST_ACTOR + 1) if bit not in used]
-        if not free:
-            raise error(f"{kind} {name!r} is one too many: {len(used)} robots and people share this world, remove one")
-        return free[0]
 
     # ------------------------------------------------------------------ the step, in two halves
 
@@ -171,8 +164,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         """[dof] joint (or free bunch) and number in it, which are the same after the world is compiled anew."""
         m = self.mj_model
         bunch_in = {free_bunch.slot_name(slot): f"bunch/{bunch}" for bunch, slot in self._bunch_slot.items()}
-        names = [m.joint(i).name for i in range(m.njnt)]
-        of = [bunch_in.get(name, name) for name in names]
+        of = [bunch_in.get(name, name) for name in self._names.joints]
         return [(of[i], int(v - m.jnt_dofadr[i])) for v, i in enumerate(m.dof_jntid.tolist())]
 
     @property
@@ -215,9 +207,10 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
     def rebind(self, mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
         """Use another MuJoCo world in which the robots' joints and bodies have the same names."""
         self.mj_model, self.mj_data, self.contact_force = mj_model, mj_data, np.zeros(mj_model.nv)
+        self._names = recompile.WorldNames.of(mj_model)
         self._kinematics_current = False
         for robot in self._robots.values():
-            robot.find_indices(mj_model)
+            robot.find_indices(mj_model, self._names)
         self._link_sensors.find_indices(mj_model, self._robots)
 
     def _stop_faulty_trees(self) -> None:
@@ -241,3 +234,19 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         stopped = [m.body(m.tree_bodyadr[tree]).name for tree in np.flatnonzero(faulty)]
         self.faults += len(stopped)
         self.last_fault = f"t = {d.time:.2f} s: {', '.join(stopped)} moved by a number that is not finite; stopped"
+
+
+def _free_code(
+    name: str, kind: str, codes: tuple[int, ...], actors: Sequence[RobotBody | HumanBody],
+    others: Sequence[RobotBody | HumanBody], error: type[ValueError],
+) -> int:  # fmt: skip
+    """A collision code that none of ``actors`` of its kind has; ``error`` if there is none or the name is taken."""
+    if any(name == actor.spec.name for actor in (*actors, *others)):
+        raise error(f"{kind} {name!r} is already here; give the newcomer another name")
+    if "/" in name or not name:
+        raise error(f"{kind} name {name!r} must not be empty nor contain '/', which parts actor and link")
+    used = {actor.code for actor in actors}
+    free = next((code for code in codes if code not in used), None)
+    if free is None:
+        raise error(f"{kind} {name!r} is one too many: {len(used)} of that kind share this world, remove one")
+    return free

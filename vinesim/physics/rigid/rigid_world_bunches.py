@@ -16,6 +16,11 @@ from vinesim.physics.rigid.mujoco_world import WorldCore
 class BunchAccess(WorldCore):
     """Picked bunches as free bodies."""
 
+    @property
+    def bunch_room(self) -> int:
+        """Number of free bunches that still get bodies without the world being compiled anew."""
+        return self._pool_size - 1 - max(self._bunch_slot.values(), default=-1)
+
     def add_bunch(self, bunch: int, body: FreeBunch, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Add a bunch at ``pose`` [7] with ``velocity`` [6] (of its origin, angular; world axes)."""
         self.add_bunches({bunch: (body, pose, velocity)})
@@ -24,7 +29,7 @@ class BunchAccess(WorldCore):
         """Add several bunches, each with its pose [7] and velocity [6]; ``ValueError`` if one exists already."""
         if known := sorted(bunches.keys() & self._free_bunches.keys()):
             raise ValueError(f"bunch {known[0]} is free already")
-        compiled = {bunch: free_bunch.compile_alone(body, self.parameters) for bunch, (body, _, _) in bunches.items()}
+        derived = {bunch: self._derive(body) for bunch, (body, _, _) in bunches.items()}
         unused = iter(sorted(set(range(self._pool_size + len(bunches))) - set(self._bunch_slot.values())))
         for bunch, (body, _, _) in bunches.items():
             self._free_bunches[bunch], self._bunch_slot[bunch] = body, next(unused)
@@ -32,7 +37,7 @@ class BunchAccess(WorldCore):
             self._recompile()
         else:
             for bunch, (body, _, _) in bunches.items():
-                free_bunch.activate(self.mj_model, self._bunch_slot[bunch], body, compiled[bunch])
+                free_bunch.activate(self.mj_model, self._bunch_slot[bunch], body, derived[bunch])
             self._update_tables()
         for bunch, (_, pose, velocity) in bunches.items():
             self.place_bunch(bunch, pose, velocity)

@@ -24,13 +24,13 @@ _PLANAR = ("x", "y", "yaw")
 class RobotBody:
     """One robot: targets and gains of its drives, and its indices in MuJoCo's arrays."""
 
-    def __init__(self, spec: RobotSpec, bit: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``bit``: collision bit. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
+    def __init__(self, spec: RobotSpec, code: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        """``code``: of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
         check(spec)
         joints, pose = len(spec.drives), np.asarray(spec.pose, float)
-        self.spec, self.bit, self.parameters = spec, bit, parameters
+        self.spec, self.code, self.parameters = spec, code, parameters
         try:
-            self._parsed = _parse(spec, 1 << bit, parameters.friction)
+            self._parsed = _parse(spec, code, parameters.friction)
         except ValueError as error:
             raise build_error(spec, error) from error
         self.shapes = shapes_of(spec.urdf)
@@ -93,20 +93,18 @@ class RobotBody:
         for i, axis in enumerate(_PLANAR):
             _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
 
-    def find_indices(self, m: mujoco.MjModel) -> None:
+    def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames) -> None:
         """Find the robot's bodies and joints in a world that was compiled anew."""
         name = self.spec.name
-        joints = [m.joint(f"{name}/{drive.joint}") for drive in self.spec.drives]
-        planar = [m.joint(f"{name}:{axis}") for axis in _PLANAR]
-        self.q = np.array([j.qposadr[0] for j in joints], int)
-        self.v = np.array([j.dofadr[0] for j in joints], int)
+        driven, planar = [f"{name}/{drive.joint}" for drive in self.spec.drives], [f"{name}:{axis}" for axis in _PLANAR]
+        joints, base = ([names.joint[joint] for joint in some] for some in (driven, planar))
+        self.q, self.v = m.jnt_qposadr[joints].astype(int), m.jnt_dofadr[joints].astype(int)
         self.inertia_index = (m.M_rowadr + m.M_rownnz - 1)[self.v]
-        self.actuator = np.array([m.actuator(f"{name}/{drive.joint}").id for drive in self.spec.drives], int)
-        self.base_q = np.array([j.qposadr[0] for j in planar], int)
-        self.base_v = np.array([j.dofadr[0] for j in planar], int)
-        self.base_actuator = np.array([m.actuator(f"{name}:{axis}").id for axis in _PLANAR], int)
-        names = recompile.object_names(m, m.name_bodyadr)
-        self.bodies = {n.removeprefix(name + "/"): i for i, n in enumerate(names) if n.startswith(name + "/")}
+        self.actuator = np.array([names.actuator[joint] for joint in driven], int)
+        self.base_q, self.base_v = m.jnt_qposadr[base].astype(int), m.jnt_dofadr[base].astype(int)
+        self.base_actuator = np.array([names.actuator[joint] for joint in planar], int)
+        mine = name + "/"
+        self.bodies = {n.removeprefix(mine): i for i, n in enumerate(names.bodies) if n.startswith(mine)}
         self._set_gains(m)
 
     def place(self, m: mujoco.MjModel, d: mujoco.MjData, pose: np.ndarray, position: np.ndarray) -> None:
@@ -224,11 +222,11 @@ class RobotBody:
         return joints
 
 
-def _parse(given: RobotSpec, bit: int, friction: float) -> mujoco.MjSpec:
-    """A robot without base and servos from its URDF; its shapes carry the collision ``bit``."""
+def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
+    """A robot without base and servos from its URDF; its shapes carry the collision ``code``."""
     child = mujoco.MjSpec.from_string(collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives)))
     for geom in child.geoms:
-        geom.contype, geom.conaffinity = bit, ALL_BITS & ~bit & ~GROUND & ~REMOTE_HAND
+        geom.contype, geom.conaffinity = code, ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
         geom.friction = contact_friction(friction)
     for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL

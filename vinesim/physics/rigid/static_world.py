@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mujoco
 import numpy as np
 
@@ -21,9 +23,24 @@ CRATE_COLOR = (0.75, 0.15, 0.12, 1.0)
 GROUND, FIXED, BOX, CRATE_FLOOR, FREE_BUNCH, REMOTE_HAND = (1 << bit for bit in range(6))
 """Collision bits. Free bunches touch the deep bed of a crate, all others its thin floor. Robots do not touch hands of
 remote people: the person's own client computes with what force they push."""
-FIRST_ACTOR, LAST_ACTOR = 6, 30
-"""Positions of the bits of robots and people. Each actor has its own, so that it never touches itself."""
-ALL_BITS = (1 << (LAST_ACTOR + 1)) - 1
+_ROBOT_BITS, _HUMAN_BITS = range(6, 18), range(18, 31)
+ROBOTS, HUMANS = sum(1 << bit for bit in _ROBOT_BITS), sum(1 << bit for bit in _HUMAN_BITS)
+"""Collision bits that codes of robots and of people consist of."""
+ALL_BITS = (1 << (_HUMAN_BITS[-1] + 1)) - 1
+_CODE_WEIGHT = 6
+
+
+def _codes(bits: range) -> tuple[int, ...]:
+    return tuple(sum(1 << bit for bit in code) for code in itertools.combinations(bits, _CODE_WEIGHT))
+
+
+ROBOT_CODES, HUMAN_CODES = _codes(_ROBOT_BITS), _codes(_HUMAN_BITS)
+"""Collision codes: each actor has one of its own, so that it never touches itself but all others.
+
+MuJoCo lets two geoms touch if ``contype`` of one and ``conaffinity`` of the other share a bit. An actor has its code as
+``contype`` and all other bits in ``conaffinity``. Codes of one kind all have six bits, so none contains another: each
+has a bit that the other has not. 31 bits thus tell 924 robots and 1716 people apart; a bit for each would do for 25.
+"""
 
 
 def contact_friction(coefficient: float, rolling_arm: float = 0.0001) -> list[float]:

@@ -45,10 +45,13 @@ BOLTED_EFFORT = (1e6, 1e6)
 """[N], [N m] With which the base of a robot that is bolted down is held: a robot's pushes move it by micrometres."""
 
 
-def load_description(name: str | pathlib.Path, *, is_remote: bool = False) -> RobotDescription:
+def load_description(
+    name: str | pathlib.Path, *, is_remote: bool = False, sidecar: Sidecar | None = None
+) -> RobotDescription:
     """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
 
-    ``is_remote``: its text came over the network, so no file that it names is opened.
+    ``is_remote``: its text came over the network, so no file that it names is opened. ``sidecar``: instead of the
+    TOML file beside the URDF.
     Raises :class:`DescriptionError` in one line if it cannot be simulated.
     """
     file = _locate(str(name))
@@ -64,7 +67,7 @@ def load_description(name: str | pathlib.Path, *, is_remote: bool = False) -> Ro
     rename_world(root, notes)
     repair_joints(root, assumed)
     repair_inertias(root, assumed)
-    sidecar = read_sidecar(file.with_suffix(".toml"))
+    sidecar = read_sidecar(file.with_suffix(".toml")) if sidecar is None else sidecar
     cameras = sidecar.cameras if sidecar.cameras is not None else guess_cameras(root, notes)
     lidars = sidecar.lidars if sidecar.lidars is not None else guess_lidars(root, notes)
     sidecar = msgspec.structs.replace(sidecar, cameras=cameras, lidars=lidars)

@@ -11,6 +11,7 @@ from collections.abc import Container, Iterable
 from typing import Literal
 
 import msgspec
+import numpy as np
 
 from vinesim.robot.description.errors import description_error
 
@@ -116,6 +117,42 @@ def read_sidecar(file: pathlib.Path) -> Sidecar:
         return msgspec.toml.decode(file.read_bytes(), type=Sidecar)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
         raise description_error(file, str(error), "see data/robots/vinebot.toml for what may be said") from error
+
+
+MAX_REMOTE_SIDECAR = 1 << 16
+"""Longest sidecar that is accepted from another client [B]."""
+
+MAX_REMOTE_NUMBER = 1e7
+"""Largest gain, limit or position in it: ten times those of a robot that is bolted down."""
+
+
+def encode_sidecar(base: BaseLimits, groups: dict[str, JointGroup]) -> str:
+    """What copies of a robot need on other clients, as JSON: limits of the base, joint groups with their gains.
+
+    Sensors and cutters act where the robot is simulated, and are not part of it.
+    """
+    return msgspec.json.encode(Sidecar(base=base, groups=groups)).decode()
+
+
+def decode_sidecar(text: str) -> Sidecar:
+    """The sidecar of another client's robot, without sensors, so that no file is looked for.
+
+    :class:`DescriptionError` if it is too long or malformed; ``check_sidecar`` checks its names and values.
+    """
+    origin = pathlib.Path("sidecar of another client")
+    if len(text) > MAX_REMOTE_SIDECAR:
+        raise description_error(origin, f"{len(text)} B", f"send at most {MAX_REMOTE_SIDECAR} B")
+    try:
+        found = msgspec.json.decode(text, type=Sidecar) if text else Sidecar()
+    except (msgspec.DecodeError, msgspec.ValidationError, RecursionError) as error:
+        raise description_error(origin, str(error), "use the same release of vinesim") from error
+    arrays = {name: values for group in found.groups.values() for name, values in group.arrays().items() if values}
+    limits = msgspec.structs.asdict(found.base)
+    for name, values in (*arrays.items(), *((key, np.atleast_1d(value)) for key, value in limits.items())):
+        least = -MAX_REMOTE_NUMBER if name == "home" else 0.0
+        if not all(least <= number <= MAX_REMOTE_NUMBER for number in values):
+            raise description_error(origin, f"{name} of {values}", f"give {least:g} to {MAX_REMOTE_NUMBER:g}")
+    return Sidecar(base=found.base, groups=found.groups)
 
 
 def check_sidecar(sidecar: Sidecar, driven: Container[str], links: Container[str], file: pathlib.Path) -> None:

@@ -84,7 +84,13 @@ def build(package: str) -> pathlib.Path:
         return place
     _check_toolchain(package)
     log.info("building %s once (10 to 20 s) into %s", package, place)
-    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as bad:
+        raise InterfacesError(
+            f"could not build message package {package!r}: {bad.strerror} at {place.parent}; make it writable, or set "
+            "XDG_CACHE_HOME to another folder"
+        ) from None
     with tempfile.TemporaryDirectory(prefix=f".{package}-", dir=place.parent) as scratch:
         done = pathlib.Path(scratch) / "done"
         # In a process of its own: the generators print, and their template engine replaces sys.stdout.

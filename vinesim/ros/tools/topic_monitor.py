@@ -4,7 +4,8 @@
 prints one JSON object: per topic the type and its hash, messages, rate, the fewest messages in any second, bytes, the
 median time from publishing to here (the age, for what was latched), the age of the stamp at arrival by /clock, the
 messages lost (gaps in the publisher's numbering) and whether the stamps ever went back. Without ``--seconds`` it runs
-until its standard input is closed; a line "restart" there begins the counts anew.
+until its standard input is closed; a line "restart" there begins the counts anew, and for a line "counts" it prints
+the number of messages of each topic, a JSON object on one line.
 
 With ``--announce`` it prints a JSON object when it listens and for the first message of every topic, each on a line,
 as the report then. With
@@ -165,7 +166,7 @@ class TopicMonitor:
         self._executor.add_node(self._node)
 
     def run(self, requests: queue.SimpleQueue[str], seconds: float | None) -> None:
-        """Count messages until a request "stop", or for so many ``seconds`` [s] after the first message."""
+        """Count messages and obey requests until "stop", or for so many ``seconds`` [s] after the first message."""
         next_look = 0.0
         deadline = None
         while deadline is None or time.monotonic() < deadline:
@@ -178,9 +179,13 @@ class TopicMonitor:
             if seconds is not None and deadline is None and any(topic.count for topic in self.stats.values()):
                 deadline = time.monotonic() + seconds
             while not requests.empty():
-                if requests.get() == "stop":
-                    return
-                self.restart()
+                match requests.get():
+                    case "stop":
+                        return
+                    case "counts":
+                        _print_line({"counts": {name: topic.count for name, topic in self.stats.items()}})
+                    case _:
+                        self.restart()
 
     def restart(self) -> None:
         """Begin all counts anew."""

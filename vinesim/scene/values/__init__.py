@@ -6,7 +6,7 @@ A value that leaves the physics thread owns its arrays: they are never written a
 
 from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPose, HumanSpec
 from vinesim.scene.values.measurement import Measurement
-from vinesim.scene.values.network import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values.network import Coupling, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 from vinesim.scene.values.rigid import Mesh, RigidVisual, Shape
 from vinesim.scene.values.robot import Drive, ElasticSample, Imu, JointSample, RobotSample, RobotSpec, Wrench
 from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
@@ -20,6 +20,7 @@ __all__ = [
     "CameraOutput",
     "ComponentStatus",
     "Contact",
+    "Coupling",
     "Detachment",
     "Drive",
     "ElasticSample",

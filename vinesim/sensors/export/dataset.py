@@ -231,7 +231,7 @@ class VineyardRenderer:
                 rng.uniform(*BUNCH_DISTANCE),
                 rng.uniform(0.0, 2.0 * np.pi),
             )
-            if actors and attempt < _TRIES_WITH_ACTORS:  # somebody is behind the bunch
+            if actors and attempt < _TRIES_WITH_ACTORS:  # a person is behind the bunch
                 behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
             rise = height - middle[2]

@@ -43,6 +43,8 @@ _PRIMITIVE_COLUMNS = {
     **dict.fromkeys(("kind", "carrier", "label", "organ", "material"), wp.int32),
 }  # fmt: skip
 """Values of each primitive: ``local_`` in the frame of its carrier, the others in the world."""
+_ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
+"""Fields of :class:`ClusterLayout` with a value for each primitive."""
 _CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
 """Values of each cluster."""
 _TEXTURES = (
@@ -175,10 +177,13 @@ class Primitives:
         self.plant_count = len(baked["label"])
         """How many primitives are plants or the static scene; those of rigid bodies follow them."""
         names = [field.name for field in dataclasses.fields(ClusterLayout)]
-        self._plants = ClusterLayout(**{name: baked[name] for name in names})
+        plants = ClusterLayout(**{name: baked[name] for name in names})
         self._columns = {}
-        self._reserve(self._plants, 0)
-        self._write(self._plants, baked["sky"], 0, 0)
+        self._reserve(plants, 0)
+        self._write(plants, baked["sky"], 0, 0)
+        self._plant_lamps = np.flatnonzero(plants.material == int(materials.LAMP))
+        nothing = np.zeros(0, np.float32)  # the columns hold these: hundreds of megabytes in a large vineyard
+        self._plants = dataclasses.replace(plants, **dict.fromkeys(_ONLY_IN_COLUMNS, nothing))
         trees = len(self.model.tree_first)
         self._by_owner = np.argsort(self._plants.owner, kind="stable")
         self._owner_start = np.searchsorted(self._plants.owner[self._by_owner], np.arange(trees + 1))
@@ -188,7 +193,7 @@ class Primitives:
     def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
         """Lay out the primitives of rigid bodies behind those of the plants, which stay as they are."""
         plants = self._plants
-        rows, clusters = len(plants.label), len(plants.first)
+        rows, clusters = self.plant_count, len(plants.first)
         bodies = self._lay_out_rigid(visuals)
         empty = not bodies
         rigid = plants if empty else join_rigid([one for _, one in bodies], [carrier for carrier, _ in bodies], rows)
@@ -201,9 +206,10 @@ class Primitives:
         parts = [plants] if empty else [plants, rigid]
         joined = {
             name: np.concatenate([getattr(part, name) for part in parts])
-            for name in ("label", "organ", "first", "size", "kind", "owner", "bunch")
+            for name in ("first", "size", "kind", "owner", "bunch")
         }
-        self.label, self.organ = joined["label"], joined["organ"]
+        end = rows if empty else rows + len(rigid.label)
+        self.label, self.organ = (self._columns[name][:end].numpy() for name in ("label", "organ"))
         self.cluster_first, self.cluster_size, self.cluster_kind = joined["first"], joined["size"], joined["kind"]
         self._owner, self._cluster_bunch = joined["owner"], joined["bunch"]
         self.rigid_clusters = np.arange(clusters, len(self.cluster_first))
@@ -212,8 +218,10 @@ class Primitives:
             version[:clusters] = self.cluster_version[:clusters]
         self.cluster_version = version
         """:attr:`pose_version` at which each cluster moved last."""
-        lamps = [np.flatnonzero(part.material == int(materials.LAMP)) for part in parts]
-        self.lamp_primitives = lamps[0] if empty else np.concatenate([lamps[0], lamps[1] + rows])
+        lamps = self._plant_lamps
+        if not empty:
+            lamps = np.concatenate([lamps, np.flatnonzero(rigid.material == int(materials.LAMP)) + rows])
+        self.lamp_primitives = lamps
         """Primitives that emit light."""
         self._bind()
         poses = np.zeros((self._static_carrier + 1 + len(visuals), 7), np.float32)
@@ -243,7 +251,7 @@ class Primitives:
     def _reserve(self, plants: ClusterLayout, rigid: int) -> None:
         """Device memory for the plants and twice as many rigid primitives as given; that of the plants is kept."""
         kept, room = self._columns, max(2 * rigid, _RIGID_ROOM)
-        for names, count in ((_PRIMITIVE_COLUMNS, len(plants.label)), (_CLUSTER_COLUMNS, len(plants.first))):
+        for names, count in ((_PRIMITIVE_COLUMNS, self.plant_count), (_CLUSTER_COLUMNS, len(plants.first))):
             for name, kind in names.items():
                 column = wp.zeros(count + room, dtype=kind, device=self.device)
                 if name in kept:

@@ -211,7 +211,7 @@ def _soil_texture() -> disk_cache.Arrays:
 def _sky_layers() -> disk_cache.Arrays:
     """What of the sky no sun changes: ``cloud``, its share; and of ``ridges`` and ``trees`` in front of it, which reach
     up to some row, the shares and the colour of the trees. float64, as they are mixed."""
-    height, azimuth = _sky_directions()
+    height, azimuth = (np.ascontiguousarray(part) for part in np.broadcast_arrays(*_sky_directions()))
     flat = np.sqrt(1.0 - height**2)
     far = 0.22 / (height + 0.12)
     cover = sample_noise(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
@@ -243,24 +243,19 @@ _SKY_BAND = 12
 """Rows of the sky's table that are computed at once, so few that they stay in a core's cache; divides the ridge's."""
 
 
-@functools.cache
 def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
-    """Sine of elevation and azimuth [rad] of the sky's table."""
-    height = (np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2) * np.ones((1, SKY_COLUMNS))
-    return height, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None] * np.ones((SKY_ROWS, 1))
+    """Sine of elevation [row, 1] and azimuth [1, column] rad of the sky's table."""
+    return np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None]
 
 
-@functools.cache
-def _clear_sky() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What is the same for every sun: horizontal components of the directions and the blue [row, column, 3]."""
-    height, azimuth = _sky_directions()
-    flat = np.sqrt(1.0 - height**2)
+def _clear_sky() -> np.ndarray:
+    """The blue of a sky without clouds [row, 1, 3]: it is the same all around."""
+    height, _ = _sky_directions()
     horizon = np.exp(-5.5 * height)[..., None]
-    blue = (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
-    return flat * np.cos(azimuth), flat * np.sin(azimuth), blue
+    return (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
 
 
-@functools.lru_cache(maxsize=4)
+@functools.lru_cache(maxsize=1)  # cameras of one robot see the same sun
 def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
     """Radiance of the sky by sqrt(sine of elevation) and azimuth: [SKY_ROWS, SKY_COLUMNS, 3] float32.
 
@@ -276,9 +271,10 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
 
 def _sky_rows(rows: slice, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
     """Some rows of the sky's table [row, SKY_COLUMNS, 3]; they lie within or beyond :data:`_RIDGE_ROWS`."""
-    (height, _), layers = _sky_directions(), _sky_layers()
-    x, y, colour = (part[rows] for part in _clear_sky())
-    height = height[rows]
+    (height, azimuth), layers = _sky_directions(), _sky_layers()
+    height, colour = height[rows], _clear_sky()[rows]
+    flat = np.sqrt(1.0 - height**2)
+    x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
     halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
     colour = colour + halo[..., None] * colour_of_sun

@@ -1,0 +1,79 @@
+"""A process that hangs is started again; one that is slow to start is not."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from tests.support.waiting import wait
+from vinesim.client.sensing import worker_process
+from vinesim.client.sensing.worker_process import WorkerProcess
+
+MODULES = ("tests.client.test_worker_process",)
+HANG_TIMEOUT = 2
+
+
+class Nothing:
+    """What a process of these tests shares with its parent."""
+
+    def close(self) -> None:
+        pass
+
+
+def report_until_stopped(start_time: float, _shared: Nothing, pipe) -> None:
+    """Ready after ``start_time`` [s], then a message ten times a second."""
+    time.sleep(start_time)
+    pipe.send(("ready", None))
+    while not pipe.poll(0.1):
+        pipe.send(("alive", None))
+
+
+@pytest.fixture
+def start(monkeypatch) -> Iterator[Callable[[float], WorkerProcess]]:
+    monkeypatch.setattr(worker_process, "HANG_TIMEOUT", HANG_TIMEOUT)
+    workers = []
+
+    def start_worker(start_time: float) -> WorkerProcess:
+        workers.append(
+            WorkerProcess(
+                "the test process", MODULES, report_until_stopped, start_time, lambda _: Nothing(), lambda *_: None
+            )
+        )
+        return workers[-1]
+
+    yield start_worker
+    for worker in workers:
+        worker.close()
+
+
+def test_a_process_that_hangs_is_killed_and_started_again(start, caplog):
+    caplog.set_level(logging.WARNING)
+    worker = start(0.0)
+    wait(lambda: worker.is_ready, "the process to be ready")
+    former = worker.current().process
+    os.kill(former.pid, signal.SIGSTOP)
+    wait(lambda: worker.restarts == 1 and worker.is_ready, "a process that is ready again")
+    assert not former.is_alive()
+    assert worker.current().process.pid != former.pid
+    assert "the test process failed: it hung: nothing came from it for 2 s; starting it again" in caplog.messages
+
+
+@pytest.mark.slow
+def test_a_process_that_hangs_before_it_is_ready_is_started_again_later(start, monkeypatch):
+    """What may compile kernels for minutes is not hung, yet it is not waited for without end."""
+    monkeypatch.setattr(worker_process, "START_TIMEOUT", 3 * HANG_TIMEOUT)
+    worker = start(2.0 * HANG_TIMEOUT)
+    wait(lambda: worker.is_ready, "the process to be ready")
+    assert worker.restarts == 0
+    former = worker.current().process.pid
+    os.kill(former, signal.SIGKILL)
+    wait(lambda: worker.current().process.pid != former, "a restart")
+    os.kill(worker.current().process.pid, signal.SIGSTOP)
+    stopped = time.monotonic()
+    wait(lambda: worker.restarts == 2, "another restart")
+    assert time.monotonic() - stopped > 2.0 * HANG_TIMEOUT

@@ -1,0 +1,43 @@
+"""The C allocator of this process: large blocks that are freed go back to the system at once.
+
+glibc raises its threshold for blocks of their own to the largest block that was ever freed, up to 32 MiB: after the
+first tables of a vineyard have come and gone, all smaller ones lie in the heap, which keeps the gaps between them. A
+threshold that is set stays (mallopt(3)). Other C libraries are left as they are.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import gc
+import sys
+
+BLOCK_SIZE = 4 << 20
+"""Blocks from this size on [bytes] lie outside the heap: tables of a scene do, arrays of one picture do not."""
+KEPT_SIZE = 64 << 20
+"""So much free memory at the end of the heap is kept [bytes], as glibc does when it sets the threshold itself."""
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+"""Numbers of glibc's malloc.h."""
+
+
+@functools.cache
+def _glibc() -> ctypes.CDLL | None:
+    """The C library of this process; None unless it is glibc."""
+    if sys.platform != "linux":
+        return None
+    library = ctypes.CDLL(None)
+    return library if hasattr(library, "gnu_get_libc_version") else None
+
+
+def keep_large_blocks_apart() -> None:
+    """Let blocks of :data:`BLOCK_SIZE` go back to the system when they are freed. Call it before tables are made."""
+    if (library := _glibc()) is not None:
+        library.mallopt(_MMAP_THRESHOLD, BLOCK_SIZE)
+        library.mallopt(_TRIM_THRESHOLD, KEPT_SIZE)
+
+
+def release_free_memory() -> None:
+    """Collect garbage and give free pages of the heap back to the system: once, when all is built."""
+    gc.collect()
+    if (library := _glibc()) is not None:
+        library.malloc_trim(0)

@@ -1,0 +1,135 @@
+"""Two actors of different clients at one tree: the force of the second reaches the simulation that owns the tree.
+
+The second actor's client simulates its contacts with its copy of the tree. It sends each as a virtual coupling: a
+spring of fixed stiffness whose anchor is chosen such that, at the place where the copy is, it pulls with the force of
+the contact. The owner's client holds the body by that spring and a damper, solved implicitly with the plant as a
+person's hand is. Where copy and tree agree the force is that of the contact; where they do not, as after a delay, the
+spring pulls them together. A force alone would not: fed back through two delays it grows
+(``docs/decisions/forces-between-clients.md``). Source: virtual coupling, J. E. Colgate et al., 1995; damping that keeps
+delayed springs stable, E. Nuno et al., 2009.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.physics.plants.ties import TieLimitError
+from vinesim.physics.step import Physics
+from vinesim.scene.values import Coupling
+
+STIFFNESS = 300.0
+"""Stiffness of a coupling [N/m]; the same for all clients, since anchors are computed from it."""
+
+DAMPING = 20.0
+"""Damping of a coupling [N s/m]: the stiffness times more than the longest delay it is meant for, half a round trip of
+0.1 s each way, would be 30; plants have damping of their own. TUNED."""
+
+MAX_FORCE = 100.0
+"""Largest force of a coupling [N]: that of a hand (CANOPIES D6.4, section 3.1.1)."""
+
+MIN_FORCE = 1e-3
+"""Contacts that press less are not sent [N]."""
+
+SLIDE = 0.005
+"""A coupling is moved on its body when its point has slid by more than this [m]."""
+
+
+@dataclasses.dataclass(slots=True)
+class _Tie:
+    """The tie of one coupling."""
+
+    tie: int
+    point: np.ndarray
+
+
+class PlantCouplings:
+    """Couplings from this client's contacts, and ties for those of other clients."""
+
+    def __init__(self, physics: Physics) -> None:
+        self.physics = physics
+        self.refused = 0
+        """Couplings that found no free tie, each counted once."""
+        self._ties: dict[tuple[str, int], _Tie] = {}
+        self._refused: set[tuple[str, int]] = set()
+
+    @property
+    def trees(self) -> set[int]:
+        """Trees that couplings of remote actors hold."""
+        return {int(self.physics.model.body_tree[body]) for _, body in self._ties}
+
+    def of_actor(self, actor: str, trees: Collection[int]) -> list[Coupling]:
+        """Couplings [N] of a local actor's contacts of the last step with ``trees``."""
+        model, found = self.physics.model, {}
+        for contact in self.physics.contacts if trees else ():
+            if contact.actor == actor and int(model.body_tree[contact.body]) in trees:
+                found.setdefault(self._carrier(contact.body), []).append(contact)
+        if not found:
+            return []
+        self.physics.update_kinematics()
+        couplings = []
+        for body, contacts in sorted(found.items()):
+            force = -sum((contact.force for contact in contacts), np.zeros(3))
+            weight = np.array([np.linalg.norm(contact.force) for contact in contacts])
+            if weight.sum() < MIN_FORCE:
+                continue
+            at = weight @ np.array([contact.position for contact in contacts]) / weight.sum()
+            force *= min(1.0, MAX_FORCE / max(float(np.linalg.norm(force)), 1e-12))
+            pose = self.physics.state.body_q[body].astype(float)
+            point = frames.rotate(frames.conjugate(pose[3:]), at - pose[:3])
+            couplings.append(Coupling(body, point, at + force / STIFFNESS))
+        return couplings
+
+    def apply(self, couplings: Mapping[str, Collection[Coupling]]) -> None:
+        """Hold bodies by the couplings of remote actors, and no others; before a step."""
+        wanted = {
+            (actor, coupling.body): coupling
+            for actor, theirs in couplings.items()
+            for coupling in theirs
+            if self._is_attached(coupling.body)
+        }
+        for key in self._ties.keys() - wanted.keys():
+            self._remove(key)
+        self._refused &= wanted.keys()
+        for key, coupling in wanted.items():
+            self._hold(key, coupling)
+
+    def _hold(self, key: tuple[str, int], coupling: Coupling) -> None:
+        plants = self.physics.plants
+        known = self._ties.get(key)
+        if known is not None and np.linalg.norm(coupling.point - known.point) > SLIDE:
+            self._remove(key)
+            known = None
+        if known is None:
+            try:
+                known = _Tie(plants.add_tie(coupling.body, coupling.point, STIFFNESS, DAMPING), coupling.point)
+            except TieLimitError:
+                self.refused += key not in self._refused
+                self._refused.add(key)
+                return
+            self._ties[key] = known
+        plants.wake(int(self.physics.model.body_tree[coupling.body]))
+        pose = self.physics.state.body_q[coupling.body].astype(float)
+        at = pose[:3] + frames.rotate(pose[3:], known.point)
+        pull = coupling.anchor - at
+        reach = MAX_FORCE / STIFFNESS
+        plants.tie_anchor[known.tie] = at + pull * min(1.0, reach / max(float(np.linalg.norm(pull)), 1e-12))
+
+    def _remove(self, key: tuple[str, int]) -> None:
+        self.physics.plants.remove_tie(key[1], self._ties.pop(key).tie)
+
+    def _carrier(self, body: int) -> int:
+        """The bunch of a berry cluster; any other body itself."""
+        model = self.physics.model
+        tree = int(model.body_tree[body])
+        while body - model.tree_first[tree] >= model.tree_core[tree]:
+            body = int(model.body_parent[body])
+        return body
+
+    def _is_attached(self, body: int) -> bool:
+        """Whether a body is not a bunch that has left its plant."""
+        bunch = np.flatnonzero(self.physics.model.bunch_body == body)
+        return not len(bunch) or bool(self.physics.state.bunch_attached[bunch[0]])

@@ -1,0 +1,45 @@
+"""Removes shared memory of Fast DDS whose process was killed: else 32 MiB a sensor process stay until the next boot.
+
+Fast DDS keeps a lock (flock) on ``NAME_el`` while the owner of segment ``NAME`` lives; its own ``fastdds shm clean``
+goes by the same lock. Readers that still have a removed segment mapped keep it until they unmap it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import pathlib
+import time
+
+log = logging.getLogger(__name__)
+
+FOLDER = pathlib.Path("/dev/shm")
+SMALLEST = 4 << 20
+"""The smallest segment of vinesim's profiles [B]; Fast DDS itself makes such of 0.5 MiB, which are left to it."""
+YOUNGEST = 60.0
+"""A segment younger than this may belong to a process that is about to lock it [s]."""
+
+
+def remove_dead_segments(folder: pathlib.Path = FOLDER) -> int:
+    """Remove large segments of this user whose owner is dead; how many. The log has their number and size."""
+    with contextlib.suppress(ImportError):
+        import fcntl
+
+        removed = size = 0
+        for path in (*folder.glob("fastrtps_*"), *folder.glob("fastdds_*")):
+            lock = path.with_name(f"{path.name}_el")
+            with contextlib.suppress(OSError):  # gone, locked, or of another user: not ours to remove
+                status = path.stat()
+                is_ours = status.st_size >= SMALLEST and status.st_uid == os.getuid()
+                if not is_ours or time.time() - status.st_mtime < YOUNGEST:
+                    continue
+                with lock.open("rb") as file:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    path.unlink()
+                    lock.unlink()
+                removed, size = removed + 1, size + status.st_size
+        if removed:
+            log.info("removed %d shared-memory segments (%.0f MB) that killed processes left", removed, size / 1e6)
+        return removed
+    return 0  # no such system has Fast DDS's locks
