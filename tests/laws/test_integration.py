@@ -136,6 +136,18 @@ def test_substeps_are_counted_for_the_chains_first_mode() -> None:
     assert set(expected) == {1, 2, 3, 4}
 
 
+def test_substeps_are_counted_again_when_a_tree_changes() -> None:
+    """A load on the tip makes a cane slow; a stump of a slow cane is fast."""
+    plants, _, _ = swinging_canes((0.45, 0.95), 0.02)
+    assert plants.tree_substeps.tolist() == [4, 1]
+    plants.set_mass(16, 0.5)
+    plants.cut(17 + 8)
+    plants.forward_kinematics()
+    plants.predict()
+    assert plants.tree_substeps[0] == 1
+    assert plants.tree_substeps[1] > 1
+
+
 def test_a_touched_tree_takes_whole_steps() -> None:
     """The velocity that contacts were solved for is the velocity that the step ends with, to single precision."""
     plants, _, _ = swinging_canes((0.45,), 0.05)

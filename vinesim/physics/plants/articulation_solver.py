@@ -110,9 +110,8 @@ class ArticulationSolver:
         self.launches = KernelLaunches(self, numbers, threads, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
         self._runner = StepRunner(
-            buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps,
-            tree_steps=self._steps, tree_rate=self.tree_rate, stepping=self._stepping, floating=self._floating,
-            thread_pool=self.thread_pool,
+            buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
+            tree_rate=self.tree_rate, stepping=self._stepping, floating=self._floating, thread_pool=self.thread_pool,
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -317,9 +316,8 @@ class ArticulationSolver:
             self._runner.predict()
             launches.download_prediction(count)
         else:
-            count = len(trees)
             self.list_subset(trees)
-            launches.upload_subset_step(count)
+            launches.upload_subset_step(count := len(trees))
             launches.predict_subset(count)
             launches.download_subset_prediction(count)
         self.buffers.synchronize()
@@ -339,8 +337,8 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, count, touched = self.launches, len(self._runner.stepped), _NO_TREES
-        changed = len(self._loaded_bodies) > 0
+        launches, touched, changed = self.launches, _NO_TREES, len(self._loaded_bodies) > 0
+        count = len(self._runner.stepped)
         self._wrench[self._loaded_bodies] = 0.0
         self._loaded_bodies = _NO_TREES
         if bodies is not None and len(bodies):
@@ -371,8 +369,8 @@ class ArticulationSolver:
         if len(self._roots) == 0:
             return _NO_TREES, _NO_TREES
         tree = self.model.body_tree[self._roots]
-        moves = self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)
-        return self.buffers.slots[self._roots[moves]], tree[moves]
+        roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
+        return self.buffers.slots[roots], self.model.body_tree[roots]
 
     def advance(self, steps: int) -> None:
         """Many steps of the awake trees with nothing in between: no contacts, no sleep, no fault guard.
