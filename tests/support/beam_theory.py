@@ -262,6 +262,17 @@ def first_shape(tree: TreeBuilder) -> np.ndarray:
     return shape / shape[np.argmax(abs(shape))]
 
 
+def spring_torque(stiffness: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Torque [..., 3] N m, in joint axes, that turns a spring [..., 3] N m/rad by a rotation vector theta [..., 3] rad.
+
+    J^-T K theta with the left Jacobian J of the exponential map: the gradient of theta^T K theta / 2.
+    """
+    angle = np.maximum(np.linalg.norm(rotation, axis=-1, keepdims=True), 1e-4)
+    moment = stiffness * rotation
+    across = np.cross(rotation, moment)
+    return moment + 0.5 * across + (1.0 - 0.5 * angle / np.tan(0.5 * angle)) / angle**2 * np.cross(rotation, across)
+
+
 # ---------------------------------------------------------------------------------------------- the solver
 
 
