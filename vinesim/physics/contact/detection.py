@@ -191,7 +191,7 @@ class ContactDetection:
         )
         self._mark_near_trees = bind_launch(
             broadphase.mark_near_trees,
-            [actors, trees, block_boxes, tree_boxes, actor_boxes, geom_states],
+            [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
             [share(self._is_near, wp.bool)],
         )
         self._find_reached_trees = bind_launch(
