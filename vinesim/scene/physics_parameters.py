@@ -104,7 +104,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[m/s] A contact that closes faster is an impact: its tree is integrated with phi = 1. TUNED."""
     max_separation_speed: Positive = 1.0
     """[m/s] Overlap is resolved at this speed at most. TUNED."""
-    contact_capacity: Capacity = 128
+    contact_capacity: Capacity = 1024
     """Contacts solved in one step; of more, the deepest are kept."""
     max_contacts_per_tree: Capacity = 64
     """Contacts that one tree can have at once."""
@@ -115,7 +115,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     solver_newton_steps: Annotated[int, msgspec.Meta(ge=0)] = 6
     """Largest number of active-set Newton steps of an island. TUNED."""
     solver_newton_contacts: Annotated[int, msgspec.Meta(ge=0)] = 16
-    """Islands of more contacts take no Newton step: it costs the cube of their number, sweeps the square."""
+    """Islands in which plants couple more contacts take no Newton step, which costs the cube of their number."""
     solver_tolerance: Positive = 1e-6
     """[1] Sweeps end when none changes an impulse by more than this share of the largest. TUNED."""
 

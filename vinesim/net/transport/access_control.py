@@ -98,7 +98,7 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
             ),
             rule(f"{name} asks to be let in", "ingress", ["query"], f"{root}/join/{name}/*"),
         ]  # fmt: skip
-        written = (f"{root}/a/{name}", f"{root}/a/{name}/far")
+        written = (f"{root}/a/{name}", *(f"{root}/a/{name}/{layer}" for layer in ("far", "mid", "near")))
         if role != Role.SPECTATOR:
             written += (f"{root}/force/*/{name}", *(f"{root}/{family}/*/*/{name}" for family in FAMILIES))
         own.append(rule(f"{name} writes", "ingress", ["put", "delete"], *written))

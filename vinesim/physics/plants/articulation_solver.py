@@ -127,13 +127,11 @@ class ArticulationSolver:
         model, state = self.model, self.state
         trees, bodies = len(model.tree_first), len(model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
-        """phi asked for each tree [tree]; set it as you like. 1 from the start where a tie is stiff
-        (``stiff_tie_mass``)."""
+        """phi asked for each tree [tree]; set it as you like. 1 where a tie is stiff (``stiff_tie_mass``)."""
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``predict()`` [tree]."""
         self.tree_rate = np.zeros(trees, np.float32)
-        """Fastest joint that the last integration found [tree] rad/s, and m/s of what falls; NaN or above
-        ``fault_rate`` for a tree that it stopped."""
+        """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
         self.tree_substeps = np.ones(trees, np.int32)
         """Into how many substeps the step of each awake tree is divided while nothing touches it [tree]."""
         self.tree_air = np.zeros((trees, 3), np.float32)
@@ -310,7 +308,7 @@ class ArticulationSolver:
         ``trees`` [k]: only these, woken or given another phi after the prediction of all.
         """
         self._checked, launches = None, self.launches
-        self._list_stepping()
+        self._runner.list_trees(self._awake)
         if trees is None:
             launches.upload_step(count := len(self._runner.stepped))
             self._runner.predict()
@@ -326,9 +324,14 @@ class ArticulationSolver:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
 
         ``impulse_response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of
-        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees. A view, good until
-        the next call.
+        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees.
         """
+        self._require_stepped(bodies)
+        return self.launches.dense_impulse_response(bodies)
+
+    def impulse_response_by_tree(self, bodies: np.ndarray) -> np.ndarray:
+        """:meth:`impulse_response` without its zeros, [n, 6, m, 6]: entry [u, :, t] for the t-th listed body of the
+        tree of body u. Bodies of one tree must be neighbours in ``bodies``. A view, good until the next call."""
         self._require_stepped(bodies)
         return self.launches.impulse_response(bodies)
 
@@ -359,11 +362,6 @@ class ArticulationSolver:
         self.buffers.synchronize()
         self.tick += 1
 
-    def _list_stepping(self) -> None:
-        """Step the awake trees from now on, as the model is now."""
-        self.launches.upload_changed()
-        self._runner.list_trees(self._awake)
-
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
         if len(self._roots) == 0:
@@ -380,7 +378,7 @@ class ArticulationSolver:
         ``acceleration`` are of the last step; a tree that went wrong stays where it was (``tree_rate`` is NaN or above
         ``fault_rate``).
         """
-        self._list_stepping()
+        self._runner.list_trees(self._awake)
         floating = self._floating_roots()
         if len(self._loaded_bodies) and steps > 0:  # the next prediction still knows the last contacts
             self._runner.predict()
@@ -395,7 +393,7 @@ class ArticulationSolver:
 
     def upload(self) -> None:
         """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
-        self._list_stepping()
+        self._runner.list_trees(self._awake)
         self.launches.upload_step(len(self._runner.stepped))
         self.buffers.synchronize()
 
@@ -406,7 +404,7 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
-        """Use phi = 1 in the next steps of trees about to be touched (``integrate()`` sees to new contacts)."""
+        """Use phi = 1 for ``contact_onset_duration``: trees about to be touched (``integrate()`` sees to touched)."""
         self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self._onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:

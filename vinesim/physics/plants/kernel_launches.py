@@ -66,6 +66,7 @@ class KernelLaunches:
     ) -> None:
         """``parameters``: numbers of :class:`vinesim.kernels.articulation.structs.SolverParameters` but gravity."""
         self.buffers, self._threads, self._max_substeps = solver.buffers, threads, max_substeps
+        self._body_tree = solver.model.body_tree
         self.changed = False
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
         self.substeps_due = False
@@ -192,19 +193,34 @@ class KernelLaunches:
         )  # fmt: skip
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
-        """Response [n, 6, n, 6] of some bodies [n] to unit impulses on them; a view, good until the next call."""
+        """Response [n, 6, m, 6] of some bodies [n] to unit impulses on the listed bodies of the same tree (neighbours
+        in the list, at most m); a view, good until the next call."""
         n, buffers = len(bodies), self.buffers
         if n > self.response_capacity or self.response_capacity == 0:
             self._record_response(max(2 * self.response_capacity, n, 16))
         self._response_bodies[:n] = buffers.slots[bodies]
         self._respond(n)
         buffers.synchronize()
-        return self._response[:n, :, :n]
+        return self._response[:n]
+
+    def dense_impulse_response(self, bodies: np.ndarray) -> np.ndarray:
+        """The same [n, 6, n, 6] for bodies in any order, with the zeros between different trees."""
+        bodies = np.asarray(bodies)
+        order = np.argsort(bodies, kind="stable")
+        _, tree_start, tree = np.unique(self._body_tree[bodies[order]], return_index=True, return_inverse=True)
+        packed = self.impulse_response(bodies[order])
+        dense = np.zeros((len(bodies), 6, len(bodies), 6), np.float32)
+        for i, start in enumerate(tree_start):
+            of_tree = np.flatnonzero(tree == i)
+            block = packed[start : start + len(of_tree), :, : len(of_tree)]
+            at = order[of_tree]
+            dense[at[:, None], :, at] = block.transpose(0, 2, 1, 3)
+        return dense
 
     def _record_response(self, capacity: int) -> None:
         self.response_capacity, buffers = capacity, self.buffers
         self._response_bodies = buffers.pinned(np.zeros(capacity, np.int32))
-        self._response = buffers.pinned(np.zeros((capacity, 6, capacity, 6), np.float32))
+        self._response = buffers.pinned(np.zeros((capacity, 6, buffers.max_tree_size, 6), np.float32))
         buffers.add_shared("response_bodies", self._response_bodies, wp.int32)
         buffers.add_shared("response", self._response, float)
         stride = buffers.max_tree_extent

@@ -86,7 +86,8 @@ class StepRunner:
     # ------------------------------------------------------------------ which trees, in which order
 
     def list_trees(self, trees: np.ndarray) -> None:
-        """Step these trees [k] from now on; count their substeps again if they are others, or the model is."""
+        """Step these trees [k] from now on, as the model is now; count their substeps if one of both has changed."""
+        self._launches.upload_changed()
         if self.stepped is trees and not self._launches.substeps_due:
             return
         self._launches.substeps_due = False
