@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import pathlib
 import subprocess
 import sys
+from typing import cast
 
 import numpy as np
 import pytest
 
 from vinesim.bench.process_memory import ProcessHistory, ProcessSample, ProcessSampler, sample_process
-from vinesim.bench.soak import Cast, measurements, run_soak
+from vinesim.bench.soak import Cast, _Run, measurements, run_soak
+from vinesim.client.processes.child_process import Process, ProcessFailed
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/smaps_rollup"), reason="needs /proc of Linux")
 
@@ -68,6 +71,26 @@ def test_samples_follow_what_a_process_takes() -> None:
         child.stdin.close()
     sampler.sample(2.0)
     assert [one.times for one in sampler.histories.values()] == [[1.0], [1.0]]
+
+
+def test_a_client_that_ends_badly_does_not_cost_the_figures(tmp_path: pathlib.Path) -> None:
+    """Of a client that is killed at the end, the last status counts, and that it wrote no report."""
+
+    class Killed:
+        def interrupt(self) -> None: ...
+
+        def finish(self) -> None:
+            raise ProcessFailed("ended with exit code -9")
+
+    run = _Run.__new__(_Run)
+    run._folder, run._figures = tmp_path, {"malformed": 0, "refused": 1}
+    run.clients = {"robot_1": cast(Process, Killed())}
+    run._newest = {"robot_1": {"faults": {"messages_refused": 3}, "sensor_restarts": 2}}
+    counts = run.end()
+    assert counts.pop("robot_1 without a report (ended with exit code -9)") == 1
+    assert {name: count for name, count in counts.items() if count} == {
+        "refused, server": 1, "messages_refused, clients": 3, "sensor_restarts, clients": 2,
+    }  # fmt: skip
 
 
 @pytest.mark.slow

@@ -23,3 +23,8 @@ def test_rows_are_of_the_bench_live_and_have_names() -> None:
         run(["live"], as_json=True, rows=["picture"])
     with pytest.raises(NoSuchBench, match="leave it out"):
         run(["plants"], as_json=True, rows=["demo"])
+
+
+def test_minutes_are_of_the_bench_soak() -> None:
+    with pytest.raises(NoSuchBench, match="--minutes is how long the bench soak runs"):
+        run(["plants"], as_json=True, minutes=2.0)

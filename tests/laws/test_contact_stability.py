@@ -79,7 +79,6 @@ def test_contact_of_branches_adds_no_energy():
     physics.rigid.mj_data.qvel[drive] = 0.5
     start = energy(physics) + 1.5 * 0.5**2
     gain, pushed = -np.inf, 0
-    physics.plants.wake(np.arange(5))
     for _ in range(400):
         physics.step()
         gain = max(gain, energy(physics) + 1.5 * float(physics.rigid.mj_data.qvel[drive][0]) ** 2 - start)
@@ -162,7 +161,6 @@ def test_a_cut_cane_comes_to_rest_on_a_pole_and_on_a_branch():
 
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.008), cane((0.3, -0.3, 1.2), radius=0.006, heading=np.pi / 2)])
     physics = Physics(model)
-    physics.plants.wake([0, 1])
     cut = int(model.tree_first[1])
     physics.plants.cut(cut)
     touched, lowest_offset = 0, 0.0

@@ -15,6 +15,7 @@ import zenoh
 from tests.support.waiting import wait
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello, MeshPart, RetainedRecord
+from vinesim.net.replication.interest import POSE_LAYERS
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
 from vinesim.net.transport import zenoh_bus, zenoh_session
@@ -62,7 +63,17 @@ def session(name, server, certs):
         close_session(one)
 
 
-WRITTEN = ["a/{}", "a/{}/far", "c/0/-1/{}", "own/0/0/{}", "fact/3/4/{}", "force/bob/{}", "voice/0/0/{}"]
+WRITTEN = [
+    "a/{}",
+    "a/{}/far",
+    "a/{}/mid",
+    "a/{}/near",
+    "c/0/-1/{}",
+    "own/0/0/{}",
+    "fact/3/4/{}",
+    "force/bob/{}",
+    "voice/0/0/{}",
+]
 
 
 @contextlib.contextmanager
@@ -107,7 +118,8 @@ def test_an_actor_writes_under_its_own_name_and_no_other(server, certs):
 
 def test_a_spectator_writes_its_pose_and_nothing_else(server, certs):
     keys = [f"vs/1/vineyard/{key.format(name)}" for key in WRITTEN for name in ("guest", "ada")]
-    assert keys_received(certs, server, "guest", keys) == ["vs/1/vineyard/a/guest", "vs/1/vineyard/a/guest/far"]
+    poses = [f"vs/1/vineyard/a/guest{layer.suffix}" for layer in reversed(POSE_LAYERS)]
+    assert sorted(keys_received(certs, server, "guest", keys)) == sorted(poses)
 
 
 def test_another_world_is_inaccessible(server, certs):

@@ -61,6 +61,30 @@ def test_a_radius_that_cells_cannot_cover_is_refused(radius):
         interest.check_radius(radius)
 
 
-def test_full_rate_has_hysteresis():
-    assert [interest.is_full_rate(d, False) for d in (9.9, 10.1, 12.1)] == [True, False, False]
-    assert [interest.is_full_rate(d, True) for d in (9.9, 10.1, 12.1)] == [True, True, False]
+def test_layers_of_poses_have_hysteresis():
+    assert [interest.count_layers(d, 1) for d in (2.9, 3.1, 6.1, 12.1)] == [4, 3, 2, 1]
+    assert [interest.count_layers(d, 4) for d in (3.5, 3.7, 7.1, 7.3, 14.3, 14.5)] == [4, 3, 3, 2, 2, 1]
+
+
+@given(st.floats(0.05, 100.0))
+def test_the_rate_of_poses_falls_with_the_distance(distance):
+    """Rate times distance is bounded both ways: what moves at 1 m/s moves by 1/180 to 1/90 rad between two poses."""
+    received = interest.count_layers(distance, 1)
+    rate = interest.POSE_RATE / interest.POSE_LAYERS[received - 1].every
+    assert rate == 60.0 or distance * rate >= 90.0 - 1e-9 or rate == 5.0
+    assert rate == 5.0 or distance * rate <= 180.0 + 1e-9
+
+
+@given(st.integers(1, 4), st.lists(st.integers(1, 30), min_size=5, max_size=200))
+def test_a_receiver_of_some_layers_gets_their_rate_at_any_rate_of_steps(layers, gaps):
+    """Of ``gaps`` poses from step to step: less than ``every`` poses and one step lie between two that are received."""
+    before, received = 0, [0]
+    for gap in gaps:
+        number = before + gap
+        if interest.pose_layer(before, number) < layers:
+            received.append(number)
+        before = number
+    every = interest.POSE_LAYERS[layers - 1].every
+    assert all(b - a < every + max(gaps) for a, b in zip(received, [*received[1:], before], strict=True))
+    if max(gaps) == 1:
+        assert len(received) - 1 == before // every

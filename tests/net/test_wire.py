@@ -243,7 +243,7 @@ def test_poses_are_received_at_60_hz_near_and_at_5_hz_far(world):
         / (after[name]["now"] - before[name]["now"])
         for name in world.clients
     }
-    # near: 60 Hz and 5 Hz of the same actor, and 5 Hz of the far one; messages of one tick count once
+    # near: 60 Hz of the one actor, and 5 Hz of the far one; messages of one tick count once
     assert 30.0 < rate["bob"] < 75.0
     assert 5.0 < rate["cleo"] < 13.0
 

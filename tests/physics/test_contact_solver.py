@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 from vinesim import frames
+from vinesim.bench import scenes
+from vinesim.kernels.contact import structs
 from vinesim.physics.contact.plant_capsules import plant_capsules
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.human_posture import standing_pose
@@ -173,6 +175,52 @@ def test_islands_are_independent():
         assert islands == len(which)
         ends.append(physics.state.joint_q.copy())
     np.testing.assert_array_equal(ends[0], np.concatenate(ends[1:]))
+
+
+def converged(newton_contacts: int) -> PhysicsParameters:
+    """Solved to the end, with Newton steps where plants couple at most so many contacts, else by sweeps alone."""
+    return PhysicsParameters(
+        solver_newton_contacts=newton_contacts, solver_newton_steps=20, solver_tolerance=1e-10, solver_sweeps=20000
+    )
+
+
+def test_newton_steps_of_blocks_find_the_forces_of_sweeps():
+    """The first step in which 24 canes press on 4 bars, from the same state: a block for each cane."""
+    forces, sweeps = [], []
+    for newton_contacts in (0, 16):
+        physics = Physics(scenes.cane_row(24), parameters=converged(newton_contacts))
+        physics.add_robot(scenes.combs("combs", 4, 24))
+        tick = 0
+        while not physics.contacts:
+            physics.rigid.command("combs", np.full(2, 0.0005 * tick))
+            physics.step()
+            tick += 1
+        solver = physics.contact_solver
+        assert solver.impulses.island_count == 1
+        assert solver.detection.counters[structs.BLOCKS] == 24
+        forces.append(np.array([contact.force for contact in physics.contacts]))
+        sweeps.append(solver.impulses.sweeps)
+    assert len(forces[0]) >= 48
+    assert np.abs(forces[0]).max() > 1.0
+    np.testing.assert_allclose(forces[0], forces[1], atol=1e-6 * np.abs(forces[0]).max())
+    assert 4 * sweeps[1] < sweeps[0]
+
+
+def test_newton_steps_of_two_touching_plants_find_the_forces_of_sweeps():
+    """A cane falls on another, the first step in which they press, from the same state: one block."""
+    forces = []
+    for newton_contacts in (0, 16):
+        lower = cane((0.0, 0.0, 1.0), radius=0.005)
+        upper = cane((0.5, -0.9, 1.02), radius=0.004, heading=0.5 * np.pi)
+        physics = Physics(assemble([lower, upper]), parameters=converged(newton_contacts))
+        physics.add_robot(bar((3.0, 3.0, 1.0)))
+        physics.plants.body_load[physics.model.bodies_of(1), 2] = -0.2
+        physics.plants.wake([0, 1])
+        while not physics.contacts:
+            physics.step()
+        forces.append(np.array([contact.force for contact in physics.contacts]))
+    assert np.abs(forces[0]).max() > 0.1
+    np.testing.assert_allclose(forces[0], forces[1], atol=1e-6 * np.abs(forces[0]).max())
 
 
 def test_contacts_are_sorted_and_name_actor_link_and_body():
@@ -539,3 +587,19 @@ def test_more_than_ten_thousand_contacts_are_counted_and_the_deepest_stay():
     all_gaps = np.sort(solver.detection.candidates.gap[:460].ravel()[bodies])
     np.testing.assert_array_equal(np.sort(gap), all_gaps[:100])
     assert run()[4] == result
+
+
+def test_two_hundred_contacts_of_one_island_converge_within_the_allowed_sweeps():
+    """Combs that bend 40 canes by 5 mm: a body shared by all contacts."""
+    physics = Physics(scenes.cane_row(40))
+    physics.add_robot(scenes.combs("combs", 4, 40))
+    sweeps, contacts = [], 0
+    for tick in range(40):
+        physics.rigid.command("combs", np.full(2, 0.005 * min(1.0, tick / 20)))
+        physics.step()
+        sweeps.append(physics.contact_solver.impulses.sweeps)
+        contacts = max(contacts, physics.contact_solver.count)
+    assert contacts >= 200
+    assert physics.contact_solver.dropped_contacts == 0
+    assert sweeps.count(physics.parameters.solver_sweeps) <= 2
+    assert sweeps[-1] < 0.5 * physics.parameters.solver_sweeps

@@ -107,6 +107,35 @@ def test_missing_limits_masses_and_mimic_sources_are_assumed_with_one_warning(
     np.testing.assert_allclose(Yard(description).run(0.5)[-1, 0], description.home, atol=1e-6)
 
 
+def test_a_joint_that_mimics_a_mimicking_one_follows_the_driven_joint(tmp_path: pathlib.Path) -> None:
+    """c = -0.5 b + 0.2 and b = 2 a + 0.1: a = 0.3 makes them 0.7 and -0.15, whatever their order in the file."""
+    chain = (
+        joint("c", "base", "lc", LIMIT + '<mimic joint="b" multiplier="-0.5" offset="0.2"/>'),
+        joint("b", "base", "lb", LIMIT + '<mimic joint="a" multiplier="2" offset="0.1"/>'),
+        joint("a", "base", "la"),
+    )
+    for joints in (chain, chain[::-1]):
+        description = load_description(write(tmp_path, *map(link, ("base", "la", "lb", "lc")), *joints))
+        assert description.joints == ("a",)
+        poses = dict(
+            zip(description.moving_joints.names, description.moving_joints.poses(np.array([0.3])), strict=True)
+        )
+        for name, angle in (("a", 0.3), ("b", 0.7), ("c", -0.15)):
+            np.testing.assert_allclose(poses[name][3:], frames.exp(np.array([0.0, angle, 0.0])), atol=1e-12)
+        assert 'joint="b"' not in description.urdf  # physics and other clients read the composed one
+        Yard(description).run(0.1)
+
+
+@pytest.mark.parametrize("source", ["a", "b"])
+def test_joints_that_mimic_each_other_in_a_cycle_are_refused(source: str, tmp_path: pathlib.Path) -> None:
+    text = (
+        joint("a", "base", "la", LIMIT + f'<mimic joint="{source}" multiplier="3"/>'),
+        joint("b", "base", "lb", LIMIT + '<mimic joint="a"/>'),
+    )
+    with pytest.raises(DescriptionError, match="let it mimic a joint that is driven itself"):
+        load_description(write(tmp_path, *map(link, ("base", "la", "lb")), *text))
+
+
 def test_a_joint_too_weak_for_its_weight_is_counterbalanced(
     tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:

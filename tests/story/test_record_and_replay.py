@@ -23,6 +23,7 @@ from vinesim.client.recording.recorder import Recorder
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter
+from vinesim.net.replication.interest import POSE_LAYERS
 from vinesim.net.server.server import Server
 from vinesim.net.transport.access_control import Role
 from vinesim.net.transport.certificates import create as new_certificate
@@ -234,17 +235,17 @@ def count_bytes(endpoint: str, path: pathlib.Path | None, distance: float) -> li
             time.sleep(0.002)
 
         def all_matched() -> bool:
-            ready = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.replicator._state.peers._far_pose.matching
+            ready = ada.joined == ["bob"] and bob.joined == ["ada"] and ada.replicator._state.peers._layers[0].matching
             if distance < 5.0:
                 streams = [s.matching and e.matching for s, e in ada.replicator._state.cells.publishers.values()]
                 ready &= (
-                    ada.replicator._state.peers._pose.matching
-                    and bob.replicator._state.peers._pose.matching
+                    ada.replicator._state.peers._layers[-1].matching
+                    and bob.replicator._state.peers._layers[-1].matching
                     and any(streams)
                 )
             if recorder is not None:
                 ready &= recorder.greetings.keys() == {"ada", "bob"} and bool(recorder.recording.count > 6)
-                ready &= distance > 5.0 or recorder._full_rate.get("ada", (None, None))[1] is not None
+                ready &= distance > 5.0 or recorder._faster.get(("ada", POSE_LAYERS[-1]), (None, None))[1] is not None
             return ready
 
         end = time.monotonic() + TIMEOUT

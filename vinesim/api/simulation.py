@@ -36,9 +36,6 @@ from vinesim.scene.values import Contact, Detachment, Snapshot
 if TYPE_CHECKING:
     from vinesim.sensors.scene.primitives import Primitives
 
-EQUILIBRIUM_RATE = 0.1
-"""[1] A tree starts awake if its first step would turn a body faster than this share of ``sleep_rate``. TUNED."""
-
 Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]
 """What can be simulated: a model, a scene or the name or path of one, canes."""
 
@@ -46,8 +43,9 @@ Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterab
 class Simulation:
     """A world that moves when :meth:`step` is called; nothing runs in the background.
 
-    Trees that are in equilibrium start asleep, all others awake. A tree falls asleep when it has been at rest for half
-    a second (``parameters.sleep_duration``) and wakes when something touches it; sleeping trees cost nothing.
+    Trees that are in equilibrium start asleep, all others awake. A tree falls asleep when it has come to rest
+    (``sleep_distance`` and the like of ``parameters``) and wakes when something touches it; sleeping trees cost
+    nothing.
     """
 
     def __init__(
@@ -96,7 +94,7 @@ class Simulation:
         self._loads: dict[int, np.ndarray] = {}
         self._detachments: list[Detachment] = []
         self._primitives: Primitives | None = None
-        self._wake_unbalanced()
+        self.physics.sleep_monitor.wake_unbalanced()
 
     # ------------------------------------------------------------------ time
 
@@ -271,19 +269,6 @@ class Simulation:
         return self._primitives
 
     # ------------------------------------------------------------------
-
-    def _wake_unbalanced(self) -> None:
-        """Wake the trees that are not in equilibrium: a trial prediction turns one of their bodies."""
-        plants, state = self.physics.plants, self.physics.state
-        asleep = np.flatnonzero(~state.tree_awake)
-        if len(asleep) == 0:
-            return
-        plants.wake(asleep)
-        plants.predict()
-        rate = np.linalg.norm(plants.velocity_free[:, 3:], axis=1)
-        fastest = np.zeros(len(self.model.tree_first))
-        np.maximum.at(fastest, self.model.body_tree, rate)
-        plants.put_to_sleep(asleep[fastest[asleep] <= EQUILIBRIUM_RATE * self.parameters.sleep_rate])
 
     def _tree(self, tree: int) -> int:
         return checked_index("tree", tree, len(self.model.tree_first), UsageError)

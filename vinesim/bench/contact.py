@@ -31,6 +31,8 @@ STEPS_PER_ROUND = (20, 5)
 LIFTED_CANES = 12
 HELD_CANES = (14, 20, 26, 32)
 """Numbers of the canes whose bunch a gripper holds."""
+COMBS = ((2, 10), (4, 32), (8, 64))
+"""Bars of two combs and the canes between them: so many contacts, bars times canes, in one island."""
 SETTLE_STEPS = 150
 """Steps before the measurement: the grippers close, bar and grippers lift."""
 SCENE = "tendone"
@@ -50,6 +52,11 @@ def contact_measurements() -> Iterator[Measurement]:
     for canes, steps in zip(CANE_COUNTS, STEPS_PER_ROUND, strict=True):
         case = f"{canes} canes and bunches, {LIFTED_CANES} lifted, {len(HELD_CANES)} held"
         yield from _compare_with_mujoco(case, "contact", scenes.cane_row(canes), robots, steps)
+    for bars, canes in COMBS:
+        case = f"{canes} canes and bunches between {bars} bars of two combs"
+        yield from _compare_with_mujoco(
+            case, "contact", scenes.cane_row(canes), [scenes.combs("combs", bars, canes)], 5
+        )
 
 
 def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
@@ -170,10 +177,12 @@ def _compare_with_mujoco(
 
 
 def _command(rigid: RigidWorld, robots: list[RobotSpec], tick: int) -> None:
-    """Move the bar 4 cm up and the closed grippers 2 cm, then all up and down by a centimetre."""
+    """Move the bar 4 cm up, the closed grippers 2 cm, and the combs 5 mm together, then all up and down."""
     wave = 0.01 * np.sin(0.06 * tick)
     for robot in robots:
-        if len(robot.drives) == 1:
+        if robot.drives[-1].joint == "sink":
+            rigid.command(robot.name, np.full(2, 0.005 * min(1.0, tick / 100)) + 0.1 * wave)
+        elif len(robot.drives) == 1:
             rigid.command(robot.name, np.array([0.04 * min(1.0, tick / 100) + wave]))
         else:
             grip = 0.05 * min(1.0, tick / 60)

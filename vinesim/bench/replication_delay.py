@@ -26,8 +26,8 @@ from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch
 from vinesim.net.codec import messages
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.hand_forces import LinkCentre
+from vinesim.net.replication.interest import POSE_RATE
 from vinesim.net.replication.jitter_buffer import JitterBuffer
-from vinesim.net.replication.peers import ACTOR_PERIOD
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -364,7 +364,7 @@ def buffered(rows: RunRows, delay: float, jitter: float, wait: float, seed: int 
     """
     chance = np.random.default_rng(seed)
     own, speed = rows.joints[:, 0], rows.speed
-    sent = np.arange(0.0, DT * (len(own) - 1), ACTOR_PERIOD)
+    sent = np.arange(0.0, DT * (len(own) - 1), 1.0 / POSE_RATE)
     tick = np.rint(sent / DT).astype(int)
     arrives = DT * tick + delay + chance.uniform(-jitter, jitter, len(sent))
     arrives[chance.random(len(sent)) < LOSS] = np.inf

@@ -108,6 +108,29 @@ def bar(name: str, first: int, count: int) -> RobotSpec:
     return RobotSpec(name, 1, urdf, "base_footprint", frames.pose(middle), drives, np.zeros(1))
 
 
+def combs(name: str, bars: int, canes: int) -> RobotSpec:
+    """Bars across the first ``canes``, 0.3 to 0.9 m from their clamps, in turns 2 mm below and 2 mm above them.
+
+    Drives [m]: lift of the lower bars, and lowering of the upper ones; each cane touches every bar from 2 mm on.
+    """
+    cylinder = f'<geometry><cylinder radius="0.02" length="{SPACING * canes}"/></geometry>'
+    height = 0.006 + 0.02 + 0.002
+    collisions = [
+        f'<collision><origin xyz="{x:.4f} 0 {z:.4f}" rpy="1.5707963 0 0"/>{cylinder}</collision>'
+        for x, z in zip(np.linspace(-0.3, 0.3, bars), np.resize([-height, height], bars), strict=True)
+    ]
+    urdf = (
+        f'<robot name="combs"><link name="base_footprint">{_inertial(50.0)}</link>'
+        f'<link name="lower">{_inertial(20.0)}{"".join(collisions[::2])}</link>'
+        f'<link name="upper">{_inertial(20.0)}{"".join(collisions[1::2])}</link>'
+        f"{_slide('lift', 'base_footprint', 'lower', '0 0 1')}{_slide('sink', 'base_footprint', 'upper', '0 0 -1')}"
+        "</robot>"
+    )
+    drives = tuple(Drive(joint, 2e5, 2e4, 1e4, 5.0, -1.0, 1.0) for joint in ("lift", "sink"))
+    middle = np.array([0.6, 0.5 * SPACING * (canes - 1), HEIGHT])
+    return RobotSpec(name, 1, urdf, "base_footprint", frames.pose(middle), drives, np.zeros(2))
+
+
 def keep_awake(physics: Physics, trees: np.ndarray) -> Physics:
     """Wake some trees [k] and let no tree fall asleep again."""
     physics.sleep_monitor.rate = -1.0

@@ -18,7 +18,7 @@ import numpy as np
 
 from vinesim.bench.live_client import own_processes
 from vinesim.bench.process_memory import ProcessHistory, ProcessSampler, check_proc
-from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup
+from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessFailed, ProcessGroup
 from vinesim.client.processes.ros_listener import RosListener
 from vinesim.client.tasks import start_poses
 from vinesim.frames import to_yaw
@@ -225,19 +225,23 @@ class _Run:
         return min((values["tick_hz"] for values in self._newest.values()), default=0.0)
 
     def end(self) -> dict[str, int]:
-        """End the clients in order; what they counted."""
+        """End the clients in order; what they counted. One that fails now is counted: the run itself is over."""
         counts = {"malformed, server": self._figures["malformed"], "refused, server": self._figures["refused"]}
         for client in self.clients.values():
             client.interrupt()
-        malformed = 0
+        reports = []
         for name, client in self.clients.items():
-            client.finish()
-            report = json.loads((self._folder / name / "report.json").read_text())
-            malformed += report["malformed"]
-            restarts = {key: report.get(key, 0) for key in ("sensor_restarts", "ros_restarts")}
+            try:
+                client.finish()
+                reports.append(json.loads((self._folder / name / "report.json").read_text()))
+            except (ProcessFailed, OSError) as error:
+                counts[f"{name} without a report ({error})"] = 1
+                reports.append({"malformed": 0, **self._newest[name]})
+        for report in reports:
+            restarts = {key: report.get(key, 0) for key in ("malformed", "sensor_restarts", "ros_restarts")}
             for key, count in (report["faults"] | restarts).items():
                 counts[f"{key}, clients"] = counts.get(f"{key}, clients", 0) + count
-        return counts | {"malformed, clients": malformed}
+        return counts
 
 
 def _pose_option(place: np.ndarray, yaw: float) -> list[str]:

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from vinesim.bench.poor_link import poor_link
 from vinesim.bench.support.fake_client import FakeClientProcess
 from vinesim.bench.support.network_emulator import Link, LinkProfile, NetworkEmulator
 from vinesim.client.recording.bunch_trace import Rows, remote_error
@@ -137,11 +138,12 @@ def measure_notification(line: Link, touches: int = TOUCHES) -> list[float]:
 
 
 def link() -> Iterator[Measurement]:
-    """Rows for each link."""
+    """Rows for each link, and whether a poor one keeps its clients."""
     for case, line in LINES.items():
         took = 1e3 * np.array(measure_notification(line))
         for share in (50, 95):
             yield Measurement("link", f"{case}: touch to received, p{share}", float(np.percentile(took, share)), "ms")
+    yield from poor_link()
     for case in LINES:
         yield from line_measurements(case)
 

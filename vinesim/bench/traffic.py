@@ -11,6 +11,7 @@ every bunch, at 60 Hz.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -22,7 +23,7 @@ from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import Measurement
+from vinesim.scene.values import Measurement, RobotUpdate
 
 ROBOTS, PEOPLE = 10, 5
 BUNCHES, BRANCHES = 3, 2
@@ -38,6 +39,11 @@ LAN = 0.001
 
 RIGID = 26
 """Size of the record of a rigid object [B]."""
+
+RINGS = (0.0, 3.0, 6.0, 12.0, 100.0)
+"""Distances [m] between which the error of what is shown is given."""
+REACH = 1.0
+"""Of an arm [m]: a joint's error moves the hand by that times the error."""
 
 OVERHEAD = 6
 """Framing of a message that shares a packet with others [B]; alone it costs far more, see the load benchmark."""
@@ -90,8 +96,11 @@ def traffic() -> Iterator[Measurement]:
         for _ in range(round(SETTLE * 100)):
             _tick(hub, fake_clients)
         rows = [[(p.bus.bytes_in, p.bus.bytes_out, _messages(p)) for p in fake_clients]]
+        errors: list[np.ndarray] = []
         for tick in range(round(SECONDS * 100)):
             _tick(hub, fake_clients)
+            if tick % 7 == 0:
+                errors.append(shown_errors(fake_clients, hub.time))
             if tick % 10 == 9:  # tenths of a second: what a link must carry, not what a packet holds
                 rows.append([(p.bus.bytes_in, p.bus.bytes_out, _messages(p)) for p in fake_clients])
         rates = 10.0 * np.diff(np.array(rows, float), axis=0)  # [tenth, actor, (in, out, messages in)]
@@ -113,8 +122,32 @@ def traffic() -> Iterator[Measurement]:
         trees = np.mean([p.replicator.counters.environment.bytes_in for p in fake_clients]) / hub.time
         yield Measurement("traffic", f"{size}: of that, poses", float(poses) / 1e3, "kB/s")
         yield Measurement("traffic", f"{size}: of that, trees", float(trees) / 1e3, "kB/s")
+        away, error = np.concatenate(errors).T
+        for low, high in itertools.pairwise(RINGS):
+            here = (away >= low) & (away < high)
+            if here.any():
+                seen = 1e3 * error[here] * REACH / away[here]
+                ring = f"{size}: robots {low:g} to {high:g} m away as shown, worst joint"
+                yield Measurement("traffic", f"{ring}, p95", 1e3 * float(np.percentile(error[here], 95)), "mrad")
+                yield Measurement(
+                    "traffic", f"{ring}, {REACH:g} m from it, seen, p95", float(np.percentile(seen, 95)), "mrad"
+                )
         for fake_client in fake_clients:
             fake_client.bus.close()
+
+
+def shown_errors(fake_clients: list[FakeClient], now: float) -> np.ndarray:
+    """[k, 2] Distance [m] and largest joint error [rad] of every robot as every other client shows it ``now``."""
+    found = []
+    for viewer in fake_clients:
+        for other in fake_clients:
+            shown = viewer.robots.get(other.name)
+            if isinstance(shown, RobotUpdate):
+                truth = other.pose(now)
+                assert isinstance(truth, RobotUpdate)
+                error = float(np.abs(shown.position - truth.position).max())
+                found.append((float(np.hypot(*(viewer.place - other.place)[:2])), error))
+    return np.array(found).reshape(-1, 2)
 
 
 def _tick(hub: MemoryHub, fake_clients: list[FakeClient]) -> None:

@@ -97,7 +97,10 @@ class Physics:
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
             ("plants: predict velocities without contacts", self.plants.predict),
-            ("contacts: solve for plants and rigid bodies together", self.contact_solver.solve),
+            (
+                "contacts: wake trees that others touch, solve plants and rigid bodies together",
+                self.contact_solver.solve,
+            ),
             ("plants: integrate with contact wrenches", self._integrate_plants),
             ("rigid: integrate with contact forces", self._integrate_rigid),
             ("faults: stop trees with invalid rates", self.fault_guard.stop_faulty_trees),
@@ -133,7 +136,9 @@ class Physics:
             self.wind.update(self.plants, self.time, observers, self.parameters)
 
     def _refine_bunches(self) -> None:
-        self.level_of_detail.update(self.contact_solver.near_trees)
+        coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
+        if len(coarsened):  # those that sleep collide with other shapes now
+            self.contact_solver.update_tree_bounds(coarsened)
 
     def _integrate_plants(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
@@ -154,8 +159,10 @@ class Physics:
 
     def _put_to_sleep(self) -> None:
         if self.parameters.sleep:
-            near, held = self.contact_solver.near_trees, self.grasp_manager.held_trees
-            self.sleep_monitor.update(np.union1d(near, held) if len(held) else near)
+            keep_awake = self.contact_solver.remote_trees.copy()
+            keep_awake[self.contact_solver.near_trees] = True
+            keep_awake[self.model.body_tree[self.plants.held_bodies]] = True
+            self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs)
 
     # ------------------------------------------------------------------ results of a step
 
@@ -279,11 +286,12 @@ class Physics:
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
         """Apply in which pose trees rest at their owner, without waking them: ``joint_q`` [body of the tree, 4]
-        each."""
+        each. Of a tree that is named several times the last pose counts."""
         for tree, rotations in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(rotations, np.float32))
-        self.plants.put_to_sleep(np.array(trees, np.int32))
-        self.contact_solver.update_tree_bounds(np.array(trees, np.int32))
+        resting = np.unique(trees).astype(np.int32)
+        self.plants.put_to_sleep(resting)
+        self.contact_solver.update_tree_bounds(resting)
         self.remotely_posed = np.union1d(self.remotely_posed, trees).astype(np.int32)
         self._body_q = None
 

@@ -61,9 +61,14 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     # ------------------------------------------------------------------ sleep of plants
     sleep_rate: Positive = 0.02
-    """[rad/s] A tree is quiet while every joint turns slower than this. TUNED."""
+    """[rad/s] Trees are looked at only while all their joints turn slower than this. TUNED."""
     sleep_duration: Positive = 0.5
-    """[s] A tree that has been quiet for so long falls asleep. DERIVED: longer than the turning point of any swing."""
+    """[s] A tree whose joints have been slow for so long is looked at. DERIVED: longer than the turning point of any
+    swing."""
+    sleep_speed: Positive = 2e-3
+    """[m/s] No point of a tree that falls asleep is faster than this. TUNED: 0.07 mm between two pictures."""
+    sleep_distance: Positive = 2e-4
+    """[m] No point of a tree that falls asleep is further than this from where it would rest. TUNED."""
 
     # ------------------------------------------------------------------ wind
     wind_radius: Positive = 4.0
@@ -99,7 +104,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[m/s] A contact that closes faster is an impact: its tree is integrated with phi = 1. TUNED."""
     max_separation_speed: Positive = 1.0
     """[m/s] Overlap is resolved at this speed at most. TUNED."""
-    contact_capacity: Capacity = 128
+    contact_capacity: Capacity = 1024
     """Contacts solved in one step; of more, the deepest are kept."""
     max_contacts_per_tree: Capacity = 64
     """Contacts that one tree can have at once."""
@@ -110,11 +115,9 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     solver_newton_steps: Annotated[int, msgspec.Meta(ge=0)] = 6
     """Largest number of active-set Newton steps of an island. TUNED."""
     solver_newton_contacts: Annotated[int, msgspec.Meta(ge=0)] = 16
-    """Islands of more contacts take no Newton step: it costs the cube of their number, sweeps the square."""
+    """Islands in which plants couple more contacts take no Newton step, which costs the cube of their number."""
     solver_tolerance: Positive = 1e-6
     """[1] Sweeps end when none changes an impulse by more than this share of the largest. TUNED."""
-    wake_speed: Positive = 1e-3
-    """[m/s] A box or a free bunch that moves slower than this wakes no plant. TUNED."""
 
     # ------------------------------------------------------------------ free bunches
     bunch_rolling_arm: NotNegative = 0.004

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import pathlib
 import queue
 import subprocess
 import sys
@@ -300,19 +301,20 @@ class FakeClientProcess:
 
 def run(
     connect: str, fake_clients: list[dict[str, Any]], *, trees: int = 12, apart: float = 1.0, tick: float = STEP_PERIOD,
-    skew: float = 0.0,
+    skew: float = 0.0, certificates: str = "",
 ) -> None:  # fmt: skip
-    """Step clients over Zenoh and apply commands from standard input until it ends. ``skew`` [s]: clock error."""
+    """Step clients over Zenoh and apply commands from standard input until it ends. ``skew`` [s]: clock error;
+    ``certificates``: folder with those of all, for ``tls/`` and ``quic/``."""
     from vinesim.net.transport.zenoh_bus import ZenohBus
 
-    model = tree_row(trees, apart=apart)
+    model, folder = tree_row(trees, apart=apart), pathlib.Path(certificates) if certificates else None
     commands: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
     by_name: dict[str, FakeClient] = {}
     late = 0
     try:
         for one in fake_clients:
             name, place = one.pop("name"), one.pop("place")
-            by_name[name] = FakeClient(ZenohBus(name, connect=connect), model, place, **one)
+            by_name[name] = FakeClient(ZenohBus(name, connect=connect, certificates=folder), model, place, **one)
         threading.Thread(target=_read_commands, args=(commands,), daemon=True).start()
         _write_line({"ready": True})
         due = time.monotonic()

@@ -71,7 +71,8 @@ def push_summary(
     """
     reports = {name: report_of(out, name) for name in (PICKER, VISITOR)}
     traces = {name: Rows.load(out / name / "trace.npz") for name in (PICKER, VISITOR)}
-    contact_force_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
+    with writing(out / "touch.png"):
+        contact_force_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
     touch_keys = (
         "touch_to_motion_ticks", "force_peak_n", "environment_bytes_when_far", "ticks_touching_when_far",
         "environment_bytes_out",

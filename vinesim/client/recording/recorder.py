@@ -7,6 +7,7 @@ receives them, which the recorder knows from a publisher on the same key, that m
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import time
@@ -21,8 +22,9 @@ from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.keys import sender_of
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.replication import interest
+from vinesim.net.replication.interest import PoseLayer
 from vinesim.net.replication.network_clock import NetworkClock
-from vinesim.net.replication.peers import ASK_PERIOD, FAR_PERIOD, WorldMismatch
+from vinesim.net.replication.peers import ASK_PERIOD, WorldMismatch
 from vinesim.net.transport.bus import KEEP_ALL, Bus, Publisher, Subscription
 from vinesim.scene.values import RobotUpdate
 
@@ -79,7 +81,8 @@ class Recorder:
         self._rejected: set[str] = set()
         self._positions: dict[str, np.ndarray] = {}
         self._far_poses: Subscription | None = None
-        self._full_rate: dict[str, tuple[Publisher, Subscription | None]] = {}
+        self._faster: dict[tuple[str, PoseLayer], tuple[Publisher, Subscription | None]] = {}
+        """Faster layers of the poses of each actor: a publisher that shows whether they are received."""
         self._log_time = 0
 
     @property
@@ -111,7 +114,7 @@ class Recorder:
 
     def close(self) -> None:
         """Undeclare the pose publishers and subscriptions."""
-        for publisher, subscription in self._full_rate.values():
+        for publisher, subscription in self._faster.values():
             publisher.close()
             if subscription is not None:
                 subscription.close()
@@ -211,36 +214,40 @@ class Recorder:
         """Subscribe to the poses that another actor receives: slow ones of all, fast ones of those with company."""
         has_company = self._everything or len(self._live) >= 2
         if has_company and self._far_poses is None:
-            self._far_poses = self.bus.subscribe("a/*/far", KEEP_ALL)
+            self._far_poses = self.bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_ALL)
         elif not has_company and self._far_poses is not None:
             self._far_poses.close()
             self._far_poses = None
-        for name in sorted(self._full_rate.keys() - self._live):
-            publisher, subscription = self._full_rate.pop(name)
+        for name, layer in [key for key in self._faster if key[0] not in self._live]:
+            publisher, subscription = self._faster.pop((name, layer))
             publisher.close()
             if subscription is not None:
                 subscription.close()
-        for name in self._live:
-            if name not in self._full_rate:
-                self._full_rate[name] = self.bus.publisher(f"a/{name}"), None
-            publisher, subscription = self._full_rate[name]
+        for name, layer in itertools.product(self._live, interest.POSE_LAYERS[1:]):
+            key = f"a/{name}{layer.suffix}"
+            if (name, layer) not in self._faster:
+                self._faster[name, layer] = self.bus.publisher(key), None
+            publisher, subscription = self._faster[name, layer]
             wanted = "poses" in self._families and (
-                self._everything or (publisher.matching and self._has_company(name))
+                self._everything or (publisher.matching and self._has_company(name, layer))
             )
             if wanted and subscription is None:
-                self._full_rate[name] = publisher, self.bus.subscribe(f"a/{name}", KEEP_ALL)
+                self._faster[name, layer] = publisher, self.bus.subscribe(key, KEEP_ALL)
             elif not wanted and subscription is not None:
                 subscription.close()
-                self._full_rate[name] = publisher, None
+                self._faster[name, layer] = publisher, None
 
-    def _has_company(self, name: str) -> bool:
-        """Whether another actor may be the subscriber. If not, it is a recorder, and two of them would never end."""
+    def _has_company(self, name: str, layer: PoseLayer) -> bool:
+        """Whether another actor may be the subscriber of a layer.
+
+        If not, it is a recorder, and two of them would never end.
+        """
         if name not in self._positions:
             return False
         away = [
             math.dist(self._positions[name][:2], place[:2]) for other, place in self._positions.items() if other != name
         ]
-        return min(away, default=math.inf) <= interest.REDUCED_RATE_DISTANCE + COMPANY_MARGIN
+        return min(away, default=math.inf) <= interest.LAYER_HYSTERESIS * layer.distance + COMPANY_MARGIN
 
 
 def observer_grid(area: tuple[float, float, float, float]) -> list[tuple[float, float]]:
@@ -284,7 +291,7 @@ class Observer:
             if key == "clock":
                 self._network_clock.receive(payload, age)
         if now >= self._due:
-            self._due = now + FAR_PERIOD
+            self._due = now + interest.POSE_LAYERS[0].every / interest.POSE_RATE
             update = RobotUpdate(
                 self.bus.name, self._network_clock.time, self._positions, np.zeros(6), np.zeros(0), np.zeros(0)
             )

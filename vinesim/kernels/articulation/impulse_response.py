@@ -99,34 +99,30 @@ def impulse_response(
 ):
     """One thread applies six unit impulses to one body and writes the velocities of all bodies up to it in the list.
 
-    bodies: [thread] which body. response_out: [u, 6, t, 6] velocity of body u of the list by a unit impulse wrench on
-    body t, linear before angular, in 1/kg, 1/(kg m), 1/(kg m^2); each thread writes its columns and, the matrix being
-    symmetric, their transpose. columns_out: [thread * stride + body of the tree] scratch, ``stride`` being the extent
-    of the largest tree.
+    bodies: [thread] which body; those of one tree are neighbours in the list. response_out: [u, 6, t, 6] velocity of
+    body u of the list by a unit impulse wrench on the t-th listed body of its tree, linear before angular, in 1/kg,
+    1/(kg m), 1/(kg m^2); each thread writes its columns and, the matrix being symmetric, their transpose. columns_out:
+    [thread * stride + body of the tree] scratch, ``stride`` being the extent of the largest tree.
     """
     slot = wp.tid()
     body = bodies[slot]
     tree = model.body_tree[body]
     first = model.tree_first[tree]
     shift = slot * stride - first  # scratch of this thread: one entry for each body of the tree
-    last = body
-    for other in range(slot):
-        if model.body_tree[bodies[other]] == tree:
-            last = wp.max(last, bodies[other])
+    start = int(slot)  # the first slot of the tree
+    last = int(body)
+    while start > 0 and model.body_tree[bodies[wp.max(start - 1, 0)]] == tree:
+        start = start - 1
+        last = wp.max(last, bodies[start])
     propagate_impulses_inward(body, first, last, shift, model, factors, columns_out)
     propagate_velocities_outward(first, last, shift, model, factors, columns_out)
-    zero = wp.mat33()
-    for other in range(slot + 1):
-        a_f = zero
-        a_m = zero
-        alpha_f = zero
-        alpha_m = zero
-        if model.body_tree[bodies[other]] == tree:
-            place = shift + bodies[other]
-            a_f = columns_out.a_by_force[place]
-            a_m = columns_out.a_by_moment[place]
-            alpha_f = columns_out.alpha_by_force[place]
-            alpha_m = columns_out.alpha_by_moment[place]
+    column = slot - start
+    for other in range(start, slot + 1):
+        place = shift + bodies[other]
+        a_f = columns_out.a_by_force[place]
+        a_m = columns_out.a_by_moment[place]
+        alpha_f = columns_out.alpha_by_force[place]
+        alpha_m = columns_out.alpha_by_moment[place]
         if other == slot:  # symmetric but for rounding
             a_f = 0.5 * (a_f + wp.transpose(a_f))
             alpha_m = 0.5 * (alpha_m + wp.transpose(alpha_m))
@@ -134,14 +130,14 @@ def impulse_response(
             alpha_f = wp.transpose(a_m)
         for r in range(3):
             for c in range(3):
-                response_out[other, r, slot, c] = a_f[r, c]
-                response_out[other, r, slot, 3 + c] = a_m[r, c]
-                response_out[other, 3 + r, slot, c] = alpha_f[r, c]
-                response_out[other, 3 + r, slot, 3 + c] = alpha_m[r, c]
-                response_out[slot, c, other, r] = a_f[r, c]
-                response_out[slot, 3 + c, other, r] = a_m[r, c]
-                response_out[slot, c, other, 3 + r] = alpha_f[r, c]
-                response_out[slot, 3 + c, other, 3 + r] = alpha_m[r, c]
+                response_out[other, r, column, c] = a_f[r, c]
+                response_out[other, r, column, 3 + c] = a_m[r, c]
+                response_out[other, 3 + r, column, c] = alpha_f[r, c]
+                response_out[other, 3 + r, column, 3 + c] = alpha_m[r, c]
+                response_out[slot, c, other - start, r] = a_f[r, c]
+                response_out[slot, 3 + c, other - start, r] = a_m[r, c]
+                response_out[slot, c, other - start, 3 + r] = alpha_f[r, c]
+                response_out[slot, 3 + c, other - start, 3 + r] = alpha_m[r, c]
 
 
 @wp.kernel

@@ -167,25 +167,26 @@ def tree_aabbs(
 @wp.kernel
 def actor_aabbs(
     # model
-    parameters: Parameters,
     actors: Actors,
+    geoms: Geoms,
     # in
+    rigid: RigidBodies,
     geom_states: GeomStates,
     # out
     actor_boxes_out: Aabbs,
 ):
-    """One thread per actor: the box around it; an empty one for a box or a free bunch that does not move."""
+    """One thread per actor: the box around it; an empty one for a box or a free bunch that MuJoCo has put to sleep.
+
+    MuJoCo puts none to sleep on which plants press.
+    """
     actor = wp.tid()
+    first = actors.start[actor]
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
-    fastest = wp.float64(0.0)
-    for g in range(actors.start[actor], actors.start[actor + 1]):
-        low = wp.min(low, geom_states.low[g])
-        high = wp.max(high, geom_states.high[g])
-        fastest = wp.max(fastest, geom_states.speed[g])
-    if actors.wakes_only_moving[actor] and fastest < parameters.wake_speed:
-        low = wp.vec3(FAR)
-        high = wp.vec3(-FAR)
+    if not actors.may_sleep[actor] or rigid.tree_asleep[rigid.dof_tree[geoms.dof[first]]] < 0:
+        for g in range(first, actors.start[actor + 1]):
+            low = wp.min(low, geom_states.low[g])
+            high = wp.max(high, geom_states.high[g])
     actor_boxes_out.low[actor] = low
     actor_boxes_out.high[actor] = high
 
@@ -209,12 +210,28 @@ def block_aabbs(
     block_boxes_out.high[block] = high
 
 
+@wp.func
+def overlaps_capsule(
+    low: wp.vec3, high: wp.vec3, tree: int, capsules: Capsules, trees: Trees, capsule_states: CapsuleStates
+):
+    """Whether a box overlaps that of one of the capsules of a tree."""
+    overlaps = bool(False)
+    for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
+        if not aabbs_disjoint(low, high, capsule_states.low[s], capsule_states.high[s]):
+            overlaps = overlaps or is_collidable(
+                capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached
+            )
+    return overlaps
+
+
 @wp.kernel
 def mark_near_trees(
     # model
     actors: Actors,
+    capsules: Capsules,
     # in
     trees: Trees,
+    capsule_states: CapsuleStates,
     block_boxes: Aabbs,
     tree_boxes: Aabbs,
     actor_boxes: Aabbs,
@@ -224,7 +241,8 @@ def mark_near_trees(
 ):
     """One thread per block: mark those of its trees whose box a geom of an actor overlaps.
 
-    A remote actor counts at remote trees only.
+    Boxes and free bunches must overlap the box of a capsule: one that lies on a canopy for hours keeps few trees awake.
+    A remote actor counts at remote trees only. capsule_states: of the last step of each tree.
     """
     block = wp.tid()
     for actor in range(actors.count[0]):
@@ -238,4 +256,7 @@ def mark_near_trees(
                 if counts and not is_near_out[tree] and not aabbs_disjoint(low, high, actor_low, actor_high):
                     for g in range(actors.start[actor], actors.start[actor + 1]):
                         if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
-                            is_near_out[tree] = True
+                            if not actors.may_sleep[actor] or overlaps_capsule(
+                                geom_states.low[g], geom_states.high[g], tree, capsules, trees, capsule_states
+                            ):
+                                is_near_out[tree] = True

@@ -2,20 +2,23 @@
 
 For plants M^-1 is the impulse response of the articulation solver; for rigid bodies it comes from MuJoCo's sparse factor
 L^T D L of M^ (mass with implicit servos). Where active constraints bind a rigid body, the caller fills in its response.
+
+Only the plants' part is assembled, a matrix for each block of contacts that plants couple. Rigid bodies couple blocks; what
+they add, J_r H^-1 J_r^T, has the rank of their degrees of freedom and stays in its factors: ``rigid_jacobian`` and
+``rigid_response``.
 """
 
 import warp as wp
 
 from vinesim.kernels.contact.structs import (
-    BODIES,
     IS_CONSTRAINED,
     Contacts,
     Geoms,
     Islands,
-    PlantBodies,
     RigidBodies,
     RigidFactors,
     Rows,
+    TouchedBodies,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -57,82 +60,112 @@ def solve_rigid_row(
         response_out[row, i] = value
 
 
+@wp.func
+def respond_within_tree(
+    row: int,
+    column: int,
+    slot: int,
+    touched: TouchedBodies,
+    plant_jacobian: wp.array2d(dtype=wp.float64),
+    body_response: wp.array4d(dtype=float),
+    response_out: wp.array2d(dtype=wp.float64),
+):
+    """Add to a row's response in one tree what its six entries from ``column`` on, of the body in ``slot``, give."""
+    start = touched.tree_start[slot]
+    for b in range(start, touched.tree_end[slot]):
+        for k in range(6):
+            change = response_out[row, 6 * (b - start) + k]
+            for j in range(6):
+                change = change + plant_jacobian[row, column + j] * wp.float64(body_response[b, k, slot - start, j])
+            response_out[row, 6 * (b - start) + k] = change
+
+
 @wp.kernel
 def inverse_mass_times_jacobian(
     # model
     geoms: Geoms,
     # in
-    bodies: PlantBodies,
     rigid: RigidBodies,
     factors: RigidFactors,
     contacts: Contacts,
-    touched_bodies: wp.array(dtype=wp.int32),
+    touched: TouchedBodies,
     counters: wp.array(dtype=wp.int32),
-    body_response: wp.array2d(dtype=float),
+    body_response: wp.array4d(dtype=float),
     # out
     rows_out: Rows,
 ):
-    """One thread per row j: M^-1 j of all plant bodies in contact, and of one kinematic tree if it is unconstrained.
+    """One thread per row j: M^-1 j of the plant bodies in contact, and of one kinematic tree if it is unconstrained.
 
-    ``body_response`` [6 body, 6 body]: change of velocity of a plant body in contact for a unit impulse on another. The
-    rigid response was zeroed before.
+    ``body_response`` [u, 6, t, 6]: change of velocity of plant body u in contact for a unit impulse on body t of its
+    tree. The rigid response was zeroed before.
     """
     row = wp.tid()
     c = row // 3
-    at = 6 * contacts.body_slot[c]
-    other_at = 6 * contacts.other_slot[c]
-    is_plant = contacts.other[c] < 0
-    tree = bodies.tree[contacts.body[c]]
-    other_tree = int(-1)  # noqa: RUF046 (Warp's way to declare a variable that changes)
-    if is_plant:
-        other_tree = bodies.tree[contacts.other_body[c]]
-    for b in range(counters[BODIES]):
-        tree_b = bodies.tree[touched_bodies[b]]
-        for k in range(6 * b, 6 * b + 6):
-            change = wp.float64(0.0)
-            if tree_b == tree:
-                for j in range(6):
-                    change = change + rows_out.plant_jacobian[row, j] * wp.float64(body_response[k, at + j])
-            if tree_b == other_tree:
-                for j in range(6):
-                    change = change + rows_out.plant_jacobian[row, 6 + j] * wp.float64(body_response[k, other_at + j])
-            rows_out.plant_response[row, k] = change
-    last_dof = int(-1)  # noqa: RUF046
-    if not is_plant:
+    slot = contacts.body_slot[c]
+    start = touched.tree_start[slot]
+    for k in range(6 * (touched.tree_end[slot] - start)):
+        rows_out.plant_response[row, k] = wp.float64(0.0)
+    respond_within_tree(row, 0, slot, touched, rows_out.plant_jacobian, body_response, rows_out.plant_response)
+    last_dof = int(-1)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    if contacts.other[c] < 0:
+        other = contacts.other_slot[c]
+        if touched.tree_start[other] == start:
+            respond_within_tree(row, 6, other, touched, rows_out.plant_jacobian, body_response, rows_out.plant_response)
+        else:
+            for k in range(6 * (touched.tree_end[other] - touched.tree_start[other])):
+                rows_out.other_response[row, k] = wp.float64(0.0)
+            respond_within_tree(row, 6, other, touched, rows_out.plant_jacobian, body_response, rows_out.other_response)
+    else:
         last_dof = geoms.dof[contacts.other[c]]
     if last_dof >= 0 and counters[IS_CONSTRAINED] == 0:
         solve_rigid_row(row, last_dof, rigid, factors, rows_out.rigid_jacobian, rows_out.rigid_response)
 
 
+@wp.func
+def body_velocity_along(
+    value: wp.float64, row: int, column: int, slot: int, source_row: int, source: int, contacts: Contacts,
+    touched: TouchedBodies, rows: Rows,
+):  # fmt: skip
+    """Add the velocity along six entries of ``row`` that a unit impulse along ``source_row`` gives the body in a slot.
+
+    ``source``: the contact of ``source_row``.
+    """
+    start = touched.tree_start[slot]
+    at = 6 * (slot - start)
+    if touched.tree_start[contacts.body_slot[source]] == start:
+        for k in range(6):
+            value = value + rows.plant_jacobian[row, column + k] * rows.plant_response[source_row, at + k]
+    elif contacts.other[source] < 0 and touched.tree_start[contacts.other_slot[source]] == start:
+        for k in range(6):
+            value = value + rows.plant_jacobian[row, column + k] * rows.other_response[source_row, at + k]
+    return value
+
+
 @wp.kernel
 def assemble_delassus(
-    # model
-    geoms: Geoms,
     # in
-    rigid: RigidBodies,
     contacts: Contacts,
+    touched: TouchedBodies,
     islands: Islands,
     # out
     rows_out: Rows,
 ):
-    """One thread per row of the Delassus matrix: entries of the contacts of its island; the others are never read."""
+    """One thread per row: the plants' entries of J M^-1 J^T with all rows of its block."""
     row = wp.tid()
     c = row // 3
-    at = 6 * contacts.body_slot[c]
-    other_at = 6 * contacts.other_slot[c]
-    last_dof = int(-1)  # noqa: RUF046
-    if contacts.other[c] >= 0:
-        last_dof = geoms.dof[contacts.other[c]]
-    for m in range(islands.start[contacts.island[c]], islands.start[contacts.island[c] + 1]):
-        for column in range(3 * islands.contact[m], 3 * islands.contact[m] + 3):
-            value = wp.float64(0.0)
-            for k in range(6):
-                value = value + rows_out.plant_jacobian[row, k] * rows_out.plant_response[column, at + k]
+    block = contacts.block[c]
+    first = islands.block_start[block]
+    last = islands.block_start[block + 1]
+    at = islands.matrix_start[block] + (3 * (contacts.place[c] - first) + row % 3) * 3 * (last - first)
+    for m in range(first, last):
+        source = islands.contact[m]
+        for k in range(3):
+            column = 3 * source + k
+            value = body_velocity_along(
+                wp.float64(0.0), row, 0, contacts.body_slot[c], column, source, contacts, touched, rows_out
+            )  # fmt: skip
             if contacts.other[c] < 0:
-                for k in range(6):
-                    value = value + rows_out.plant_jacobian[row, 6 + k] * rows_out.plant_response[column, other_at + k]
-            dof = int(last_dof)
-            while dof >= 0:
-                value = value + rows_out.rigid_jacobian[row, dof] * rows_out.rigid_response[column, dof]
-                dof = rigid.dof_parent[dof]
-            rows_out.delassus[row, column] = value
+                value = body_velocity_along(
+                    value, row, 6, contacts.other_slot[c], column, source, contacts, touched, rows_out
+                )  # fmt: skip
+            rows_out.delassus[at + 3 * (m - first) + k] = value

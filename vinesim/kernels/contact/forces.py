@@ -2,7 +2,18 @@
 
 import warp as wp
 
-from vinesim.kernels.contact.structs import CONTACTS, Contacts, Islands, Parameters, Rows, WarmStart
+from vinesim.kernels.contact.row_velocity import velocity_along
+from vinesim.kernels.contact.structs import (
+    BODIES,
+    CONTACTS,
+    Contacts,
+    Geoms,
+    Islands,
+    Parameters,
+    RigidBodies,
+    Rows,
+    WarmStart,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -11,7 +22,9 @@ wp.set_module_options({"enable_backward": False})
 def store_warm_start(
     # model
     parameters: Parameters,
+    geoms: Geoms,
     # in
+    rigid: RigidBodies,
     islands: Islands,
     rows: Rows,
     # out
@@ -28,10 +41,8 @@ def store_warm_start(
     contacts_out.force[c] = wp.transpose(axes) * impulse / parameters.dt
     slip_u = rows.velocity_free[n + 1]
     slip_v = rows.velocity_free[n + 2]
-    for m in range(islands.start[contacts_out.island[c]], islands.start[contacts_out.island[c] + 1]):
-        for k in range(3 * islands.contact[m], 3 * islands.contact[m] + 3):
-            slip_u = slip_u + rows.delassus[n + 1, k] * rows.impulse[k]
-            slip_v = slip_v + rows.delassus[n + 2, k] * rows.impulse[k]
+    slip_u = velocity_along(slip_u, n + 1, geoms, rigid, contacts_out, islands, rows)
+    slip_v = velocity_along(slip_v, n + 2, geoms, rigid, contacts_out, islands, rows)
     # the stretch with which spring and damper give just this friction: a contact that slides drags its anchor along
     force_u = impulse[1] / parameters.dt + parameters.damping * slip_u
     force_v = impulse[2] / parameters.dt + parameters.damping * slip_v
@@ -57,16 +68,17 @@ def accumulate_wrenches(
     # out
     wrench_out: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per plant body in contact: the sum of the wrenches [N, N m] of all contacts on it."""
-    body = wp.tid()
-    for k in range(6):
-        wrench_out[body, k] = wp.float64(0.0)
+    """One thread in all: the sum of the wrenches [N, N m] of all contacts on each plant body in contact."""
+    for body in range(counters[BODIES]):
+        for k in range(6):
+            wrench_out[body, k] = wp.float64(0.0)
     for row in range(3 * counters[CONTACTS]):
         c = row // 3
         force = rows.impulse[row] / parameters.dt
-        if contacts.body_slot[c] == body:
+        body = contacts.body_slot[c]
+        for k in range(6):
+            wrench_out[body, k] = wrench_out[body, k] + force * rows.plant_jacobian[row, k]
+        if contacts.other[c] < 0:
+            other = contacts.other_slot[c]
             for k in range(6):
-                wrench_out[body, k] = wrench_out[body, k] + force * rows.plant_jacobian[row, k]
-        if contacts.other[c] < 0 and contacts.other_slot[c] == body:
-            for k in range(6):
-                wrench_out[body, k] = wrench_out[body, k] + force * rows.plant_jacobian[row, 6 + k]
+                wrench_out[other, k] = wrench_out[other, k] + force * rows.plant_jacobian[row, 6 + k]

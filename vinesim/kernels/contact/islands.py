@@ -8,10 +8,12 @@ import warp as wp
 
 from vinesim.kernels.contact.structs import (
     AWAKE_TREES,
+    BLOCKS,
     BODIES,
     CONTACTS,
     IMPACTED_TREES,
     ISLANDS,
+    MATRIX_ENTRIES,
     OVERFLOW,
     SKIPPED_GEOMS,
     Candidates,
@@ -21,6 +23,7 @@ from vinesim.kernels.contact.structs import (
     Islands,
     PlantBodies,
     RigidBodies,
+    TouchedBodies,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -90,25 +93,136 @@ def insert_sorted(body: int, count: int, bodies_out: wp.array(dtype=wp.int32)):
 
 
 @wp.func
-def link_contacts(c: int, contacts_out: Contacts, bodies: PlantBodies, geoms: Geoms, rigid: RigidBodies):
-    """Join the islands of all contacts before ``c`` that interact with it."""
-    tree = bodies.tree[contacts_out.body[c]]
-    other_tree = int(-1)  # noqa: RUF046
-    if contacts_out.other_body[c] >= 0:
-        other_tree = bodies.tree[contacts_out.other_body[c]]
-    label = rigid_island(contacts_out.other[c], geoms, rigid)
-    for d in range(c):
-        tree_d = bodies.tree[contacts_out.body[d]]
-        linked = tree_d == tree or tree_d == other_tree
-        if contacts_out.other_body[d] >= 0:
-            other_tree_d = bodies.tree[contacts_out.other_body[d]]
-            linked = linked or other_tree_d == tree or other_tree_d == other_tree
-        if not linked and label >= 0:
-            linked = label == rigid_island(contacts_out.other[d], geoms, rigid)
-        if linked:
-            one = island_root(contacts_out.island, c)
-            two = island_root(contacts_out.island, d)
-            contacts_out.island[wp.max(one, two)] = wp.min(one, two)
+def slot_of(body: int, count: int, sorted_bodies: wp.array(dtype=wp.int32)):
+    """Place of a body in a sorted list of ``count`` that contains it; 0 for none (negative)."""
+    low = int(0)  # noqa: RUF046
+    high = int(count) - 1
+    while low < high:
+        middle = (low + high) // 2
+        if sorted_bodies[middle] < body:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@wp.func
+def bound_trees(count: int, bodies: PlantBodies, touched_out: TouchedBodies):
+    """Find where the touched bodies of each tree begin and end."""
+    for slot in range(count):
+        touched_out.last_contact[slot] = -1
+        touched_out.tree_start[slot] = slot
+        if slot > 0 and bodies.tree[touched_out.body[slot]] == bodies.tree[touched_out.body[slot - 1]]:
+            touched_out.tree_start[slot] = touched_out.tree_start[slot - 1]
+    for k in range(count):
+        slot = count - 1 - k
+        touched_out.tree_end[slot] = slot + 1
+        if slot + 1 < count and touched_out.tree_start[slot + 1] == touched_out.tree_start[slot]:
+            touched_out.tree_end[slot] = touched_out.tree_end[slot + 1]
+
+
+@wp.func
+def link_contacts(c: int, last_contact_out: wp.array(dtype=wp.int32), place: int, label_out: wp.array(dtype=wp.int32)):
+    """Join contact ``c`` with the island of the last contact that was linked at this place, and note it there."""
+    if last_contact_out[place] >= 0:
+        one = island_root(label_out, c)
+        two = island_root(label_out, last_contact_out[place])
+        label_out[wp.max(one, two)] = wp.min(one, two)
+    last_contact_out[place] = c
+
+
+@wp.func
+def flatten_labels(contact_count: int, label_out: wp.array(dtype=wp.int32)):
+    """Let every contact's label be the first contact of its set."""
+    for c in range(contact_count):
+        label_out[c] = island_root(label_out, c)
+
+
+@wp.func
+def is_listed_before(a: int, b: int, islands: Islands):
+    """Whether contact a comes before contact b in the list: by islands, then by blocks."""
+    before = islands.label[a] < islands.label[b]
+    if islands.label[a] == islands.label[b]:
+        before = islands.block_label[a] < islands.block_label[b]
+    return before
+
+
+@wp.func
+def list_contacts(contact_count: int, islands_out: Islands):
+    """List all contacts by islands and blocks. Contacts come by trees, so few move far."""
+    for c in range(contact_count):
+        at = int(c)
+        while at > 0 and is_listed_before(c, islands_out.contact[wp.max(at - 1, 0)], islands_out):
+            islands_out.contact[at] = islands_out.contact[at - 1]
+            at = at - 1
+        islands_out.contact[at] = c
+
+
+@wp.func
+def number_sets(
+    contact_count: int, counters_out: wp.array(dtype=wp.int32), contacts_out: Contacts, islands_out: Islands
+):
+    """Number islands and blocks in the order of the list, and place the blocks' matrices one after the other."""
+    islands = int(-1)  # noqa: RUF046
+    blocks = int(-1)  # noqa: RUF046
+    for place in range(contact_count):
+        c = islands_out.contact[place]
+        previous = islands_out.contact[wp.max(place - 1, 0)]
+        if place == 0 or islands_out.block_label[c] != islands_out.block_label[previous]:
+            blocks = blocks + 1
+            islands_out.block_start[blocks] = place
+        if place == 0 or islands_out.label[c] != islands_out.label[previous]:
+            islands = islands + 1
+            islands_out.start[islands] = place
+            islands_out.first_block[islands] = blocks
+        contacts_out.island[c] = islands
+        contacts_out.block[c] = blocks
+        contacts_out.place[c] = place
+    islands_out.start[islands + 1] = contact_count
+    islands_out.first_block[islands + 1] = blocks + 1
+    islands_out.block_start[blocks + 1] = contact_count
+    entries = int(0)  # noqa: RUF046
+    for b in range(blocks + 1):
+        islands_out.matrix_start[b] = entries
+        rows = 3 * (islands_out.block_start[b + 1] - islands_out.block_start[b])
+        entries = entries + rows * rows
+    counters_out[ISLANDS] = islands + 1
+    counters_out[BLOCKS] = blocks + 1
+    counters_out[MATRIX_ENTRIES] = entries
+
+
+@wp.func
+def island_of_dof(dof: int, rigid: RigidBodies, contacts: Contacts, islands: Islands):
+    """Island of a degree of freedom; -1 if it has no contact."""
+    contact = islands.rigid_last_contact[rigid.tree_island[rigid.dof_tree[dof]]]
+    island = int(-1)  # noqa: RUF046
+    if contact >= 0:
+        island = contacts.island[contact]
+    return island
+
+
+@wp.func
+def list_dofs(island_count: int, rigid: RigidBodies, contacts: Contacts, islands_out: Islands):
+    """List the degrees of freedom of the rigid bodies in contact, island by island."""
+    for i in range(island_count + 1):
+        islands_out.first_dof[i] = 0
+    for dof in range(islands_out.dof.shape[0]):
+        island = island_of_dof(dof, rigid, contacts, islands_out)
+        if island >= 0:
+            islands_out.first_dof[island] = islands_out.first_dof[island] + 1
+    listed = int(0)  # noqa: RUF046
+    for i in range(island_count):
+        size = islands_out.first_dof[i]
+        islands_out.first_dof[i] = listed
+        listed = listed + size
+    for dof in range(islands_out.dof.shape[0]):
+        island = island_of_dof(dof, rigid, contacts, islands_out)
+        if island >= 0:
+            islands_out.dof[islands_out.first_dof[island]] = dof
+            islands_out.first_dof[island] = islands_out.first_dof[island] + 1
+    for k in range(island_count):  # each first place was moved to the next one's
+        islands_out.first_dof[island_count - k] = islands_out.first_dof[island_count - k - 1]
+    islands_out.first_dof[0] = 0
 
 
 @wp.kernel
@@ -122,7 +236,7 @@ def build_islands(
     candidates: Candidates,
     # out
     counters_out: wp.array(dtype=wp.int32),
-    touched_bodies_out: wp.array(dtype=wp.int32),
+    touched_out: TouchedBodies,
     contacts_out: Contacts,
     islands_out: Islands,
 ):
@@ -139,33 +253,29 @@ def build_islands(
         contacts_out.other_body[c] = -1
         if contacts_out.other[c] < 0:
             contacts_out.other_body[c] = capsules.body[-1 - contacts_out.other[c]]
-        body_count = insert_sorted(contacts_out.body[c], body_count, touched_bodies_out)
-        body_count = insert_sorted(contacts_out.other_body[c], body_count, touched_bodies_out)
-    for c in range(contact_count):
-        contacts_out.body_slot[c] = 0
-        contacts_out.other_slot[c] = 0
-        for k in range(body_count):
-            if touched_bodies_out[k] == contacts_out.body[c]:
-                contacts_out.body_slot[c] = k
-            if touched_bodies_out[k] == contacts_out.other_body[c]:
-                contacts_out.other_slot[c] = k
+        body_count = insert_sorted(contacts_out.body[c], body_count, touched_out.body)
+        body_count = insert_sorted(contacts_out.other_body[c], body_count, touched_out.body)
     counters_out[BODIES] = body_count
+    bound_trees(body_count, bodies, touched_out)
+    for label in range(islands_out.rigid_last_contact.shape[0]):
+        islands_out.rigid_last_contact[label] = -1
 
     for c in range(contact_count):
-        contacts_out.island[c] = c
-        link_contacts(c, contacts_out, bodies, geoms, rigid)
-    islands = int(0)  # noqa: RUF046
-    listed = int(0)  # noqa: RUF046
+        islands_out.label[c] = c
+        contacts_out.body_slot[c] = slot_of(contacts_out.body[c], body_count, touched_out.body)
+        contacts_out.other_slot[c] = slot_of(contacts_out.other_body[c], body_count, touched_out.body)
+        link_contacts(c, touched_out.last_contact, touched_out.tree_start[contacts_out.body_slot[c]], islands_out.label)
+        if contacts_out.other_body[c] >= 0:
+            place = touched_out.tree_start[contacts_out.other_slot[c]]
+            link_contacts(c, touched_out.last_contact, place, islands_out.label)
+    flatten_labels(contact_count, islands_out.label)
     for c in range(contact_count):
-        if contacts_out.island[c] == c:
-            islands_out.start[islands] = listed
-            for d in range(c, contact_count):
-                if island_root(contacts_out.island, d) == c:
-                    islands_out.contact[listed] = d
-                    listed = listed + 1
-            islands = islands + 1
-    islands_out.start[islands] = listed
-    for i in range(islands):
-        for m in range(islands_out.start[i], islands_out.start[i + 1]):
-            contacts_out.island[islands_out.contact[m]] = i
-    counters_out[ISLANDS] = islands
+        islands_out.block_label[c] = islands_out.label[c]
+    for c in range(contact_count):
+        label = rigid_island(contacts_out.other[c], geoms, rigid)
+        if label >= 0:
+            link_contacts(c, islands_out.rigid_last_contact, label, islands_out.label)
+    flatten_labels(contact_count, islands_out.label)
+    list_contacts(contact_count, islands_out)
+    number_sets(contact_count, counters_out, contacts_out, islands_out)
+    list_dofs(counters_out[ISLANDS], rigid, contacts_out, islands_out)

@@ -82,8 +82,13 @@ def write_bias(
         rows_out.bias[3 * c] = wp.max(end_gap * parameters.stiffness / share, -parameters.max_separation_speed)
     t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
-    for k in range(warm_start.count[0]):
+    count = warm_start.count[0]
+    looked = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    while looked < count:  # a contact that lasts is near the same place in the list
+        k = (c + looked) % count
+        looked = looked + 1
         if warm_start.feature[k] == feature and warm_start.other[k] == other:
+            looked = count
             rows_out.impulse[3 * c] = warm_start.normal_impulse[k]
             rows_out.impulse[3 * c + 1] = wp.dot(t1, warm_start.friction_impulse[k])
             rows_out.impulse[3 * c + 2] = wp.dot(t2, warm_start.friction_impulse[k])

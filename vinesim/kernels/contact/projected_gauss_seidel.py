@@ -6,8 +6,10 @@ x_n v_n = 0; friction |x_t| <= mu x_n against the sliding. In double precision.
 
 import warp as wp
 
+from vinesim.kernels.contact.conjugate_gradient import follow_conjugate_direction
 from vinesim.kernels.contact.newton import newton_step
-from vinesim.kernels.contact.structs import Contacts, Islands, Parameters, Rows
+from vinesim.kernels.contact.row_velocity import add_impulse, delassus_entry, update_rigid_velocity, velocity_along
+from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Parameters, RigidBodies, Rows, SolverScratch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,101 +19,72 @@ MIN_IMPULSE_SCALE = wp.constant(wp.float64(1.0e-5))
 
 @wp.func
 def row_residual(
-    row: int,
-    compliance: wp.float64,
-    first: int,
-    last: int,
-    island_contact: wp.array(dtype=wp.int32),
-    delassus: wp.array2d(dtype=wp.float64),
-    velocity_free: wp.array(dtype=wp.float64),
-    bias: wp.array(dtype=wp.float64),
-    impulse: wp.array(dtype=wp.float64),
+    row: int, compliance: wp.float64, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows
 ):
     """Velocity [m/s] along a row, bias and compliance included, with the impulses of its island."""
-    r = velocity_free[row] + bias[row] + compliance * impulse[row]
-    for m in range(first, last):
-        i = 3 * island_contact[m]
-        r = (
-            r
-            + delassus[row, i] * impulse[i]
-            + delassus[row, i + 1] * impulse[i + 1]
-            + delassus[row, i + 2] * impulse[i + 2]
-        )
-    return r
+    r = rows.velocity_free[row] + rows.bias[row] + compliance * rows.impulse[row]
+    return velocity_along(r, row, geoms, rigid, contacts, islands, rows)
 
 
 @wp.func
 def relax_contact(
-    c: int,
-    mu: wp.float64,
-    compliance: wp.float64,
-    first: int,
-    last: int,
-    island_contact: wp.array(dtype=wp.int32),
-    delassus: wp.array2d(dtype=wp.float64),
-    velocity_free: wp.array(dtype=wp.float64),
-    bias: wp.array(dtype=wp.float64),
-    impulse_out: wp.array(dtype=wp.float64),
-):
+    c: int, island: int, compliance: wp.float64, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands,
+    rows_out: Rows,
+):  # fmt: skip
     """One Gauss-Seidel step of a contact, normal and then friction; returns the largest change of an impulse [N s]."""
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     n = 3 * c
-    r = row_residual(n, compliance, first, last, island_contact, delassus, velocity_free, bias, impulse_out)
-    before = impulse_out[n]
-    normal = wp.max(zero, before - r / (delassus[n, n] + compliance))
-    impulse_out[n] = normal
-    change = wp.abs(normal - before)
+    r = row_residual(n, compliance, geoms, rigid, contacts, islands, rows_out)
+    before = rows_out.impulse[n]
+    normal = wp.max(zero, before - r / (delassus_entry(n, 0, geoms, rigid, contacts, islands, rows_out) + compliance))
+    if normal != before:
+        add_impulse(n, normal - before, island, contacts, islands, rows_out)
+        rows_out.impulse[n] = normal
 
     u = n + 1
     v = n + 2
-    ru = row_residual(u, compliance, first, last, island_contact, delassus, velocity_free, bias, impulse_out)
-    rv = row_residual(v, compliance, first, last, island_contact, delassus, velocity_free, bias, impulse_out)
+    ru = row_residual(u, compliance, geoms, rigid, contacts, islands, rows_out)
+    rv = row_residual(v, compliance, geoms, rigid, contacts, islands, rows_out)
     # the larger eigenvalue of the tangential block: the step stays inside the cone's convergence
-    mean = half * (delassus[u, u] + delassus[v, v]) + compliance
-    spread = half * (delassus[u, u] - delassus[v, v])
-    eigenvalue = mean + wp.sqrt(spread * spread + delassus[u, v] * delassus[u, v])
-    fu = impulse_out[u] - ru / eigenvalue
-    fv = impulse_out[v] - rv / eigenvalue
+    uu = delassus_entry(u, 1, geoms, rigid, contacts, islands, rows_out)
+    vv = delassus_entry(v, 2, geoms, rigid, contacts, islands, rows_out)
+    uv = delassus_entry(u, 2, geoms, rigid, contacts, islands, rows_out)
+    mean = half * (uu + vv) + compliance
+    spread = half * (uu - vv)
+    eigenvalue = mean + wp.sqrt(spread * spread + uv * uv)
+    fu = rows_out.impulse[u] - ru / eigenvalue
+    fv = rows_out.impulse[v] - rv / eigenvalue
     tangential = wp.sqrt(fu * fu + fv * fv)
-    limit = mu * normal
+    limit = contacts.friction[c] * normal
     if tangential > limit:
         fu = fu * limit / wp.max(tangential, wp.float64(1.0e-30))
         fv = fv * limit / wp.max(tangential, wp.float64(1.0e-30))
-    change = wp.max(change, wp.abs(fu - impulse_out[u]) + wp.abs(fv - impulse_out[v]))
-    impulse_out[u] = fu
-    impulse_out[v] = fv
-    return change
+    change_u = fu - rows_out.impulse[u]
+    change_v = fv - rows_out.impulse[v]
+    if change_u != zero or change_v != zero:
+        add_impulse(u, change_u, island, contacts, islands, rows_out)
+        add_impulse(v, change_v, island, contacts, islands, rows_out)
+    return wp.max(wp.abs(normal - before), wp.abs(change_u) + wp.abs(change_v))
 
 
 @wp.func
-def save_impulses(
-    first: int,
-    last: int,
-    island_contact: wp.array(dtype=wp.int32),
-    impulse: wp.array(dtype=wp.float64),
-    system_out: wp.array2d(dtype=wp.float64),
-):
-    """Keep the impulses of one island in the last column of the scratch matrix."""
-    for m in range(first, last):
-        for k in range(3):
-            row = 3 * island_contact[m] + k
-            system_out[row, system_out.shape[1] - 1] = impulse[row]
+def largest_block(island: int, islands: Islands):
+    """Contacts of the largest block of an island."""
+    largest = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    for block in range(islands.first_block[island], islands.first_block[island + 1]):
+        largest = wp.max(largest, islands.block_start[block + 1] - islands.block_start[block])
+    return largest
 
 
 @wp.func
-def restore_impulses(
-    first: int,
-    last: int,
-    island_contact: wp.array(dtype=wp.int32),
-    system: wp.array2d(dtype=wp.float64),
-    impulse_out: wp.array(dtype=wp.float64),
+def copy_impulses(
+    island: int, islands: Islands, impulse: wp.array(dtype=wp.float64), impulse_out: wp.array(dtype=wp.float64)
 ):
-    """Go back to the impulses that were kept."""
-    for m in range(first, last):
-        for k in range(3):
-            row = 3 * island_contact[m] + k
-            impulse_out[row] = system[row, system.shape[1] - 1]
+    """Copy the impulses of one island."""
+    for m in range(islands.start[island], islands.start[island + 1]):
+        for row in range(3 * islands.contact[m], 3 * islands.contact[m] + 3):
+            impulse_out[row] = impulse[row]
 
 
 @wp.kernel
@@ -122,44 +95,51 @@ def solve_islands(
     max_newton_steps: int,
     max_newton_contacts: int,
     tolerance: wp.float64,
+    geoms: Geoms,
     # in
+    rigid: RigidBodies,
     contacts: Contacts,
     # out
     islands_out: Islands,
+    scratch_out: SolverScratch,
     rows_out: Rows,
 ):
     """One thread per island: solve it from the guess in ``impulse`` on.
 
     Contacts that depend on each other (two fingers about a bunch) slow Gauss-Seidel down: within a few sweeps it finds
-    which contacts stick, slide or open, and takes a hundred for the rest. So small islands take a Newton step after
-    every other sweep, at first. If these do not settle, sweeps alone go on from where they began.
+    which contacts stick, slide or open, and takes a hundred for the rest. So islands of small blocks take a Newton step
+    after every other sweep, at first. If these do not settle, sweeps go on from where they began, with conjugate
+    gradients, as they do from the first one on in islands with a large block.
     """
     island = wp.tid()
     first = islands_out.start[island]
     last = islands_out.start[island + 1]
+    newton_end = 2 * max_newton_steps
+    if largest_block(island, islands_out) > max_newton_contacts:
+        newton_end = 0
+    update_rigid_velocity(island, contacts, islands_out, rows_out)
     sweeps = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    gradient = wp.float64(0.0)
     busy = bool(True)
     while busy and sweeps < max_sweeps:
+        copy_impulses(island, islands_out, rows_out.impulse, scratch_out.impulse_before)
         change = wp.float64(0.0)
         largest = wp.float64(MIN_IMPULSE_SCALE)
         for m in range(first, last):
             c = islands_out.contact[m]
-            moved = relax_contact(
-                c, contacts.friction[c], parameters.compliance, first, last, islands_out.contact,
-                rows_out.delassus, rows_out.velocity_free, rows_out.bias, rows_out.impulse,
-            )  # fmt: skip
+            moved = relax_contact(c, island, parameters.compliance, geoms, rigid, contacts, islands_out, rows_out)
             change = wp.max(change, moved)
             largest = wp.max(largest, rows_out.impulse[3 * c])
         sweeps = sweeps + 1
         busy = change > tolerance * largest
-        if busy and last - first <= max_newton_contacts and sweeps % 2 == 0 and sweeps <= 2 * max_newton_steps + 2:
-            if sweeps <= 2 * max_newton_steps:
+        if busy and sweeps < max_sweeps:
+            if sweeps == newton_end + 1 and newton_end > 0:
+                copy_impulses(island, islands_out, scratch_out.impulse_first, rows_out.impulse)
+                update_rigid_velocity(island, contacts, islands_out, rows_out)
+            elif sweeps > newton_end:
+                gradient = follow_conjugate_direction(island, gradient, contacts, islands_out, scratch_out, rows_out)
+            elif sweeps % 2 == 0:
                 if sweeps == 2:
-                    save_impulses(first, last, islands_out.contact, rows_out.impulse, rows_out.newton_system)
-                newton_step(
-                    parameters.compliance, first, last, islands_out.contact, contacts.friction, rows_out.delassus,
-                    rows_out.velocity_free, rows_out.bias, rows_out.newton_system, rows_out.impulse,
-                )  # fmt: skip
-            else:
-                restore_impulses(first, last, islands_out.contact, rows_out.newton_system, rows_out.impulse)
+                    copy_impulses(island, islands_out, rows_out.impulse, scratch_out.impulse_first)
+                newton_step(island, parameters.compliance, contacts, islands_out, scratch_out, rows_out)
     islands_out.sweeps[island] = sweeps

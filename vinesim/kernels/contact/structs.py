@@ -21,11 +21,14 @@ BODIES = wp.constant(4)
 IS_CONSTRAINED = wp.constant(5)
 """1 if a rigid body in contact is bound by active constraints of MuJoCo."""
 ISLANDS = wp.constant(6)
+BLOCKS = wp.constant(8)
+MATRIX_ENTRIES = wp.constant(9)
+"""Entries of the matrices of all blocks."""
 SORT_AXIS = wp.constant(7)
 """World axis (0, 1, 2) along which the boxes of trees are sorted."""
-SKIPPED_GEOMS = wp.constant(8)
+SKIPPED_GEOMS = wp.constant(10)
 """Static geoms beyond what one tree can be near to."""
-COUNTERS = 9
+COUNTERS = 11
 
 AABB_BLOCK = wp.constant(32)
 """So many static boxes share one box around them, and are skipped by one comparison."""
@@ -51,8 +54,6 @@ class Parameters:
     """[m/s]"""
     impact_speed: wp.float64
     """[m/s] A contact that closes faster is an impact."""
-    wake_speed: wp.float64
-    """[m/s] Boxes and free bunches that are slower wake no plant."""
     plant_friction: wp.float64
     """[1] Coulomb coefficient between plants."""
 
@@ -71,6 +72,8 @@ class Trees:
 
     awake: wp.array(dtype=wp.int32)
     """[k] numbers of the trees that this step is about; as many as the thread count says."""
+    is_awake: wp.array(dtype=wp.bool)
+    """[tree]"""
     is_fine: wp.array(dtype=wp.bool)
     """[tree] whether the clusters of its bunches are free to move."""
     is_remote: wp.array(dtype=wp.bool)
@@ -124,7 +127,7 @@ class Capsules:
 
 @wp.struct
 class CapsuleStates:
-    """The capsules of awake trees at the start of the step [capsule]."""
+    """The capsules at the start of the step [capsule]; of sleeping trees, where they fell asleep."""
 
     start: wp.array(dtype=wp.vec3)
     end: wp.array(dtype=wp.vec3)
@@ -133,6 +136,19 @@ class CapsuleStates:
     low: wp.array(dtype=wp.vec3)
     """[m] box of the space that it sweeps in the step."""
     high: wp.array(dtype=wp.vec3)
+
+
+@wp.struct
+class Clearances:
+    """How far capsules of awake trees were from contact with sleeping trees when they were last compared [capsule]."""
+
+    start: wp.array(dtype=wp.vec3)
+    """[m] then."""
+    end: wp.array(dtype=wp.vec3)
+    distance: wp.array(dtype=float)
+    """[m] that they may move from there; negative if they must be compared in any case."""
+    reach: wp.array(dtype=float)
+    """[m] around the capsule to be searched in this step; 0 for none."""
 
 
 @wp.struct
@@ -189,8 +205,8 @@ class Actors:
     start: wp.array(dtype=wp.int32)
     """[actor + 1] first geom of each."""
     is_remote: wp.array(dtype=wp.bool)
-    wakes_only_moving: wp.array(dtype=wp.bool)
-    """Boxes and free bunches wake plants only while they are faster than ``wake_speed``."""
+    may_sleep: wp.array(dtype=wp.bool)
+    """Boxes and free bunches wake plants only while MuJoCo has them awake."""
 
 
 @wp.struct
@@ -209,6 +225,8 @@ class RigidBodies:
     """[MuJoCo body]"""
     dof_parent: wp.array(dtype=wp.int32)
     dof_tree: wp.array(dtype=wp.int32)
+    tree_asleep: wp.array(dtype=wp.int32)
+    """[MuJoCo tree] negative while it is awake."""
     velocity_free: wp.array(dtype=wp.float64)
     """[dof] at the end of the step if there were no plants."""
     correction: wp.array(dtype=wp.float64)
@@ -289,18 +307,53 @@ class Contacts:
     axes: wp.array(dtype=wp.mat33d)
     """rows: normal, first and second tangent."""
     island: wp.array(dtype=wp.int32)
+    block: wp.array(dtype=wp.int32)
+    place: wp.array(dtype=wp.int32)
+    """place in the list of the islands."""
     force: wp.array(dtype=wp.vec3d)
     """[N] on the plant."""
 
 
 @wp.struct
+class TouchedBodies:
+    """Plant bodies in contact [slot], sorted, each once: those of one tree are neighbours."""
+
+    body: wp.array(dtype=wp.int32)
+    tree_start: wp.array(dtype=wp.int32)
+    """[slot] first slot of the same tree."""
+    tree_end: wp.array(dtype=wp.int32)
+    """[slot] slot after the last of the same tree."""
+    last_contact: wp.array(dtype=wp.int32)
+    """[slot] scratch: the contact of the tree that begins here that was linked last."""
+
+
+@wp.struct
 class Islands:
-    """Islands: sets of contacts that do not affect each other within the step."""
+    """Islands: sets of contacts that do not affect each other within the step. Each consists of blocks.
+
+    A block is a set of contacts that plants couple. The blocks of an island are coupled by rigid bodies only.
+    """
 
     start: wp.array(dtype=wp.int32)
     """[island + 1] first place of each in ``contact``."""
+    first_block: wp.array(dtype=wp.int32)
+    """[island + 1]"""
+    block_start: wp.array(dtype=wp.int32)
+    """[block + 1] first place of each in ``contact``."""
+    matrix_start: wp.array(dtype=wp.int32)
+    """[block + 1] first entry of its matrix in ``Rows.delassus``."""
     contact: wp.array(dtype=wp.int32)
-    """[contact] contacts, island by island."""
+    """[place] contacts, island by island and block by block."""
+    label: wp.array(dtype=wp.int32)
+    """[contact] scratch: the first contact of the same island."""
+    block_label: wp.array(dtype=wp.int32)
+    """[contact] scratch: the first contact of the same block."""
+    first_dof: wp.array(dtype=wp.int32)
+    """[island + 1] first place of each in ``dof``."""
+    dof: wp.array(dtype=wp.int32)
+    """[place] degrees of freedom of the rigid bodies, island by island."""
+    rigid_last_contact: wp.array(dtype=wp.int32)
+    """[label of rigid bodies] scratch: the contact with these rigid bodies that was linked last."""
     sweeps: wp.array(dtype=wp.int32)
     """[island] Gauss-Seidel sweeps of the last solve."""
 
@@ -314,19 +367,40 @@ class Rows:
     rigid_jacobian: wp.array2d(dtype=wp.float64)
     """[row, dof]"""
     plant_response: wp.array2d(dtype=wp.float64)
-    """[row, 6 * body in contact] M^-1 J^T: change of velocity of plant bodies for a unit impulse along the row."""
+    """[row, 6 * touched body of the tree] M^-1 J^T: change of velocity of the touched bodies of the tree of ``body``
+    for a unit impulse along the row."""
+    other_response: wp.array2d(dtype=wp.float64)
+    """The same for the tree of ``other_body``, if that is another tree."""
     rigid_response: wp.array2d(dtype=wp.float64)
     """[row, dof] the same for the rigid world."""
-    delassus: wp.array2d(dtype=wp.float64)
-    """[row, row] J M^-1 J^T, within islands only."""
+    delassus: wp.array(dtype=wp.float64)
+    """J M^-1 J^T of the plants [entry], a matrix of rows for each block."""
     velocity_free: wp.array(dtype=wp.float64)
     """[row] m/s along the row at the end of the step without contacts."""
     bias: wp.array(dtype=wp.float64)
     """[row] m/s"""
     impulse: wp.array(dtype=wp.float64)
     """[row] N s"""
-    newton_system: wp.array2d(dtype=wp.float64)
-    """[row, row + 2] scratch of Newton steps; the last column keeps the impulses from before the first of them."""
+    rigid_velocity: wp.array(dtype=wp.float64)
+    """[dof] by which the impulses change the velocities of the rigid world."""
+
+
+@wp.struct
+class SolverScratch:
+    """What the solver of an island works with."""
+
+    matrix: wp.array(dtype=wp.float64)
+    """[entry] as ``Rows.delassus``: the linear system of a Newton step."""
+    columns: wp.array2d(dtype=wp.float64)
+    """[row, 1 + dof of the island] its right-hand sides: velocities without impulses, and Jacobians of the dofs."""
+    rigid_system: wp.array2d(dtype=wp.float64)
+    """[dof, 1 + dof of the island] what is left of it for the rigid velocities, right-hand side first."""
+    impulse_first: wp.array(dtype=wp.float64)
+    """[row] N s before the first Newton step."""
+    impulse_before: wp.array(dtype=wp.float64)
+    """[row] N s before the last sweep."""
+    direction: wp.array(dtype=wp.float64)
+    """[row] N s, direction of search."""
 
 
 @wp.struct

@@ -12,6 +12,9 @@ robots and five people on 60 x 40 m, each moving five trees, a client receives 7
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 
 CELL_SIZE = 6.0
@@ -26,11 +29,29 @@ MAX_INTEREST_RADIUS = CELL_SIZE - HYSTERESIS
 INTEREST_RADIUS = 5.0
 """Default distance within which an actor receives states of objects that peers move [m]."""
 
-FULL_RATE_DISTANCE = 10.0
-"""Actors nearer than this receive each other's poses at the full rate [m] ..."""
+POSE_RATE = 60.0
+"""Poses that an actor makes a second. Each leaves on one layer only; a receiver takes the layers that it needs."""
 
-REDUCED_RATE_DISTANCE = 12.0
-"""... until they are this far apart [m]."""
+
+class PoseLayer(NamedTuple):
+    """A share of the poses of an actor, under a key of its own."""
+
+    suffix: str
+    """Of the key ``a/<actor>``."""
+    every: int
+    """With all layers above it in the list, every so many of the poses."""
+    distance: float
+    """[m] Actors within it subscribe to the layer."""
+
+
+POSE_LAYERS = (
+    PoseLayer("/far", 12, math.inf), PoseLayer("/mid", 4, 12.0), PoseLayer("/near", 2, 6.0), PoseLayer("", 1, 3.0),
+)  # fmt: skip
+"""5 Hz for all, and 15, 30 and 60 Hz within 12, 6 and 3 m: the rate falls with the distance, so that what moves at a
+given speed moves by the same angle between two poses, seen from the receiver. Hands touch within 3 m."""
+
+LAYER_HYSTERESIS = 1.2
+"""A layer is received until its actor is farther away than its distance by this factor."""
 
 Cell = tuple[int, int]
 
@@ -80,6 +101,12 @@ def count_listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.
     return np.count_nonzero(x * x + y * y <= near * near, axis=1)
 
 
-def is_full_rate(distance: float, now: bool) -> bool:
-    """Whether an actor at ``distance`` [m] sends its poses at the full rate here, given whether it does ``now``."""
-    return distance <= (REDUCED_RATE_DISTANCE if now else FULL_RATE_DISTANCE)
+def count_layers(distance: float, now: int) -> int:
+    """How many of :data:`POSE_LAYERS` are received from an actor at ``distance`` [m], if there are so many ``now``."""
+    factors = (LAYER_HYSTERESIS if number < now else 1.0 for number in range(len(POSE_LAYERS)))
+    return sum(distance <= layer.distance * factor for layer, factor in zip(POSE_LAYERS, factors, strict=True))
+
+
+def pose_layer(before: int, number: int) -> int:
+    """The layer of the poses after ``before`` up to ``number``, of which one is sent: the lowest of theirs."""
+    return next(i for i, layer in enumerate(POSE_LAYERS) if number // layer.every != before // layer.every)

@@ -1,6 +1,7 @@
 """The peers of one actor: liveliness, greetings, their poses, and the common clock.
 
-Keys: ``a/<actor>`` pose at the full rate for peers nearby, ``a/<actor>/far`` the same at 5 Hz for all, and the queries
+Keys: ``a/<actor>/far``, ``a/<actor>/mid``, ``a/<actor>/near`` and ``a/<actor>`` share the poses of an actor: the nearer
+a peer, the more of them it receives (:data:`vinesim.net.replication.interest.POSE_LAYERS`). And the queries
 ``hello/<actor>`` and ``clock``.
 """
 
@@ -8,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 import zlib
 from collections.abc import Iterator
 
@@ -21,16 +23,10 @@ from vinesim.net.replication import interest
 from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.replication.network_clock import NetworkClock
 from vinesim.net.replication.remote_pose import RemotePose
-from vinesim.net.transport.bus import KEEP_LAST_1, Bus, Publisher, Reply
+from vinesim.net.transport.bus import KEEP_LAST_1, Bus, Reply
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 log = logging.getLogger(__name__)
-
-ACTOR_PERIOD = 1.0 / 60.0
-"""Time between poses for peers nearby [s]."""
-
-FAR_PERIOD = 1.0 / 5.0
-"""Time between poses for all [s]."""
 
 ASK_PERIOD = 0.5
 """Time between two queries for a peer's hello [s]."""
@@ -65,11 +61,11 @@ class PeerRegistry:
         self._queried: dict[str, float] = {}
         self._rejected: set[str] = set()
         self._warned: set[str] = set()
-        self._pose = bus.publisher(f"a/{hello.name}")
-        self._far_pose = bus.publisher(f"a/{hello.name}/far")
-        bus.subscribe("a/*/far", KEEP_LAST_1)
-        self._pose_due: dict[Publisher, float] = {}
-        self._phase = zlib.crc32(hello.name.encode()) % 1024 / 1024.0
+        self._layers = [bus.publisher(f"a/{hello.name}{layer.suffix}") for layer in interest.POSE_LAYERS]
+        bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_LAST_1)
+        self._pose_number: int | None = None
+        """Of the last pose that was due."""
+        self._phase = zlib.crc32(hello.name.encode()) % 1024 / 1024.0 * interest.POSE_LAYERS[0].every
 
     def positions(self) -> dict[str, np.ndarray]:
         """Positions [3] m of all peers whose pose is known."""
@@ -98,8 +94,8 @@ class PeerRegistry:
             actor = self.known.pop(name)
             self._queried.pop(name, None)
             self._warned.discard(name)
-            if actor.near is not None:
-                actor.near.close()
+            for channel in actor.near:
+                channel.close()
         self._rejected &= alive
         self._initial_names &= alive
         strangers = sorted(alive - self.known.keys() - self._rejected - {self.hello.name})
@@ -183,28 +179,27 @@ class PeerRegistry:
     # ------------------------------------------------------------ poses
 
     def update_interest(self, position: np.ndarray) -> None:
-        """Receive poses at the full rate from peers near ``position`` [m]."""
+        """Receive more of the poses of a peer the nearer it is to ``position`` [m]."""
         for name, actor in self.known.items():
             if actor.update is None:
                 continue
             away = float(np.hypot(*(actor.update.base_q[:2] - position[:2])))
-            if interest.is_full_rate(away, actor.near is not None):
-                actor.near = actor.near or self.bus.subscribe(f"a/{name}", KEEP_LAST_1)
-            elif actor.near is not None:
-                actor.near.close()
-                actor.near = None
+            wanted = interest.count_layers(away, 1 + len(actor.near)) - 1
+            while len(actor.near) > wanted:
+                actor.near.pop().close()
+            for layer in interest.POSE_LAYERS[1 + len(actor.near) : 1 + wanted]:
+                actor.near.append(self.bus.subscribe(f"a/{name}{layer.suffix}", KEEP_LAST_1))
 
     def publish_pose(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
-        """Publish the own pose: 60 Hz to peers nearby, 5 Hz to all; encoded only if there is a subscriber."""
-        payload = b""
-        for publisher, period in ((self._pose, ACTOR_PERIOD), (self._far_pose, FAR_PERIOD)):
-            due = self._pose_due.get(publisher)
-            if due is None:  # those who come at once need not speak at once for ever
-                due = now - period * self._phase
-            elif now < due - 1e-9:
-                continue
-            self._pose_due[publisher] = max(due, now - period) + period
-            if publisher.matching:
-                payload = payload or encode_pose(dataclasses.replace(robot, actor=self.hello.name, time=time))
-                if publisher.put(payload):
-                    self.counters.actor.count_out(payload)
+        """Publish the own pose, 60 times a second on one of the layers; encoded only if that has a subscriber."""
+        number, before = math.floor(now * interest.POSE_RATE + self._phase + 1e-6), self._pose_number
+        if number == before:
+            return
+        self._pose_number = number
+        if before is None:  # those who come at once need not speak at once for ever
+            return
+        publisher = self._layers[interest.pose_layer(before, number)]
+        if publisher.matching:
+            payload = encode_pose(dataclasses.replace(robot, actor=self.hello.name, time=time))
+            if publisher.put(payload):
+                self.counters.actor.count_out(payload)

@@ -32,7 +32,8 @@ class RemotePose:
         self._buffer = JitterBuffer(buffer)
         self.joints = hello.joints
         self.update: RobotUpdate | HumanUpdate | None = None
-        self.near: Subscription | None = None
+        self.near: list[Subscription] = []
+        """Of the faster layers of its poses; empty while it is far."""
         self.moved_at = -1e9
         self._turns = _TURNS if hello.kind == "human" else _BASE
         """Indices of the quaternions in the flat pose [k, 4]."""
@@ -81,7 +82,7 @@ class RemotePose:
 
     def sample(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
         """The pose at network ``time``, to be shown at own time ``now`` [s]; of a distant peer up to 100 ms old."""
-        if self._cached is None or self.near is not None or not 0.0 <= now - self._cached.time < FAR_SAMPLE_PERIOD:
+        if self._cached is None or self.near or not 0.0 <= now - self._cached.time < FAR_SAMPLE_PERIOD:
             self._cached = self._at(time, now)
         return self._cached
 

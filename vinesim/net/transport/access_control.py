@@ -101,7 +101,7 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         ]  # fmt: skip
         if role == Role.ROBOT:
             own.append(rule(f"{name} offers its meshes", "ingress", ["query"], f"{root}/offer/{name}"))
-        written = (f"{root}/a/{name}", f"{root}/a/{name}/far")
+        written = (f"{root}/a/{name}", *(f"{root}/a/{name}/{layer}" for layer in ("far", "mid", "near")))
         if role != Role.SPECTATOR:
             written += (f"{root}/force/*/{name}", *(f"{root}/{family}/*/*/{name}" for family in FAMILIES))
         own.append(rule(f"{name} writes", "ingress", ["put", "delete"], *written))

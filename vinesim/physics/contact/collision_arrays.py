@@ -26,7 +26,7 @@ def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
     made.compliance = 1.0 / (p.dt * (stiffness * p.dt + damping))
     made.margin, made.static_margin = p.contact_margin, p.static_contact_margin
     made.max_separation_speed, made.impact_speed = p.max_separation_speed, p.impact_speed
-    made.wake_speed, made.plant_friction = p.wake_speed, p.friction
+    made.plant_friction = p.friction
     return made
 
 
@@ -38,6 +38,7 @@ class PlantArrays:
         self.trees = SharedArrays(
             structs.Trees,
             awake=np.zeros(count, np.int32),
+            is_awake=state.tree_awake,
             is_fine=state.tree_fine,
             is_remote=np.zeros(count, np.bool_),
             bunch_attached=state.bunch_attached,
@@ -115,6 +116,7 @@ class RigidArrays:
             subtree_com=data.subtree_com,
             dof_parent=world.dof_parentid,
             dof_tree=world.dof_treeid,
+            tree_asleep=data.tree_asleep,
             velocity_free=velocity,
             correction=correction,
             correction_before=before,
@@ -147,7 +149,7 @@ class RigidArrays:
         self.actor_count = self.actors.count[0] = len(first)
         self.actors.start[: len(first) + 1] = [*first, movable]
         self.actors.is_remote[: len(first)] = is_remote[first]
-        self.actors.wakes_only_moving[: len(first)] = [actor[i] not in rigid.actors for i in first]
+        self.actors.may_sleep[: len(first)] = [actor[i] not in rigid.actors for i in first]
 
     @functools.cached_property
     def names(self) -> list[tuple[str, str, int]]:

@@ -29,12 +29,10 @@ class ContactSolver:
     ``wake_near_trees()`` (before ``plants.predict()``) wakes the trees that an actor is near to; ``solve()`` (after it)
     leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.integrate()``.
 
-    Robots, people, boxes and free bunches wake the trees that they are near to. Static geoms (ground, poles, trunks)
-    and
-    other plants only hold back what moves already. What overlaps in the scene as generated is in contact only beyond
-    that. All numbers come from ``rigid.parameters``; of more contacts than ``contact_capacity``, the deepest are kept,
-    and
-    ``dropped_contacts`` and ``overflow_message`` report it.
+    Robots, people, boxes and free bunches wake the trees that they are near to, awake trees those that they touch.
+    Static geoms (ground, poles, trunks) only hold back what moves already. What overlaps in the scene as generated is
+    in contact only beyond that. All numbers come from ``rigid.parameters``; of more contacts than
+    ``contact_capacity``, the deepest are kept, and ``dropped_contacts`` and ``overflow_message`` report it.
     """
 
     def __init__(self, model: Model, plants: ArticulationSolver, rigid: RigidWorld) -> None:
@@ -87,11 +85,12 @@ class ContactSolver:
             self.plants.wake(self.near_trees)
 
     def solve(self) -> None:
-        """Find the contacts of all awake trees and their forces."""
-        self._awake = awake = self.plants.awake
+        """Find the contacts of all awake trees, and of those that these wake, and their forces."""
         self.count, self._reported, self._touched = 0, (), ()
         self.impulses.clear()
-        if len(awake) and self._rigid_arrays is not None and self._rigid_arrays.count:
+        self._awake = self.plants.awake
+        if len(self._awake):
+            self._awake = awake = self._wake_reached_trees()
             self._find_contacts(awake)
             self._predict_impacted(awake)
         if self.count:
@@ -100,11 +99,24 @@ class ContactSolver:
         else:
             self.impulses.warm_start.count[0] = 0
 
+    def _wake_reached_trees(self) -> np.ndarray:
+        """Wake the sleeping trees that awake ones touch, those that these touch, and so on.
+
+        Returns all awake trees [k].
+        """
+        plants, detection = self.plants, self.detection
+        detection.list_awake(plants.awake)
+        while self.plant_plant_contacts and len(reached := detection.find_reached_trees()):
+            plants.wake(reached)
+            plants.predict(reached)
+            detection.list_awake(plants.awake)
+        return plants.awake
+
     def _find_contacts(self, awake: np.ndarray) -> None:
         """List the contacts of the awake trees; of too many, the deepest."""
         detection, capacity = self.detection, self.impulses.capacity
         candidates = detection.candidates
-        detection.find_candidates(awake, self.plant_plant_contacts)
+        detection.find_candidates(self.plant_plant_contacts)
         if detection.candidates is not candidates:
             self.impulses.bind_launches(detection)
         self.impulses.compact_candidates(1)
@@ -131,9 +143,10 @@ class ContactSolver:
         """
         if self.detection.counters[structs.IMPACTED_TREES]:
             impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
-            if (self.plants.phi_used[impacted] < 1.0).any():
+            changed = impacted[self.plants.phi_used[impacted] < 1.0]
+            if len(changed):
                 self.plants.use_backward_euler(impacted)
-                self.plants.predict()
+                self.plants.predict(changed)
 
     # ------------------------------------------------------------------ results
 
@@ -176,6 +189,14 @@ class ContactSolver:
                 if pressure[c] > 0.0
             )  # fmt: skip
         return self._reported
+
+    @property
+    def contact_pairs(self) -> np.ndarray:
+        """[k, 2] Pairs of awake trees that were in contact in the last step."""
+        bodies = np.stack(
+            [self.impulses.contacts.body[: self.count], self.impulses.contacts.other_body[: self.count]], -1
+        )
+        return self.model.body_tree[bodies[bodies[:, 1] >= 0]]
 
     @property
     def touched_trees(self) -> tuple[tuple[int, str], ...]:

@@ -1,6 +1,7 @@
 """Collision detection of plants: boxes of trees and geoms, trees that actors are near, and candidates of contacts.
 
-The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then
+The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then, with the
+prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake ones touch) and
 :meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for
 each listing of the rigid world: a bound launch costs a fifth of a plain one.
 """
@@ -13,7 +14,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.contact import broadphase, narrowphase_plants, narrowphase_rigid, structs
+from vinesim.kernels.contact import broadphase, narrowphase_plants, narrowphase_rigid, sleeping_trees, structs
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
@@ -45,7 +46,8 @@ class ContactDetection:
         trees = len(arrays.trees.is_fine)
         self._order, self._partition = np.zeros(trees, np.int32), (0, 0)
         self._sorted_rows = np.zeros(trees, np.int32)
-        self._is_near = np.zeros(trees, np.bool_)
+        self._is_near, self._is_reached = np.zeros(trees, np.bool_), np.zeros(trees, np.bool_)
+        self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
         self.counters = np.zeros(structs.COUNTERS, np.int32)
         """See :mod:`vinesim.kernels.contact.structs`."""
         self.tree_boxes = SharedArrays.zeros(structs.Aabbs, trees)
@@ -83,9 +85,14 @@ class ContactDetection:
         """Bring the boxes of some trees [k], and of their blocks, up to the poses of their bodies."""
         self.arrays.trees.awake[: len(trees)] = trees
         self._launch_over_trees(len(trees), self._tree_aabbs)
+        self.compare_anew()
         blocks = np.unique(trees // AABB_BLOCK)
         self._blocks[: len(blocks)] = blocks
         self._block_aabbs(len(blocks))
+
+    def compare_anew(self) -> None:
+        """Compare all capsules of awake trees with the sleeping ones in the next step, however little they move."""
+        self._clearances.distance[:] = -1.0
 
     def find_near_trees(self) -> np.ndarray:
         """Trees [k] whose box a geom of an actor overlaps within the step."""
@@ -111,14 +118,25 @@ class ContactDetection:
 
     # ------------------------------------------------------------------ narrowphase
 
-    def find_candidates(self, awake: np.ndarray, plant_plant_contacts: bool) -> None:
-        """Fill ``candidates`` for the awake trees [k]; ``counters`` says how many trees these are."""
-        trees = len(awake)
+    def list_awake(self, awake: np.ndarray) -> None:
+        """Take the awake trees [k] and bring their boxes up to their predicted motion."""
+        self.arrays.trees.awake[: len(awake)] = awake
+        self.counters[structs.AWAKE_TREES] = len(awake)
+        self._launch_over_trees(len(awake), self._tree_aabbs)
+
+    def find_reached_trees(self) -> np.ndarray:
+        """Sleeping trees [k] with which one of the listed awake ones is in contact, or will be before the step ends."""
+        self._is_reached[:] = False
+        self._launch_over_trees(int(self.counters[structs.AWAKE_TREES]), self._find_reached_trees)
+        return np.flatnonzero(self._is_reached)
+
+    def find_candidates(self, plant_plant_contacts: bool) -> None:
+        """Fill ``candidates`` for the listed awake trees."""
+        trees = int(self.counters[structs.AWAKE_TREES])
         if trees > self._room:
             self._allocate_candidates(2 * trees)
-        self.arrays.trees.awake[:trees] = awake
-        self.counters[structs.AWAKE_TREES] = trees
-        self._launch_over_trees(trees, self._tree_aabbs, self._find_rigid_contacts)
+        awake = self.arrays.trees.awake[:trees]
+        self._launch_over_trees(trees, self._find_rigid_contacts)
         if plant_plant_contacts:
             low = self.tree_boxes.low[awake]
             axis = self.counters[structs.SORT_AXIS] = int(np.argmax(low.max(0) - low.min(0)))
@@ -159,7 +177,9 @@ class ContactDetection:
         by_tree = {"index_list": "order", "partitions": self.plants.threads}
 
         self._geom_aabbs = bind_launch(broadphase.geom_aabbs, [parameters, geoms, rigid.bodies.struct], [geom_states])
-        self._actor_aabbs = bind_launch(broadphase.actor_aabbs, [parameters, actors, geom_states], [actor_boxes])
+        self._actor_aabbs = bind_launch(
+            broadphase.actor_aabbs, [actors, geoms, rigid.bodies.struct, geom_states], [actor_boxes]
+        )
         self._tree_aabbs = bind_launch(
             broadphase.tree_aabbs,
             [parameters, capsules, order, trees, bodies],
@@ -171,8 +191,14 @@ class ContactDetection:
         )
         self._mark_near_trees = bind_launch(
             broadphase.mark_near_trees,
-            [actors, trees, block_boxes, tree_boxes, actor_boxes, geom_states],
+            [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
             [share(self._is_near, wp.bool)],
+        )
+        self._find_reached_trees = bind_launch(
+            sleeping_trees.find_reached_trees,
+            [parameters, capsules, order, trees, block_boxes, tree_boxes, bodies, capsule_states],
+            [self._clearances.struct, share(self._is_reached, wp.bool)],
+            **by_tree,
         )
         self._find_rigid_contacts = bind_launch(
             narrowphase_rigid.find_rigid_contacts,

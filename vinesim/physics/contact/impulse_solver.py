@@ -18,6 +18,8 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
 
+MATRIX_CONTACTS = 16
+"""Room for the matrices of the blocks is made for blocks of so many contacts, and more when they are larger."""
 REMOVED_GEOM = np.iinfo(np.int32).max
 """Number that a warm start keeps for a geom that is gone."""
 
@@ -38,18 +40,24 @@ class ImpulseSolver:
         n = self.capacity = parameters.contact_capacity
         self.contacts = SharedArrays.zeros(structs.Contacts, n)
         self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
-        self.islands = SharedArrays.zeros(structs.Islands, n, start=np.zeros(n + 1, np.int32))
+        self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1)
+        tree_size = plants.buffers.max_tree_size
+        self._island_arrays = {
+            name: np.zeros(n + 1, np.int32)
+            for name in ("start", "first_block", "block_start", "matrix_start", "contact", "label", "block_label",
+                         "first_dof", "sweeps")
+        }  # fmt: skip
+        self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
         self._row_arrays = {
             "plant_jacobian": np.zeros((3 * n, 12)),
-            "plant_response": np.zeros((3 * n, 12 * n)),
-            "delassus": np.zeros((3 * n, 3 * n)),
-            "newton_system": np.zeros((3 * n, 3 * n + 2)),
+            "plant_response": np.zeros((3 * n, 6 * tree_size)),
+            "other_response": np.zeros((3 * n, 6 * tree_size)),
             "velocity_free": np.zeros(3 * n),
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
         }
-        self._touched_bodies, self._wrench = np.zeros(2 * n + 1, np.int32), np.zeros((2 * n, 6))
-        self._body_response = np.zeros((2 * n, 6, 2 * n, 6), np.float32)
+        self._wrench = np.zeros((2 * n, 6))
+        self._body_response = np.zeros((2 * n, 6, tree_size, 6), np.float32)
         self.bodies = np.zeros(0, np.int32)
         """Plant bodies in contact [n], sorted."""
         self.wrenches = np.zeros((0, 6))
@@ -70,10 +78,7 @@ class ImpulseSolver:
             for k, geom in enumerate(other[: self.warm_start.count[0]].tolist()):
                 if 0 <= geom < len(previous.names):
                     other[k] = at.get(previous.names[geom], REMOVED_GEOM)
-        size = (3 * self.capacity, self.rigid.mj_model.nv)
-        self.rows = SharedArrays(
-            structs.Rows, rigid_jacobian=np.zeros(size), rigid_response=np.zeros(size), **self._row_arrays
-        )
+        self._allocate()
         self.bind_launches(detection)
 
     def renumber_geoms(self, number: np.ndarray) -> None:
@@ -83,23 +88,51 @@ class ImpulseSolver:
         now = number[other[of_geoms]]
         other[of_geoms] = np.where(now >= 0, now, REMOVED_GEOM)
 
+    def _allocate(self) -> None:
+        """Arrays whose size depends on the rigid world or on the matrices of the blocks."""
+        world, rows = self.rigid.mj_model, 3 * self.capacity
+        self.rows = SharedArrays(
+            structs.Rows,
+            rigid_jacobian=np.zeros((rows, world.nv)),
+            rigid_response=np.zeros((rows, world.nv)),
+            rigid_velocity=np.zeros(world.nv),
+            delassus=self._matrix,
+            **self._row_arrays,
+        )
+        self.scratch = SharedArrays(
+            structs.SolverScratch,
+            matrix=np.zeros(len(self._matrix)),
+            columns=np.zeros((rows, 1 + world.nv)),
+            rigid_system=np.zeros((world.nv, 1 + world.nv)),
+            **{name: np.zeros(rows) for name in ("impulse_first", "impulse_before", "direction")},
+        )
+        labels = np.zeros(2 * world.ntree, np.int32)  # see EffectiveMass.island_labels
+        dofs = np.zeros(world.nv, np.int32)
+        self.islands = SharedArrays(structs.Islands, rigid_last_contact=labels, dof=dofs, **self._island_arrays)
+
     def clear(self) -> None:
         """Forget the last solve, but for its warm start."""
         self.bodies, self.wrenches, self.rigid_force = self.bodies[:0], self.wrenches[:0], None
 
     def solve(self, count: int, counters: np.ndarray) -> None:
         """Find the impulses of the first ``count`` contacts, and what they do to either side."""
-        n, row_count, rows = count, 3 * count, self.rows
+        n, row_count = count, 3 * count
         self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
         self._build_islands(1)
-        touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
-        self.bodies = bodies = self._touched_bodies[:touched].copy()
+        if counters[structs.MATRIX_ENTRIES] > len(self._matrix):
+            self._matrix = np.zeros(2 * int(counters[structs.MATRIX_ENTRIES]))
+            self._allocate()
+            self.bind_launches(self._detection)
+            self._build_islands(1)
+        rows, touched, island_count = self.rows, int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
+        self.bodies = bodies = self.touched.body[:touched].copy()
         rigid_jacobian, rigid_response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
         rigid_jacobian[:] = 0.0
         rigid_response[:] = 0.0
         self._write_contact_rows(n)
 
-        self._body_response[:touched, :, :touched] = self.plants.impulse_response(bodies)
+        widest = int((self.touched.tree_end[:touched] - self.touched.tree_start[:touched]).max())
+        self._body_response[:touched, :, :widest] = self.plants.impulse_response_by_tree(bodies)[:, :, :widest]
         geom_bodies = self.rigid_arrays.geoms.body[self.contacts.other[:n].clip(0)]
         is_constrained = counters[structs.IS_CONSTRAINED] = self.rigid.is_constrained(geom_bodies)
         self._inverse_mass_times_jacobian(row_count)
@@ -111,19 +144,20 @@ class ImpulseSolver:
 
         self.warm_start.count[0] = n
         self._store_warm_start(n)
-        self._accumulate_wrenches(touched)
+        self._accumulate_wrenches(1)
         self.wrenches = self._wrench[:touched].copy()
         self.rigid_force = rows.impulse[:row_count] @ rigid_jacobian / -self.parameters.dt
 
     def bind_launches(self, detection: ContactDetection) -> None:
         """Bind every kernel to its arrays; to call again when ``detection`` has new arrays of candidates."""
+        self._detection = detection
         p, parameters, rigid = self.parameters, self._kernel_parameters, self.rigid_arrays
         capsules, bodies = self.arrays.capsules.struct, self.arrays.bodies.struct
         geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
         candidates, contacts = detection.candidates.struct, self.contacts.struct
         groups, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
-        counters, touched = share(detection.counters, wp.int32), share(self._touched_bodies, wp.int32)
-        body_response = share(self._body_response, wp.float32).reshape((12 * self.capacity, -1))
+        counters, touched = share(detection.counters, wp.int32), self.touched.struct
+        body_response, factors = share(self._body_response, wp.float32), rigid.factors.struct
         self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
         self._build_islands = bind_launch(
             islands.build_islands,
@@ -137,26 +171,20 @@ class ImpulseSolver:
         )
         self._inverse_mass_times_jacobian = bind_launch(
             delassus.inverse_mass_times_jacobian,
-            [geoms, bodies, rigid_bodies, rigid.factors.struct, contacts, touched, counters, body_response],
+            [geoms, rigid_bodies, factors, contacts, touched, counters, body_response],
             [rows],
         )
-        self._assemble_delassus = bind_launch(
-            delassus.assemble_delassus, [geoms, rigid_bodies, contacts, groups], [rows]
-        )
+        self._assemble_delassus = bind_launch(delassus.assemble_delassus, [contacts, touched, groups], [rows])
         self._solve_islands = bind_launch(
             projected_gauss_seidel.solve_islands,
-            [
-                parameters,
-                p.solver_sweeps,
-                p.solver_newton_steps,
-                p.solver_newton_contacts,
-                p.solver_tolerance,
-                contacts,
-            ],
-            [groups, rows],
-        )
+            [parameters, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms,
+             rigid_bodies, contacts],
+            [groups, self.scratch.struct, rows],
+        )  # fmt: skip
         self._store_warm_start = bind_launch(
-            forces.store_warm_start, [parameters, groups, rows], [contacts, warm_start]
+            forces.store_warm_start,
+            [parameters, geoms, rigid_bodies, groups, rows],
+            [contacts, warm_start],
         )
         self._accumulate_wrenches = bind_launch(
             forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]

@@ -23,35 +23,27 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.errors import checked_index
+from vinesim.kernels.articulation.first_mode import MAX_SUBSTEPS, substeps_for
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
 from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.plants.kernel_launches import KernelLaunches
+from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
+from vinesim.physics.plants.remote_pose import blend_towards
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
 from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
-
-def kernel_parameters(
-    p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
-) -> dict[str, Any]:
-    """Fields of :class:`vinesim.kernels.articulation.structs.SolverParameters`."""
-    return {
-        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
-        "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
-        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
-    }  # fmt: skip
+_NO_TREES = np.zeros(0, np.int32)
 
 
 class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
     ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
-    a
-    tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after a contact
+    a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after contact
     began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
     ``predict()`` before them.
 
@@ -64,11 +56,11 @@ class ArticulationSolver:
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
         threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
-        fast_rate: [rad/s] see ``PhysicsParameters.fast_joint_rate``.
-        max_rate: [rad/s] see ``PhysicsParameters.max_joint_rate``.
+        fast_rate, max_rate: [rad/s] see ``fast_joint_rate`` and ``max_joint_rate`` of ``PhysicsParameters``.
         fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
+        substeps: divide the step of trees whose first mode is too fast for it; off only to compare with other solvers.
         buffers: where arrays live, instead of what ``device`` says.
     """
 
@@ -86,6 +78,7 @@ class ArticulationSolver:
         max_rate: float | None = None,
         fault_rate: float | None = None,
         geometric_stiffness: bool = True,
+        substeps: bool = True,
         buffers: DeviceBuffers | None = None,
     ) -> None:
         p = parameters
@@ -114,9 +107,12 @@ class ArticulationSolver:
             weakref.finalize(self, self.thread_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
         self._onset_steps = numbers["contact_steps"] - 1
-        self.launches = KernelLaunches(self, numbers, threads)
+        self.launches = KernelLaunches(self, numbers, threads, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
-        self._runner = StepRunner(buffers, self.launches, model.tree_size, self._stepping, self.thread_pool)
+        self._runner = StepRunner(
+            buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
+            tree_rate=self.tree_rate, stepping=self._stepping, floating=self._floating, thread_pool=self.thread_pool,
+        )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self._clusters = BerryClusters(self)
@@ -131,13 +127,13 @@ class ArticulationSolver:
         model, state = self.model, self.state
         trees, bodies = len(model.tree_first), len(model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
-        """phi asked for each tree [tree]; set it as you like. 1 from the start where a tie is stiff
-        (``stiff_tie_mass``)."""
+        """phi asked for each tree [tree]; set it as you like. 1 where a tie is stiff (``stiff_tie_mass``)."""
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``predict()`` [tree]."""
         self.tree_rate = np.zeros(trees, np.float32)
-        """Fastest joint that the last integration found [tree] rad/s, and m/s of what falls; NaN or above
-        ``fault_rate`` for a tree that it stopped."""
+        """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
+        self.tree_substeps = np.ones(trees, np.int32)
+        """Into how many substeps the step of each awake tree is divided while nothing touches it [tree]."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -165,7 +161,7 @@ class ArticulationSolver:
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
         self._floating, self._roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
-        self._euler_steps = np.zeros(trees, np.int32)
+        self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
         self._last_contact = np.full(trees, -2, np.int64)  # tick of the last contact
         self._loaded_bodies = np.zeros(0, np.int32)
         self._stepping, self._subset = np.zeros(trees, np.int32), np.zeros(trees, np.int32)
@@ -185,7 +181,8 @@ class ArticulationSolver:
         return {
             wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
                        "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
-                       "tree_euler_steps": self._euler_steps, "floating": self._floating},
+                       "tree_euler_steps": self._euler_steps, "tree_steps": self._steps,
+                       "tree_substeps": self.tree_substeps, "floating": self._floating},
             float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
                     "tie_damping": ties.damping, "tree_phi": self.phi, "phi_used": self.phi_used,
                     "tree_rate": self.tree_rate},
@@ -227,11 +224,8 @@ class ArticulationSolver:
         if len(trees) == 0:
             return
         bodies = self.bodies_of(trees)
-        self.state.joint_qd[bodies] = 0.0
-        self.state.joint_xd[bodies] = 0.0
-        self.velocity_free[bodies] = 0.0
-        self.acceleration[bodies] = 0.0
-        self._wrench[bodies] = 0.0
+        for rows in (self.state.joint_qd, self.state.joint_xd, self.velocity_free, self.acceleration, self._wrench):
+            rows[bodies] = 0.0
         self.tree_rate[trees] = 0.0
         self._euler_steps[trees] = 0
         self.forward_kinematics(trees)
@@ -308,24 +302,36 @@ class ArticulationSolver:
 
     # ------------------------------------------------------------------ one step
 
-    def predict(self) -> None:
-        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts."""
-        self._checked = None
+    def predict(self, trees: np.ndarray | None = None) -> None:
+        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts.
+
+        ``trees`` [k]: only these, woken or given another phi after the prediction of all.
+        """
+        self._checked, launches = None, self.launches
         self._runner.list_trees(self._awake)
-        self.launches.upload_changed()
-        count = len(self._runner.stepped)
-        self.launches.upload_step(count)
-        self._runner.predict()
-        self.launches.download_prediction(count)
+        if trees is None:
+            launches.upload_step(count := len(self._runner.stepped))
+            self._runner.predict()
+            launches.download_prediction(count)
+        else:
+            self.list_subset(trees)
+            launches.upload_subset_step(count := len(trees))
+            launches.predict_subset(count)
+            launches.download_subset_prediction(count)
         self.buffers.synchronize()
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
         """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
 
         ``impulse_response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of
-        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees. A view, good until
-        the next call.
+        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees.
         """
+        self._require_stepped(bodies)
+        return self.launches.dense_impulse_response(bodies)
+
+    def impulse_response_by_tree(self, bodies: np.ndarray) -> np.ndarray:
+        """:meth:`impulse_response` without its zeros, [n, 6, m, 6]: entry [u, :, t] for the t-th listed body of the
+        tree of body u. Bodies of one tree must be neighbours in ``bodies``. A view, good until the next call."""
         self._require_stepped(bodies)
         return self.launches.impulse_response(bodies)
 
@@ -334,10 +340,10 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, count = self.launches, len(self._runner.stepped)
-        changed = len(self._loaded_bodies) > 0
+        launches, touched, changed = self.launches, _NO_TREES, len(self._loaded_bodies) > 0
+        count = len(self._runner.stepped)
         self._wrench[self._loaded_bodies] = 0.0
-        self._loaded_bodies = np.zeros(0, np.int32)
+        self._loaded_bodies = _NO_TREES
         if bodies is not None and len(bodies):
             self._require_stepped(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
@@ -351,19 +357,18 @@ class ArticulationSolver:
             self._last_contact[touched] = self.tick
         elif changed:
             launches.upload_wrenches(count)
-        self._runner.integrate(self._list_floating_roots())
+        self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)
         self.buffers.synchronize()
         self.tick += 1
 
-    def _list_floating_roots(self) -> int:
-        """List the floating roots that this step moves; how many there are."""
+    def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
+        """The floating roots that this step moves: where kernels find them, and their trees."""
         if len(self._roots) == 0:
-            return 0
+            return _NO_TREES, _NO_TREES
         tree = self.model.body_tree[self._roots]
         roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
-        self._floating[: len(roots)] = self.buffers.slots[roots]
-        return len(roots)
+        return self.buffers.slots[roots], self.model.body_tree[roots]
 
     def advance(self, steps: int) -> None:
         """Many steps of the awake trees with nothing in between: no contacts, no sleep, no fault guard.
@@ -374,21 +379,21 @@ class ArticulationSolver:
         ``fault_rate``).
         """
         self._runner.list_trees(self._awake)
-        floating = self._list_floating_roots()
+        floating = self._floating_roots()
         if len(self._loaded_bodies) and steps > 0:  # the next prediction still knows the last contacts
-            self._runner.advance(1, floating)
+            self._runner.predict()
             self._wrench[self._loaded_bodies] = 0.0
-            self._loaded_bodies = np.zeros(0, np.int32)
+            self._loaded_bodies = _NO_TREES
             self.launches.upload_wrenches(len(self._runner.stepped))
-            self._runner.advance(steps - 1, floating)
+            self._runner.integrate(_NO_TREES, *floating)
+            self._runner.advance(steps - 1, *floating)
         else:
-            self._runner.advance(steps, floating)
+            self._runner.advance(steps, *floating)
         self.tick += steps
 
     def upload(self) -> None:
         """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
         self._runner.list_trees(self._awake)
-        self.launches.upload_changed()
         self.launches.upload_step(len(self._runner.stepped))
         self.buffers.synchronize()
 
@@ -399,8 +404,7 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
-        """Use phi = 1 in the next steps of trees about to be touched, for ``contact_onset_duration`` (``integrate()``
-        sees to new contacts)."""
+        """Use phi = 1 for ``contact_onset_duration``: trees about to be touched (``integrate()`` sees to touched)."""
         self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self._onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
@@ -422,12 +426,10 @@ class ArticulationSolver:
             return
         bodies = self._checked = np.asarray(bodies)
         trees = self.model.body_tree[bodies]
-        at = np.searchsorted(self._runner.stepped, trees)
-        if (
-            len(self._runner.stepped) == 0
-            or (self._runner.stepped[np.minimum(at, len(self._runner.stepped) - 1)] != trees).any()
-        ):
-            late = next(i for i, tree in enumerate(trees) if tree not in self._runner.stepped)
+        stepped = self._runner.stepped
+        at = np.searchsorted(stepped, trees)
+        if len(stepped) == 0 or (stepped[np.minimum(at, len(stepped) - 1)] != trees).any():
+            late = int(np.argmin(np.isin(trees, stepped)))
             raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
         riding = bodies - self.model.tree_first[trees] >= self.tree_moving[trees]
         if riding.any():
@@ -439,20 +441,7 @@ class ArticulationSolver:
 
     def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
-        bodies = self.model.bodies_of(tree)
-        there, rates = np.asarray(joint_q, np.float32), np.asarray(joint_qd, np.float32)
-        here = self.state.joint_q[bodies]
-        if there.shape != here.shape or rates.shape != (len(here), 3):
-            raise ValueError(f"tree {tree}: pulled by joints {there.shape}, {rates.shape}; it has {len(here)} bodies")
-        there = frames.normalize(there)
-        if not np.isfinite(there).all() or not np.isfinite(rates).all() or not (there != 0.0).any(-1).all():
-            raise ValueError(
-                f"tree {tree}: pulled to a pose that is not finite or has zero quaternions; drop the update"
-            )
-        turn = frames.log(frames.multiply(frames.conjugate(here), there))
-        self.state.joint_q[bodies] = frames.normalize(frames.multiply(here, frames.exp(blend * turn)))
-        self.state.joint_qd[bodies] = rates
-        self.state.joint_qd[bodies.start + self.tree_moving[tree] : bodies.stop] = 0.0  # what rides does not turn
+        blend_towards(self, tree, joint_q, joint_qd, blend)
 
     # ------------------------------------------------------------------ ties, wrenches, damping
 
@@ -470,6 +459,11 @@ class ArticulationSolver:
     def tie_damping(self) -> np.ndarray:
         """N s/m [tie]."""
         return self._ties.damping
+
+    @property
+    def held_bodies(self) -> list[int]:
+        """Bodies that ties of :meth:`add_tie` hold."""
+        return self._ties.held_bodies
 
     def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
@@ -499,6 +493,6 @@ class ArticulationSolver:
         return self.launches.joint_wrench(bodies)
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
-        """Least damping ratio that a spring mode of this frequency [Hz] can show: pi f (2 phi - 1) dt."""
+        """Least damping ratio that a first mode of this frequency [Hz] can show: pi f (2 phi - 1) dt / substeps."""
         phi = float(self.phi.max(initial=0.5)) if phi is None else phi
-        return math.pi * frequency * (2.0 * phi - 1.0) * self.dt
+        return math.pi * frequency * (2.0 * phi - 1.0) * self.dt / substeps_for(frequency, self.dt)

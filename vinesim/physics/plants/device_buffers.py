@@ -103,6 +103,11 @@ class DeviceBuffers:
             self.add_constant(name, data.astype(np.int32), wp.int32)
 
     @property
+    def max_tree_size(self) -> int:
+        """Bodies of the largest tree."""
+        return self._largest
+
+    @property
     def max_tree_extent(self) -> int:
         """Places from the first body of the largest tree to its last, both included."""
         return (self._largest - 1) * self.pitch + 1

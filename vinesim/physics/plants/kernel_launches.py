@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.articulation import structs
+from vinesim.kernels.articulation import first_mode, structs
 from vinesim.kernels.articulation.floating_components import correct_floating_momentum
 from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.articulation.integration import integrate
@@ -17,6 +17,7 @@ from vinesim.kernels.articulation.joint_wrench import joint_wrench
 from vinesim.kernels.articulation.kinematics import forward_kinematics
 from vinesim.kernels.articulation.prediction import predict
 from vinesim.kernels.launch import bind_launch
+from vinesim.physics.parameters import PhysicsParameters
 
 if TYPE_CHECKING:
     from vinesim.physics.plants.articulation_solver import ArticulationSolver
@@ -41,6 +42,17 @@ SCRATCH = {
 """Rows that only kernels see."""
 
 
+def kernel_parameters(
+    p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
+) -> dict[str, Any]:
+    """Fields of :class:`vinesim.kernels.articulation.structs.SolverParameters`."""
+    return {
+        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
+        "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
+        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
+    }  # fmt: skip
+
+
 class KernelLaunches:
     """Launches of the articulation kernels on the arrays of one solver.
 
@@ -49,11 +61,16 @@ class KernelLaunches:
     :meth:`upload_changed` carries over when :attr:`changed` says so. Everything else a GPU reads where it is.
     """
 
-    def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], threads: int) -> None:
+    def __init__(
+        self, solver: ArticulationSolver, parameters: dict[str, float], threads: int, max_substeps: int
+    ) -> None:
         """``parameters``: numbers of :class:`vinesim.kernels.articulation.structs.SolverParameters` but gravity."""
-        self.buffers, self._threads = solver.buffers, threads
+        self.buffers, self._threads, self._max_substeps = solver.buffers, threads, max_substeps
+        self._body_tree = solver.model.body_tree
         self.changed = False
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
+        self.substeps_due = False
+        """Whether they have changed since the substeps of trees were counted."""
         self._seldom: list[str] = []
         self._register_arrays(solver)
         self._record_transfers()
@@ -87,7 +104,7 @@ class KernelLaunches:
         """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
         if self.changed:
             self.buffers.upload(self._seldom)
-            self.changed = False
+            self.changed, self.substeps_due = False, True
 
     def fill(self, struct: Any, **values: Any) -> Any:
         """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named
@@ -112,6 +129,8 @@ class KernelLaunches:
 
         self.upload_step = copier("stepping", *STEP_INPUTS)
         self.download_prediction = copier("stepping", "body_q", "body_qd", "body_qd_free", to_host=True)
+        self.upload_subset_step = copier("subset", *STEP_INPUTS)
+        self.download_subset_prediction = copier("subset", "body_q", "body_qd", "body_qd_free", to_host=True)
         self.upload_wrenches = copier("stepping", "body_wrench")
         self.download_joints = copier(
             "stepping", "joint_x", "joint_xd", "joint_q", "joint_qd", "body_acceleration", to_host=True
@@ -130,14 +149,17 @@ class KernelLaunches:
         joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
         partitioned = {"index_list": "trees", "partitions": self._threads}
-        self.predict = record(
-            predict, parameters, self._model, "stepping", "tree_phi", "tree_euler_steps", self._forces, joints,
-            "phi_used",
-            self._bodies, self._factors, scratch, prediction, **partitioned,
+        self.predict, self.predict_subset = (
+            record(
+                predict, parameters, self._model, trees, "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
+                joints, "phi_used",
+                self._bodies, self._factors, scratch, prediction, **options,
+            )
+            for trees, options in (("stepping", partitioned), ("subset", {"index_list": "trees"}))
         )  # fmt: skip
         self.integrate = record(
-            integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", joints, prediction, "tree_rate",
-            "tree_euler_steps", joints, **partitioned,
+            integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
+            "tree_rate", "tree_euler_steps", joints, **partitioned,
         )  # fmt: skip
         self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
         self.apply_wrenches = record(
@@ -145,8 +167,14 @@ class KernelLaunches:
             scratch, prediction,
         )  # fmt: skip
         self.correct_floating_momentum = record(
-            correct_floating_momentum, parameters, self._model, "floating", "phi_used", "tree_rate", self._forces,
-            self._bodies, "body_acceleration", "lever", fill(s.FloatingScratch), joints,
+            correct_floating_momentum, parameters, self._model, "floating", "phi_used", "tree_rate", "tree_steps",
+            self._forces, self._bodies, "body_acceleration", "lever", fill(s.FloatingScratch), joints,
+            index_list="roots",
+        )  # fmt: skip
+
+        self.count_substeps = record(
+            first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
+            scratch, fill(s.WrenchScratch), "tree_substeps",
         )  # fmt: skip
 
     def _record_impact(self, parameters: Any) -> None:
@@ -155,8 +183,8 @@ class KernelLaunches:
         joints, scratch = fill(s.JointState), fill(s.Scratch)
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         self.factor_impact = self.record(
-            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", self._forces, joints,
-            "impact_phi",
+            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
+            joints, "impact_phi",
             self._bodies, self._factors, scratch, prediction, index_list="trees",
         )  # fmt: skip
         self.apply_impulses = self.record(
@@ -165,19 +193,34 @@ class KernelLaunches:
         )  # fmt: skip
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
-        """Response [n, 6, n, 6] of some bodies [n] to unit impulses on them; a view, good until the next call."""
+        """Response [n, 6, m, 6] of some bodies [n] to unit impulses on the listed bodies of the same tree (neighbours
+        in the list, at most m); a view, good until the next call."""
         n, buffers = len(bodies), self.buffers
         if n > self.response_capacity or self.response_capacity == 0:
             self._record_response(max(2 * self.response_capacity, n, 16))
         self._response_bodies[:n] = buffers.slots[bodies]
         self._respond(n)
         buffers.synchronize()
-        return self._response[:n, :, :n]
+        return self._response[:n]
+
+    def dense_impulse_response(self, bodies: np.ndarray) -> np.ndarray:
+        """The same [n, 6, n, 6] for bodies in any order, with the zeros between different trees."""
+        bodies = np.asarray(bodies)
+        order = np.argsort(bodies, kind="stable")
+        _, tree_start, tree = np.unique(self._body_tree[bodies[order]], return_index=True, return_inverse=True)
+        packed = self.impulse_response(bodies[order])
+        dense = np.zeros((len(bodies), 6, len(bodies), 6), np.float32)
+        for i, start in enumerate(tree_start):
+            of_tree = np.flatnonzero(tree == i)
+            block = packed[start : start + len(of_tree), :, : len(of_tree)]
+            at = order[of_tree]
+            dense[at[:, None], :, at] = block.transpose(0, 2, 1, 3)
+        return dense
 
     def _record_response(self, capacity: int) -> None:
         self.response_capacity, buffers = capacity, self.buffers
         self._response_bodies = buffers.pinned(np.zeros(capacity, np.int32))
-        self._response = buffers.pinned(np.zeros((capacity, 6, capacity, 6), np.float32))
+        self._response = buffers.pinned(np.zeros((capacity, 6, buffers.max_tree_size, 6), np.float32))
         buffers.add_shared("response_bodies", self._response_bodies, wp.int32)
         buffers.add_shared("response", self._response, float)
         stride = buffers.max_tree_extent
@@ -209,6 +252,6 @@ class KernelLaunches:
         buffers.add_shared("joint_bodies", self._joint_bodies, wp.int32)
         buffers.add_shared("joint_wrench", self._joint_wrench, wrench)
         self._sum_joint_wrenches = self.record(
-            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", self._forces, self._bodies,
-            "body_acceleration", "joint_wrench",
+            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", "tree_steps", self._forces,
+            self._bodies, "body_acceleration", "joint_wrench",
         )  # fmt: skip

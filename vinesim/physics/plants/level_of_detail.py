@@ -45,8 +45,10 @@ class LevelOfDetail:
         """The trees whose clusters move, sorted [k]."""
         return np.flatnonzero(self.plants.state.tree_fine)
 
-    def update(self, near: np.ndarray) -> None:
-        """Before ``predict()``: ``near`` [k] are the awake trees that an actor reaches into."""
+    def update(self, near: np.ndarray) -> np.ndarray:
+        """Before ``predict()``: ``near`` [k] are the awake trees that an actor reaches into; those that were coarsened
+        [k] are returned."""
+        coarsened = near[:0]
         plants, state = self.plants, self.plants.state
         attached = int(np.count_nonzero(state.bunch_attached))
         if attached != self._attached:  # a tree whose bunches are gone has nothing to refine
@@ -65,11 +67,13 @@ class LevelOfDetail:
             still = self._still[fine] = np.where(self._rate(fine) < self.rest_rate, self._still[fine] + 1, 0)
             is_done = (alone > self.fine_steps) & (still >= self.rest_steps)
             if is_done.any():
-                plants.coarsen(fine[is_done])
+                coarsened = fine[is_done]
+                plants.coarsen(coarsened)
         fresh = wanted[~state.tree_fine[wanted]]
         if len(fresh):
             self._alone[fresh] = self._still[fresh] = 0
             plants.refine(fresh)
+        return coarsened
 
     def _seen(self) -> np.ndarray:
         """Awake trees [k] with a bunch near a watched point; poses are those of the last tick's start."""

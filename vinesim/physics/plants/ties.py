@@ -48,6 +48,11 @@ class TieTable:
         self._model_span = self.span.copy()
         self._slot_of: dict[int, int] = {}
 
+    @property
+    def held_bodies(self) -> list[int]:
+        """Bodies with ties of :meth:`add`."""
+        return list(self._slot_of)
+
     def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
         """Tie a body with world pose [7] at a point [3] m of its frame, where that is now; returns the tie.
 

@@ -7,6 +7,7 @@ kind. A repaired URDF needs no repair.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
@@ -58,6 +59,8 @@ def repair_joints(root: etree._Element, assumed: list[str]) -> None:
         if mimic is not None and mimic.get("joint") not in moving:
             joint.remove(mimic)
             freed.append(name)
+    _compose_mimics(moving)
+    for name, joint in moving.items():
         if joint.find("mimic") is not None:
             continue
         limit = joint.find("limit")
@@ -82,6 +85,24 @@ def repair_joints(root: etree._Element, assumed: list[str]) -> None:
         )
     if unbounded:
         assumed.append(f"{some_names(unbounded)} turns without lower and upper limits: half a turn to either side")
+
+
+def _compose_mimics(joints: Mapping[str, etree._Element]) -> None:
+    """Let a joint that mimics a mimicking one mimic the driven joint at the end; cycles stay, and are refused later.
+
+    With q1 = m1 q2 + o1 and q2 = m2 q3 + o2: q1 = m1 m2 q3 + (m1 o2 + o1).
+    """
+    for joint in joints.values():
+        mimic, passed = joint.find("mimic"), set()
+        while mimic is not None and mimic.get("joint") not in passed:
+            passed.add(mimic.get("joint"))
+            source = joints[mimic.get("joint")].find("mimic")
+            if source is None:
+                break
+            multiplier = float(mimic.get("multiplier", 1.0))
+            mimic.set("joint", source.get("joint", ""))
+            mimic.set("offset", repr(multiplier * float(source.get("offset", 0.0)) + float(mimic.get("offset", 0.0))))
+            mimic.set("multiplier", repr(multiplier * float(source.get("multiplier", 1.0))))
 
 
 def repair_inertias(root: etree._Element, assumed: list[str]) -> None:

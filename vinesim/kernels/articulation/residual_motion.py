@@ -1,0 +1,110 @@
+"""Residual motion: how fast a tree still moves, and how far it still is from the pose in which it will rest.
+
+The displacement to that pose follows from one step of the articulated-body algorithm that starts at zero velocity, has no
+damping and is so long that springs outweigh inertia: it solves (M + (T/2)^2 K) a = u for the generalized force u that
+is not in balance, and (T/2)^2 a is K^-1 u, the quasi-static displacement. K is the tangent stiffness at the present
+pose, loads and ties included.
+"""
+
+import warp as wp
+
+from vinesim.kernels.articulation.kinematics import body_kinematics, parent_kinematics
+from vinesim.kernels.articulation.prediction import accelerate_bodies, assemble_bodies, eliminate_joints
+from vinesim.kernels.articulation.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    Factors,
+    JointState,
+    Prediction,
+    Scratch,
+    SolverParameters,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+REST_STEP = 10.0
+"""[s] Duration T of that step. Of a mode of frequency f it finds all but 1 / (1 + (pi f T)^2): 0.4 % less at half a
+hertz. TUNED"""
+
+
+@wp.func
+def largest_displacement(linear: wp.vec3, angular: wp.vec3, arm: wp.vec3, so_far: float):
+    """The larger of ``so_far`` and the displacements of both ends of a body; NaN enters, and stays."""
+    most = wp.max(wp.length(linear), wp.length(linear + wp.cross(angular, arm)))
+    if most <= so_far or so_far != so_far:
+        most = so_far
+    return most
+
+
+@wp.kernel
+def residual_motion(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    body_length: wp.array(dtype=float),
+    # in
+    trees: wp.array(dtype=wp.int32),
+    forces: AppliedForces,
+    joints: JointState,
+    joints_still: JointState,
+    forces_static: AppliedForces,
+    # out
+    static_load_out: wp.array(dtype=wp.spatial_vector),
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+    speed_out: wp.array(dtype=float),
+    distance_out: wp.array(dtype=float),
+    is_free_out: wp.array(dtype=wp.bool),
+):
+    """One thread measures one tree: the fastest end of its bodies, and the one that is furthest from where it will rest.
+
+    Contacts count as forces that stay as they were in the last step. What a floating component does as a whole is in
+    its speed, not in its distance: it may rest anywhere.
+
+    p: with :data:`REST_STEP` as its step. model: without joint damping. body_length: [body] m. trees: [thread] which
+    tree. forces: with the contact wrenches of the last step. joints: at its end; joints_still: the same without
+    rates. forces_static: with ``static_load_out`` as the load and no contact wrenches. prediction_out: its
+    ``joint_qd_free`` times T / 4 is the displacement of each joint. speed_out, distance_out: [tree] m/s, m.
+    is_free_out: [tree] whether nothing touches it and none of it floats, so that all of its displacement is known. All
+    else that is written is scratch.
+    """
+    tree = trees[wp.tid()]
+    first = model.tree_first[tree]
+    end = first + model.tree_moving[tree] * model.pitch
+    speed = float(0.0)
+    is_free = bool(True)
+    for k in range(first, end, model.pitch):
+        above, above_motion = parent_kinematics(k, tree, model, joints, bodies_out)
+        _axes, _lever, pose, motion = body_kinematics(
+            above, above_motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
+        )
+        bodies_out.body_q[k] = pose
+        bodies_out.body_qd[k] = motion
+        arm = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(body_length[k], 0.0, 0.0))
+        speed = largest_displacement(wp.spatial_top(motion), wp.spatial_bottom(motion), arm, speed)
+        contact = forces.body_wrench[k]
+        static_load_out[k] = forces.body_load[k] + contact
+        is_free = is_free and model.body_root[k] < 0 and wp.length_sq(contact) == 0.0
+    is_free_out[tree] = is_free
+    speed_out[tree] = speed
+
+    assemble_bodies(p, model, forces_static, joints_still, tree, 0.5, bodies_out, factors_out, scratch_out)
+    eliminate_joints(p, model, joints_still, bodies_out, tree, 0.5, factors_out, scratch_out)
+    accelerate_bodies(p.dt, model, joints_still, bodies_out, factors_out, scratch_out, tree, prediction_out)
+    distance = float(0.0)
+    for k in range(first, end, model.pitch):
+        linear = wp.spatial_top(prediction_out.body_acceleration[k])
+        angular = wp.spatial_bottom(prediction_out.body_acceleration[k])
+        pose = bodies_out.body_q[k]
+        root = model.body_root[k]
+        if root >= 0:
+            whole = wp.spatial_bottom(prediction_out.body_acceleration[root])
+            away = wp.transform_get_translation(pose) - wp.transform_get_translation(bodies_out.body_q[root])
+            linear = linear - wp.spatial_top(prediction_out.body_acceleration[root]) - wp.cross(whole, away)
+            angular = angular - whole
+        arm = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(body_length[k], 0.0, 0.0))
+        distance = largest_displacement(linear, angular, arm, distance)
+    distance_out[tree] = 0.25 * p.dt * p.dt * distance
