@@ -125,4 +125,5 @@ def residual_motion(
             angular = angular - whole
         arm = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(body_length[k], 0.0, 0.0))
         distance = largest_displacement(linear, angular, arm, distance)
-    distance_out[tree] = wp.where(is_stable, 0.25 * p.dt * p.dt * distance, FAR)
+    # what bears a tree in contact is not in K
+    distance_out[tree] = wp.where(is_stable or not is_free, 0.25 * p.dt * p.dt * distance, FAR)
