@@ -8,16 +8,17 @@ import pathlib
 import stat
 import time
 
+import numpy as np
 import pytest
 import zenoh
 
 from tests.support.waiting import wait
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello, RetainedRecord
+from vinesim.net.codec.messages import Hello, MeshPart, RetainedRecord
 from vinesim.net.replication.interest import POSE_LAYERS
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
-from vinesim.net.transport import zenoh_session
+from vinesim.net.transport import zenoh_bus, zenoh_session
 from vinesim.net.transport.access_control import CertificateError, Role, tls_config
 from vinesim.net.transport.bus import KEEP_ALL, BusError, JoinRejected
 from vinesim.net.transport.certificates import create, roles
@@ -25,6 +26,7 @@ from vinesim.net.transport.endpoints import parse
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.net.transport.zenoh_session import ServerUnreachable, close_session, config, open_session
 from vinesim.scene.ids import ObjectKind, object_id
+from vinesim.scene.triangles import digest_of, encode_triangles
 
 
 @pytest.fixture(scope="module")
@@ -207,6 +209,40 @@ def test_all_bus_functions_work_under_access_control(server, certs):
         wait(all_replied, "four answers")
         assert messages.decode_records(answers["snap/0/0"]) == [record]
         assert messages.decode_hello(answers["hello/guest"]).name == "guest"
+
+
+def test_a_robot_offers_its_own_meshes_and_all_may_ask_for_them(server, certs, monkeypatch):
+    """Under another name nothing is offered; a spectator offers nothing; neither answers for the server."""
+    payload = encode_triangles(np.eye(3)[None])
+    digest = digest_of(payload)
+    part = messages.encode_part(MeshPart(digest, len(payload), 0, payload))
+    forged = messages.encode_part(MeshPart(digest, len(payload), 0, bytes(36)))
+    with (
+        bus("ada", server, certs) as ada,
+        bus("bob", server, certs) as bob,
+        bus("guest", server, certs) as guest,
+        session("bob", server, certs) as program,
+    ):
+        for each in (ada, bob, guest):
+            each.join(hello(each.name))
+        answers: list = []
+        served = program.declare_queryable(
+            f"vs/1/vineyard/mesh/{digest}", lambda query: query.reply(str(query.key_expr), forged)
+        )
+        heard = program.declare_queryable("vs/1/vineyard/offer/*", lambda query: answers.append(str(query.key_expr)))
+        with monkeypatch.context() as patched:
+            patched.setattr(zenoh_bus, "FETCH_TIMEOUT", 1.0)  # a denied question waits until then
+            for each, key in ((bob, "offer/ada"), (guest, "offer/guest"), (guest, "offer/ada")):
+                assert each.fetch(key, part) == []
+        assert len(server.meshes) == 0
+        (reply,) = ada.fetch("offer/ada", part)
+        assert messages.decode_wanted(reply).offset == len(payload)
+        for each in (bob, guest):
+            (reply,) = each.fetch(f"mesh/{digest}", messages.encode_request(0))
+            assert messages.decode_part(reply).data == payload
+        assert not answers
+        for each in (served, heard):
+            each.undeclare()
 
 
 def test_liveliness_and_replies_of_another_name_are_blocked(server, certs):

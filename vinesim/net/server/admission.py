@@ -47,6 +47,14 @@ class AdmissionControl:
         """Actors that are live now, as ``world/name``, sorted."""
         return sorted(f"{world}/{name}" for (world, name), sessions in self._alive.items() if sessions)
 
+    def is_admitted(self, world: str, name: str) -> bool:
+        """Whether an actor has been admitted and has not left."""
+        return (world, name) in self._admitted
+
+    def is_live(self, world: str, name: str) -> bool:
+        """Whether a session with this name is live."""
+        return bool(self._alive.get((world, name)))
+
     def scene_of(self, world: str) -> SceneId:
         """The scene of a world now."""
         return self._required_scene or self._scenes.get(world, SceneId())

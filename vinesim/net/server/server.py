@@ -21,12 +21,14 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.replication.interest import Cell
 from vinesim.net.server.admission import AdmissionControl, SceneId
+from vinesim.net.server.mesh_store import MeshStore
 from vinesim.net.server.retained_store import Quota, RetainedStore
 from vinesim.net.transport import endpoints
 from vinesim.net.transport.access_control import SERVER, acl_config, server_answers_config, tls_config
 from vinesim.net.transport.bus import BusError
 from vinesim.net.transport.zenoh_bus import ROOT, WORLD
 from vinesim.net.transport.zenoh_session import close_session, config, open_session
+from vinesim.scene.triangles import is_digest
 
 log = logging.getLogger(__name__)
 
@@ -111,6 +113,8 @@ class Server:
         self._warned: set[str] = set()
         self.store = None if linked else RetainedStore(state_folder, quota)
         """The retained state; None if another server keeps it."""
+        self.meshes = MeshStore()
+        """Meshes of robots, for clients that have no files of them."""
         try:
             self._session = _open_router(self.endpoints, linked, settings)
         except PortTaken:
@@ -144,6 +148,8 @@ class Server:
                 session.declare_queryable(f"{root}/clock", self._on_clock_query),
                 session.declare_queryable(f"{root}/snap/*/*", self._on_snapshot_query),
                 session.declare_subscriber(f"{root}/fact/**", self._on_record),
+                session.declare_queryable(f"{root}/offer/*", self._on_mesh_offer),
+                session.declare_queryable(f"{root}/mesh/*", self._on_mesh_query),
             ]
         return declared
 
@@ -189,6 +195,10 @@ class Server:
                 "facts_strange": counters.rejected,
                 "facts_failed": counters.errors,
                 "snapshots": counters.snapshots,
+                "meshes": len(self.meshes),
+                "mesh_bytes": self.meshes.bytes,
+                "meshes_corrupt": self.meshes.counters.corrupt,
+                "meshes_refused": self.meshes.counters.refused,
                 "trouble": self.store.status_message,
             }
         return figures
@@ -274,6 +284,9 @@ class Server:
         is_live = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
             (self._admission.on_join if is_live else self._admission.on_leave)(world, name, session)
+            has_left = not self._admission.is_live(world, name)
+        if has_left:
+            self.meshes.release((world, name))
         log.info("%s/%s %s", world, name, "came" if is_live else "left")
 
     def _on_record(self, sample: zenoh.Sample) -> None:
@@ -345,6 +358,35 @@ class Server:
                 return
             for cell, payload in self.store.snapshot(world, cells):
                 query.reply(f"{ROOT}/{world}/snap/{cell[0]}/{cell[1]}", payload)
+
+    def _on_mesh_offer(self, query: zenoh.Query) -> None:
+        with query:
+            key = _strip_root(query.key_expr)
+            world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
+            try:
+                if "*" in key:
+                    raise MessageError("an actor offers its own meshes")
+                with self._lock:
+                    if not self._admission.is_admitted(world, name):
+                        raise MessageError("only an actor that has joined offers meshes")
+                wanted = self.meshes.offer((world, name), messages.decode_part(_query_payload(query)))
+            except MessageError as error:
+                self._count_malformed(key, error)
+                return
+            query.reply(str(query.key_expr), messages.encode_wanted(wanted))
+
+    def _on_mesh_query(self, query: zenoh.Query) -> None:
+        with query:
+            key = _strip_root(query.key_expr)
+            digest = key.rpartition("/")[2]
+            try:
+                if not is_digest(digest) or "*" in key:
+                    raise MessageError("the question names no mesh")
+                part = self.meshes.part(digest, messages.decode_request(_query_payload(query)))
+            except MessageError as error:
+                self._count_malformed(key, error)
+                return
+            query.reply(str(query.key_expr), messages.encode_part(part))
 
     def _count_malformed(self, key: str, error: MessageError) -> None:
         """Count an invalid query; log the first of each key."""

@@ -59,6 +59,9 @@ SILENCE_TIMEOUT = 3.0
 DATAGRAM_RETRY_PERIOD = 10.0
 """Time between two attempts to send poses over datagrams again [s]."""
 
+FETCH_TIMEOUT = 10.0
+"""Time limit of :meth:`ZenohBus.fetch` [s]: large replies over slow links."""
+
 MAX_PENDING_PUTS = 10_000
 """Reliable messages that wait to be sent; further ones are refused."""
 
@@ -364,6 +367,22 @@ class ZenohBus:
             key, payload, arrived = self._replies.popleft()
             found.append(Reply(key, payload, now - arrived))
         return found
+
+    def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
+        try:
+            replies = self._session.get(
+                self._prefix + key, payload=payload, timeout=FETCH_TIMEOUT, priority=zenoh.Priority.BACKGROUND,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )  # fmt: skip
+            found = [reply.ok.payload for reply in replies if reply.ok is not None]
+        except zenoh.ZError as error:
+            self.count_failure(error)
+            return []
+        return [payload.to_bytes() for payload in found if len(payload) <= messages.MAX_MESSAGE]
+
+    @property
+    def admissions(self) -> int:
+        return self._admission.count
 
     def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         def on_query(query: zenoh.Query) -> None:
