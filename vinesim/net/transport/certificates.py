@@ -18,7 +18,12 @@ from collections.abc import Sequence
 from vinesim.errors import UsageError
 from vinesim.net.codec.messages import is_valid_name
 from vinesim.net.transport.access_control import (
-    CA_NAME, SERVER, CertificateError, Role, authority_folder, refuse_authority_key,
+    CA_NAME,
+    SERVER,
+    CertificateError,
+    Role,
+    authority_folder,
+    refuse_authority_key,
 )  # fmt: skip
 
 try:
@@ -73,7 +78,9 @@ def create(
     refuse_authority_key(folder)
     authority = authority_folder(folder) if authority is None else authority
     if authority.resolve() == folder.resolve():
-        raise UsageError(f"--authority {authority}: give a folder of its own for {CA_NAME}.key, e.g. {folder}-authority")
+        raise UsageError(
+            f"--authority {authority}: give a folder of its own for {CA_NAME}.key, e.g. {folder}-authority"
+        )
     try:
         for each in (authority, folder):
             each.mkdir(parents=True, exist_ok=True, mode=0o700)

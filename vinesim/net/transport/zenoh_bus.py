@@ -478,7 +478,9 @@ def _watch(folder: pathlib.Path, name: str) -> CertificateWatch | None:
     try:
         certificates.check(folder, name)
     except certificates.CryptographyMissing:
-        log.info("%s: whether the certificates in %s are valid is not checked here without 'vinesim[tls]'", name, folder)
+        log.info(
+            "%s: whether the certificates in %s are valid is not checked here without 'vinesim[tls]'", name, folder
+        )
         return None
     return CertificateWatch(folder)
 
