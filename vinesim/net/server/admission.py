@@ -81,6 +81,14 @@ class AdmissionControl:
             del self._admitted[actor]
         self._forget(world)
 
+    def forget_actors(self) -> None:
+        """No session is connected any more."""
+        self._alive.clear()
+        self._admitted.clear()
+        self._spectators.clear()
+        for world in list(self._scenes):
+            self._forget(world)
+
     def may_publish(self, world: str, name: str, session: str) -> bool:
         """Whether records under this name come from the session that was admitted with it, and not as a spectator.
 

@@ -44,8 +44,25 @@ _EVERYTHING = [
 ]  # fmt: skip
 
 
+def authority_folder(folder: pathlib.Path) -> pathlib.Path:
+    """Where the key of the authority of a folder of certificates lies by default."""
+    folder = folder.absolute() if not folder.name else folder
+    return folder.with_name(f"{folder.name}-authority")
+
+
+def refuse_authority_key(folder: pathlib.Path) -> None:
+    """Raise :class:`CertificateError` if the key of the authority lies in a folder of certificates."""
+    if (folder / f"{CA_NAME}.key").exists():
+        place = authority_folder(folder)
+        raise CertificateError(
+            f"{folder / CA_NAME}.key: who has it can make certificates for every name, so no server or client may hold "
+            f"it: mkdir -m 700 {place} && cp {folder}/{CA_NAME}.pem {place}/ && mv {folder}/{CA_NAME}.key {place}/"
+        )
+
+
 def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
     """Settings of a session with the certificate of ``name`` that trusts only what ``folder/ca.pem`` signed."""
+    refuse_authority_key(folder)
     authority, certificate, key = (folder / file for file in (f"{CA_NAME}.pem", f"{name}.pem", f"{name}.key"))
     for file in (authority, certificate, key):
         if not file.is_file():

@@ -56,7 +56,7 @@ class ServerAdmission:
         if not welcomes and self._is_secured:
             raise JoinRejected(
                 f"the server at {self._endpoint} refuses actors named {self._name!r}: its folder of certificates must "
-                f"hold {self._name}.pem, and it reads them when it starts"
+                f"hold {self._name}.pem, which it notices within seconds"
             )
         if not welcomes:
             log.info("%s: no vinesim server keeps world %r; actors check each other", self._name, self._world)
