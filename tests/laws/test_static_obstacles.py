@@ -16,7 +16,10 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanSpec
 
-WIRE, ARM = {"fixed_organ": [int(Organ.WIRE)], "fixed_index": [0]}, {"fixed_organ": [int(Organ.ARM)], "fixed_index": [0]}
+WIRE, ARM = (
+    {"fixed_organ": [int(Organ.WIRE)], "fixed_index": [0]},
+    {"fixed_organ": [int(Organ.ARM)], "fixed_index": [0]},
+)
 RADIUS = {int(Organ.WIRE): 0.0015, int(Organ.ARM): 0.02}
 
 
