@@ -96,9 +96,9 @@ def validate_bunch(model: Model, bunch: int | None) -> int | None:
 
 
 def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndarray:
-    """Distance on the ground from points [n, 2] m to the nearest post, trunk, wire, arm or box [n] m; infinite without any.
+    """Distance on the ground from points [n, 2] m to the nearest obstacle or box [n] m; infinite without any.
 
-    What is wholly above :data:`OVERHEAD` does not count.
+    Obstacles are all poles, trunks, wires and arms. What is wholly above :data:`OVERHEAD` does not count.
 
     ``without``: number of a box that is left out.
     """

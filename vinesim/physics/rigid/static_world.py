@@ -1,4 +1,4 @@
-"""The static world as MuJoCo sees it: ground, trellis, old wood and crates; and the collision bits of everything rigid."""
+"""The static world as MuJoCo sees it: ground, trellis, wood and crates; and the collision bits of all that is rigid."""
 
 from __future__ import annotations
 
