@@ -1,4 +1,4 @@
-"""All rigid bodies in one MuJoCo world: ground, poles and trunks, crates, robots, people, free bunches.
+"""All rigid bodies in one MuJoCo world: ground, trellis, old wood, crates, robots, people, free bunches.
 
 A step is split in two halves, with the contact solve of :mod:`vinesim.physics.contact.contact_solver` between them:
 :meth:`RigidWorld.predict` computes the velocity at the end of the step without contacts with plants,
