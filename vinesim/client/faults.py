@@ -14,11 +14,13 @@ DESCRIPTIONS = {
     "trees_slowed": "trees turned faster than max_joint_rate and were slowed below it, which takes energy from them",
     "robots_stopped": "robots or boxes moved by a number that is not finite and were put back",
     "contacts_dropped": "contacts were left out, as there were more than there is room for",
-    "geoms_skipped": "poles or trunks near a tree were left out, as there are more than max_static_geoms_per_tree",
+    "geoms_skipped": "static geoms near a tree were left out, as there are more than max_static_geoms_per_tree",
     "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",
     "couplings_refused": "forces of other actors on plants were refused, as too many bodies of plants were held",
     "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",
     "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
+    "meshes_refused": "meshes of other clients were refused, as they were corrupt or too many: they stay boxes",
+    "meshes_not_taken": "meshes of robots here were not taken by the server: others see boxes in their place",
     "deadlines_dropped": "steps were skipped after the process had stood still",
 }
 """What each fault is, for a person."""
@@ -31,6 +33,8 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
         "couplings_refused": client.couplings.refused,
         "messages_refused": sum(one.malformed for one in counters),
         "wrenches_refused": sum(one.wrenches_refused for one in counters),
+        "meshes_refused": client.meshes.refused_count,
+        "meshes_not_taken": client.meshes.refused_offers,
         "deadlines_dropped": deadlines_dropped,
     }
     return {name: count for name, count in counts.items() if count}

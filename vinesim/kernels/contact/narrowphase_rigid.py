@@ -208,6 +208,14 @@ def contact_ends(
     return ends
 
 
+@wp.func
+def clear_slots(row: int, count: int, candidates_out: Candidates):
+    """Mark the slots of a row beyond its candidates as empty."""
+    slots = candidates_out.feature.shape[1]
+    for k in range(wp.min(count, slots), slots):
+        candidates_out.feature[row, k] = -1
+
+
 @wp.kernel
 def find_rigid_contacts(
     # model
@@ -242,9 +250,7 @@ def find_rigid_contacts(
     near_count = wp.min(near_count, room)
     is_impact = bool(False)
     count = int(0)  # noqa: RUF046
-    last = capsules.tree_start[tree + 1]
-    if near_count == 0:
-        last = capsules.tree_start[tree]
+    last = capsules.tree_start[tree + wp.where(near_count > 0, 1, 0)]
     for s in range(capsules.tree_start[tree], last):
         if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):
             radius = wp.float64(capsules.radius[s])
@@ -292,6 +298,4 @@ def find_rigid_contacts(
                                 count = count + 1
     candidates_out.is_impact[row] = is_impact
     candidates_out.count[row] = count
-    slots = candidates_out.feature.shape[1]
-    for k in range(wp.min(count, slots), slots):
-        candidates_out.feature[row, k] = -1
+    clear_slots(row, count, candidates_out)
