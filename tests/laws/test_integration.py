@@ -205,9 +205,8 @@ def random_rods(count: int, seed: int) -> tuple[list[TreeBuilder], np.ndarray]:
         length, radius, modulus = rng.uniform(0.3, 1.5), rng.uniform(0.002, 0.006), 10.0 ** rng.uniform(9.0, 10.0)
         pieces = int(rng.integers(4, 17))
         along = frames.from_x_axis(frames.normalize(rng.normal(size=3)))
-        tree = TreeBuilder(
-            frames.pose(np.zeros(3), frames.multiply(along, frames.exp(rng.uniform(0.0, 6.0) * AXES[0])))
-        )
+        roll = frames.exp(np.array([rng.uniform(0.0, 6.0), 0.0, 0.0]))
+        tree = TreeBuilder(frames.pose(np.zeros(3), frames.multiply(along, roll)))
         wood = RodMaterial(modulus, rng.uniform(500.0, 1000.0), shear_modulus=rng.uniform(0.1, 0.5) * modulus)
         last = tree.bodies[tree.add_rod(-1, length, (radius, radius * rng.uniform(0.5, 1.0)), wood, pieces)[-1]]
         load = rng.uniform(0.0, 0.6) * modulus * np.pi * radius**4 / 4.0 / length**2 / 9.81
