@@ -453,7 +453,7 @@ def test_cutting_keeps_pose_velocity_and_indices(plants: ArticulationSolver) -> 
 def test_a_stump_moves_like_a_shorter_cane() -> None:
     """The stump after a cut is bitwise equal to a cane built without the cut part."""
     total, short = canes(1), canes(1)
-    plants = ArticulationSolver(total, State.at_rest(total), phi=1.0)  # one phi: a fast part sets its tree's
+    plants = ArticulationSolver(total, State.at_rest(total))
     plants.wake(0)
     plants.state.joint_qd[:, 1] = 1.0
     plants.forward_kinematics()
@@ -465,7 +465,7 @@ def test_a_stump_moves_like_a_shorter_cane() -> None:
     short.tree_size[:] = short.tree_core[:] = 3
     state = State.at_rest(short)
     state.joint_q[:], state.joint_qd[:] = plants.state.joint_q[:3], plants.state.joint_qd[:3]
-    twin = ArticulationSolver(short, state, phi=1.0)
+    twin = ArticulationSolver(short, state)
     twin.wake(0)
     for _ in range(100):
         step(plants)

@@ -44,8 +44,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     phi: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.55
     """[1] Implicitness of the integration: 1/2 trapezoidal, 1 backward Euler. TUNED."""
     fast_joint_rate: Positive = 5.0
-    """[rad/s] phi of a tree rises with its fastest joint, from a tenth of this rate on, to 1 at this rate; a body that
-    turns faster feels drag. TUNED."""
+    """[rad/s] A tree with a faster joint is integrated with phi = 1; a body that turns faster feels drag. TUNED."""
     max_joint_rate: Positive = 50.0
     """[rad/s] No joint is integrated faster than this. DERIVED: half a radian in a step of 10 ms."""
     fault_joint_rate: Positive = 5000.0

@@ -46,10 +46,6 @@ from vinesim.kernels.articulation.structs import (
 
 wp.set_module_options({"enable_backward": False})
 
-SLOW = wp.constant(0.1)
-"""Share of ``fast_rate`` up to which joints are slow enough for the phi asked for: the solve is linear about the start of
-the step, and errs in energy with the square of the rates. TUNED: of 100 random rods none gains energy but for one step."""
-
 
 @wp.func
 def add_tie(
@@ -359,25 +355,6 @@ def accelerate_bodies(
         )
 
 
-@wp.func
-def predict_tree(
-    p: SolverParameters,
-    model: ArticulationModel,
-    forces: AppliedForces,
-    joints: JointState,
-    tree: int,
-    phi: float,
-    bodies_out: BodyState,
-    factors_out: Factors,
-    scratch_out: Scratch,
-    prediction_out: Prediction,
-):
-    """The three passes over one tree."""
-    assemble_bodies(p, model, forces, joints, tree, phi, bodies_out, factors_out, scratch_out)
-    eliminate_joints(p, model, joints, bodies_out, tree, phi, factors_out, scratch_out)
-    accelerate_bodies(p.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)
-
-
 @wp.kernel
 def predict(
     # model
@@ -401,10 +378,10 @@ def predict(
 
     The articulated-body algorithm (Featherstone 2008, table 7.1) with implicit springs.
 
-    trees: [thread] which tree. tree_phi: [tree] phi asked for, 1/2 to 1; tree_phi_out: [tree] phi used: it rises with
-    the fastest joint, from ``SLOW * p.fast_rate`` on, to 1 at ``p.fast_rate``; 1 if the joints would be faster at the
-    end of the step, and with ``tree_euler_steps`` [tree] left. tree_steps: [tree] substeps that the step is divided
-    into; this is one of them. bodies_out: poses and velocities at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
+    trees: [thread] which tree. tree_phi: [tree] phi asked for, 1/2 to 1; tree_phi_out: [tree] phi used, 1 for a tree
+    with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] substeps that the
+    step is divided into; this is one of them. bodies_out: poses and velocities
+    at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
     that is needed later.
     """
     trees_model = contiguous_model(model)
@@ -416,17 +393,12 @@ def predict(
     step = substep_parameters(p, tree_steps[tree])
     phi = tree_phi[tree]
     first = trees_model.tree_first[tree]
-    moving = trees_model.tree_moving[tree]
-    fastest = max_joint_rate(state.joint_qd, first, moving, trees_model.pitch)
-    if fastest > SLOW * p.fast_rate:
-        phi = phi + (1.0 - phi) * wp.min((fastest / p.fast_rate - SLOW) / (1.0 - SLOW), 1.0)
-    if tree_euler_steps[tree] > 0:
+    fastest = max_joint_rate(state.joint_qd, first, trees_model.tree_moving[tree], trees_model.pitch)
+    if fastest > p.fast_rate or tree_euler_steps[tree] > 0:
         phi = 1.0
-    applied = contiguous_forces(forces)
-    prediction = contiguous_prediction(prediction_out)
-    predict_tree(step, trees_model, applied, state, tree, phi, bodies, factors, scratch, prediction)
-    fastest = max_joint_rate(prediction.joint_qd_free, first, moving, trees_model.pitch)
-    if fastest > p.fast_rate and phi < 1.0:
-        phi = 1.0
-        predict_tree(step, trees_model, applied, state, tree, phi, bodies, factors, scratch, prediction)
     tree_phi_out[tree] = phi
+    assemble_bodies(step, trees_model, contiguous_forces(forces), state, tree, phi, bodies, factors, scratch)
+    eliminate_joints(step, trees_model, state, bodies, tree, phi, factors, scratch)
+    accelerate_bodies(
+        step.dt, trees_model, state, bodies, factors, scratch, tree, contiguous_prediction(prediction_out)
+    )

@@ -42,7 +42,7 @@ _NO_TREES = np.zeros(0, np.int32)
 class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
-    ``predict()`` chooses each tree's phi: up to 1 as a joint nears ``fast_rate``, and if that was faster than
+    ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
     a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after contact
     began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
     ``predict()`` before them.
