@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from tests.laws import test_contact, test_rod_in_space
+from tests.laws import test_contact, test_integration, test_rod_in_space
 from tests.support import beam_theory
 from tests.support.contact_forces import force_on
 from tests.support.contact_scenes import bunch_scene, grasp, gripper, held_point
@@ -142,9 +142,24 @@ def damping() -> Table:
         ("damping ratio asked", *(f"{z:g}" for z in requested)),
         [("seen", *(f"{z:.4f}" for z in measured)), ("frequency", *(f"{100 * (f - 1):+.2f} %" for f in frequency))],
     )
+    lines += ["", *first_modes()]
     f_seen, f_truth = beam_theory.measured_frequencies()
     off = [f"{100 * (a / b - 1):+.2f} %" for a, b in zip(f_seen, f_truth, strict=True)]
     return [*lines, "", *table(("frequency at 1 ms", "first", "second", "third"), [("off", *off)])]
+
+
+def first_modes() -> Table:
+    """First mode of stiff canes at 100 Hz and the default phi, with whole steps and with substeps."""
+    zeta = 0.12
+    substeps, expected, *after = test_integration.first_modes(zeta)
+    _, _, *before = test_integration.first_modes(zeta, substeps=False)
+    rows = [("substeps", *map(str, substeps))]
+    for name, (frequency, damping) in (("whole steps", before), ("substeps as above", after)):
+        rows.append(
+            (f"{name}: frequency", *(f"{100 * (f / g - 1):+.2f} %" for f, g in zip(frequency, expected, strict=True)))
+        )
+        rows.append((f"{name}: damping ratio, {zeta} asked", *(f"{z:.4f}" for z in damping)))
+    return table(("first mode [Hz]", *(f"{f:.1f}" for f in expected)), rows)
 
 
 def grasped() -> Table:

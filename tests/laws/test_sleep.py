@@ -159,6 +159,35 @@ def test_a_cane_dragged_through_sleeping_ones_moves_them_as_if_they_were_awake(
     assert np.abs(forces - expected_forces).max() < 0.02 * largest
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_was_clear_of_sleepers_and_hardly_moved_need_not_be_compared_again(seed: int) -> None:
+    """Comparing every capsule with all sleepers in every step gives the same, to the bit."""
+    rng = np.random.default_rng(seed)
+    model = assemble(
+        [cane((rng.uniform(0.0, 0.6), 0.03 * i, rng.uniform(0.98, 1.02)), radius=0.005) for i in range(16)]
+    )
+    worlds = [Physics(model), Physics(model)]
+    bodies = model.tree_first[[2, 9]] + rng.integers(6, 15, 2)
+    ties = [[physics.plants.add_tie(int(body), np.zeros(3), 1000.0, 10.0) for body in bodies] for physics in worlds]
+    anchor = worlds[0].plants.tie_anchor[ties[0]].copy()
+    velocity, most = np.zeros((2, 3)), 0
+    for physics in worlds:
+        physics.wake(np.array([2, 9]))
+    for step in range(250):
+        if step % 25 == 0:
+            velocity = rng.normal(size=(2, 3)) * rng.choice([0.003, 0.1, 0.8])
+        anchor += np.float32(0.01) * velocity
+        for physics, tied in zip(worlds, ties, strict=True):
+            physics.plants.tie_anchor[tied] = anchor
+        worlds[1].contact_solver.detection.compare_anew()
+        for physics in worlds:
+            physics.step()
+        most = max(most, len(worlds[0].plants.awake))
+        assert worlds[0].plants.awake.tolist() == worlds[1].plants.awake.tolist()
+        assert np.array_equal(worlds[0].state.joint_q, worlds[1].state.joint_q)
+    assert most >= 3
+
+
 def pressure(physics: Physics) -> float:
     return sum(float(np.linalg.norm(contact.force)) for contact in physics.contacts if contact.actor == "plants")
 

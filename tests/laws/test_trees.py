@@ -82,7 +82,7 @@ def test_free_motion_in_space_is_mujocos() -> None:
 
 @pytest.mark.parametrize("phi", [0.55, 1.0])
 def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
-    """Y = J (M + metric)^-1 J^T with MuJoCo's J and M, metric = phi dt (phi dt K + D) in the joint frames."""
+    """Y = J (M + metric)^-1 J^T with MuJoCo's J and M, metric = phi dt (phi dt K + D) in the joints' middle axes."""
     rng = np.random.default_rng(5)
     model = assemble([forked(rng, isotropic=False), forked(rng, isotropic=False)])
     plants = awake(model, random_state(model, rng, 1.0), phi=phi, geometric_stiffness=False)
@@ -100,7 +100,7 @@ def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
     stiffness = model.joint_stiffness.astype(float)
     damping = np.maximum(model.joint_damping - (2 * phi - 1) * DT * stiffness, 0.0)
     metric = phi * DT * (phi * DT * stiffness + damping)
-    axes = frames.to_matrix(state.joint_q.astype(float))
+    axes = frames.to_matrix(frames.exp(0.5 * frames.log(state.joint_q.astype(float))))
     for body in range(len(metric)):
         block = slice(3 * body, 3 * body + 3)
         inertia[block, block] += axes[body].T @ np.diag(metric[body]) @ axes[body]
@@ -383,7 +383,7 @@ def test_response_of_a_cut_tree_is_that_of_a_free_joint(phi: float) -> None:
     used = float(plants.phi_used[0])
     metric = used * DT * (used * DT * stiffness + np.maximum(damping, 0.0))
     assert used == pytest.approx(phi)
-    axes = frames.to_matrix(state.joint_q.astype(float))
+    axes = frames.to_matrix(frames.exp(0.5 * frames.log(state.joint_q.astype(float))))
     for body, at in enumerate(mj_model.jnt_dofadr):
         if plants._parent[body] >= 0:
             inertia[at : at + 3, at : at + 3] += axes[body].T @ np.diag(metric[body]) @ axes[body]

@@ -61,6 +61,7 @@ def test_names_that_are_not_live_do_not_keep_a_live_sender_out():
 def test_a_client_holds_a_bounded_amount_of_messages_of_strangers():
     """Any number of names, each with messages of any size."""
     hub = MemoryHub()
+    hub.binds_names = False
     ada = Client(hub, "ada", 0.5)
     run(hub, [ada], 0.1)
     stranger = hub.bus("stranger", live=False)

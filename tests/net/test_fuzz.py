@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, tre
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.codec import messages
+from vinesim.net.codec.human import encode_pose
 from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.model_check import check_record
@@ -162,6 +164,42 @@ def test_a_client_with_physics_survives_malformed_messages(kind):
     assert client.replicator.counters.malformed > 100
     assert (client.replicator.counters.wrenches_limited > 0) == (kind == "human")
     assert client.replicator.peers == {}
+
+
+def test_jumps_of_a_remote_person_do_not_push_a_robot_on_its_wheels():
+    """Poses of human size that jump in and about the robot, and corrupted ones of a seed that once pushed it 9 m."""
+    hub, now = MemoryHub(), [10.0]
+    client, pose = robot_client(hub, now)
+    attacker = FakeClient(
+        hub.bus(ATTACKER), client.model, (float(pose[0]) + 0.7, float(pose[1])), digest=client.model.digest(),
+        kind="human",
+    )  # fmt: skip
+
+    def tick() -> float:
+        hub.advance(0.01)
+        now[0] += 0.01
+        client.tick()
+        return float(np.linalg.norm(client.physics.rigid.base_state("ada")[0][:3] - pose[:3]))
+
+    for _ in range(60):
+        tick()
+        attacker.tick(now[0])
+    assert ATTACKER in client.remote_actors
+    chance, publisher = np.random.default_rng(5), attacker.bus.publisher(f"a/{ATTACKER}")
+    moved, arrived = [], client.replicator.counters.actor.messages_in
+    for _ in range(120):
+        update = attacker.pose(now[0])
+        points = update.pose.points.copy()
+        points[:, :2] += pose[:2] - points[4, :2] + chance.uniform(-0.8, 0.8, 2)
+        publisher.put(encode_pose(dataclasses.replace(update, pose=update.pose.with_points(points))))
+        moved.append(tick())
+    assert client.replicator.counters.actor.messages_in > arrived + 60
+    malformed = storm(client.model, attacker, 11, now[0])
+    for _ in range(60):
+        for key, payload in itertools.islice(malformed, 20):
+            attacker.bus.publisher(key, reliable=True).put(payload)
+        moved.append(tick())
+    assert max(moved) < 0.03
 
 
 def test_a_hanging_bunch_that_is_claimed_by_an_actor_who_leaves_goes_on_hanging():

@@ -13,9 +13,9 @@ from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.codec.wrenches import MAX_WRENCH, WrenchMessage, encode_wrenches
 from vinesim.net.counters import Counters
 from vinesim.net.replication.hand_forces import (
+    HAND_FORCE,
+    HAND_LEVER,
     MAX_AGE,
-    MAX_PERSON_FORCE,
-    MAX_PERSON_MOMENT,
     MAX_PUSHING_PEOPLE,
     REACH,
     WrenchSync,
@@ -168,7 +168,7 @@ def test_no_person_and_not_all_together_push_harder_than_hands_can(pushes):
 
 def _assert_limited(wrenches: dict[str, np.ndarray], people: int) -> None:
     total = sum(np.linalg.norm(wrench.reshape(2, 3), axis=1) for wrench in wrenches.values())
-    assert (total <= people * (1.0 + 1e-9) * np.array([MAX_PERSON_FORCE, MAX_PERSON_MOMENT])).all()
+    assert (total <= people * (1.0 + 1e-9) * 2.0 * HAND_FORCE * np.array([1.0, HAND_LEVER])).all()
 
 
 def test_a_wrench_that_is_too_strong_keeps_its_line_of_action_and_is_counted():
@@ -177,7 +177,7 @@ def test_a_wrench_that_is_too_strong_keeps_its_line_of_action_and_is_counted():
     receive(robot, {"arm": 100.0 * PUSH})
     got = robot.net_wrenches(0.0)["arm"]
     np.testing.assert_allclose(got / np.linalg.norm(got), PUSH / np.linalg.norm(PUSH), rtol=1e-6)
-    assert np.linalg.norm(got[:3]) == pytest.approx(MAX_PERSON_FORCE)
+    assert np.linalg.norm(got[:3]) == pytest.approx(2.0 * HAND_FORCE)
     assert counters.wrenches_limited == 1
 
 
@@ -186,4 +186,14 @@ def test_wrenches_that_leave_are_limited_too():
     pair = Pair()
     for _ in range(10):
         received = pair.tick({"arm": 1e6 * PUSH})
-    assert np.linalg.norm(received["arm"][:3]) == pytest.approx(MAX_PERSON_FORCE)
+    assert np.linalg.norm(received["arm"][:3]) == pytest.approx(2.0 * HAND_FORCE)
+
+
+@pytest.mark.parametrize("hand_force", [HAND_FORCE, 30.0])
+@pytest.mark.parametrize(("hands", "count"), [((0.3, 5.0), 1), ((5.0, 0.4), 1), ((0.3, 0.4), 2)])
+def test_each_hand_within_reach_pushes_with_its_own_limit_and_no_more(hands, count, hand_force):
+    robot = WrenchSync(MemoryHub().bus("anna"), "anna", Counters(), hand_force)
+    payload = encode_wrenches(WrenchMessage(1.0, {"arm": 100.0 * PUSH, "base": 100.0 * PUSH}))
+    robot.receive(payload, EVA, person(hands=hands), 0.0, LINKS.get)
+    forces = [np.linalg.norm(wrench[:3]) for wrench in robot.net_wrenches(0.0).values()]
+    assert sum(forces) == pytest.approx(count * hand_force)

@@ -21,7 +21,7 @@ from vinesim.net.codec.human import (
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
 from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.scene.values import HumanUpdate, RobotUpdate
+from vinesim.scene.values import POINT_NAMES, HumanUpdate, RobotUpdate
 
 HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.from_yaw(2.0))
 
@@ -140,3 +140,19 @@ def test_a_truncated_message_is_refused(payload):
             read(payload[:length])
     with pytest.raises(MessageError):
         read(payload + b"\0")
+
+
+@pytest.mark.parametrize("point", ["head", "left", "right", "left_foot", "right_foot"])
+def test_a_pose_of_no_human_size_or_speed_is_refused(point):
+    sent = random_human()
+    at = POINT_NAMES.index(point)
+    for size, speed, is_human in ((1.5, 20.0, True), (2.6, 0.0, False), (1.0, 60.0, False)):
+        points, velocity = sent.pose.points.copy(), np.zeros((len(POINT_NAMES), 6))
+        points[at, :3] = points[POINT_NAMES.index("hips"), :3] + [0.0, size, 0.0]
+        velocity[at, 2] = speed
+        payload = encode_human(HumanUpdate("eva", 1.0, sent.pose.with_points(points), velocity))
+        if is_human:
+            assert decode_human(payload, "eva").pose is not None
+        else:
+            with pytest.raises(MessageError, match=r"from the hips|faster than"):
+                decode_human(payload, "eva")

@@ -76,7 +76,9 @@ def test_a_remote_rest_pose_is_applied_without_waking():
     for _ in range(200):
         other.step()
     bodies = other.model.bodies_of(0)
-    physics.apply_remote_rest([0], [other.state.joint_q[bodies]])
+    other_pose = other.state.joint_q[bodies]
+    several = 2 * len(physics.model.tree_first)  # as several actors of one client are told
+    physics.apply_remote_rest(several * [0], (several - 1) * [physics.state.joint_q[bodies]] + [other_pose])
     assert len(physics.plants.awake) == 0
     assert physics.remotely_posed.tolist() == [0]
     assert physics.snapshot().moved_trees.tolist() == [0]

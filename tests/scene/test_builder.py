@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.support import beam_theory
 from vinesim import frames
 from vinesim.scene import builder
 from vinesim.scene.ids import Organ
@@ -80,7 +81,7 @@ def test_solve_rest_pose_keeps_the_drawn_shape_under_load():
     tree.solve_rest_pose()
     model = builder.assemble([tree])
     assert np.abs(model.forward_kinematics(model.joint_settled) - drawn).max() < 1e-5
-    root = model.joint_stiffness[0] * frames.log(model.joint_settled[0].astype(float))
+    root = beam_theory.spring_torque(model.joint_stiffness[0], frames.log(model.joint_settled[0].astype(float)))
     lever = drawn[:, :3] + frames.rotate(drawn[:, 3:], model.body_com.astype(float)) - POSE[:3]
     moment = np.cross(lever, model.body_mass[:, None] * builder.GRAVITY).sum(0)
     axes = frames.multiply(POSE[3:], model.body_rest[0].astype(float))

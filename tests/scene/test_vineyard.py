@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tests.support import beam_theory
 from vinesim import frames
 from vinesim.scene import plant_parameters
 from vinesim.scene import spec as scenes
@@ -269,7 +270,7 @@ def test_the_drawn_shape_is_an_equilibrium(vineyard):
             gravity = np.cross(centre[below] - q[b, :3], weight[below]).sum(0)
             parent = model.tree_pose[tree] if model.body_parent[b] < 0 else q[model.body_parent[b]]
             axes = frames.multiply(parent[3:], model.body_rest[b].astype(float))
-            spring = frames.rotate(axes, model.joint_stiffness[b] * angle[b])
+            spring = frames.rotate(axes, beam_theory.spring_torque(model.joint_stiffness[b], angle[b]))
             assert np.abs(spring - gravity).max() < 1e-3
     assert np.linalg.norm(angle, axis=1).max() < 0.7
 

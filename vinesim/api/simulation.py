@@ -43,8 +43,9 @@ Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterab
 class Simulation:
     """A world that moves when :meth:`step` is called; nothing runs in the background.
 
-    Trees that are in equilibrium start asleep, all others awake. A tree falls asleep when it has been at rest for half
-    a second (``parameters.sleep_duration``) and wakes when something touches it; sleeping trees cost nothing.
+    Trees that are in equilibrium start asleep, all others awake. A tree falls asleep when it has come to rest
+    (``sleep_distance`` and the like of ``parameters``) and wakes when something touches it; sleeping trees cost
+    nothing.
     """
 
     def __init__(

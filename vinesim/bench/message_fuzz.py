@@ -223,9 +223,15 @@ class Storm:
     """Messages that reached the first client."""
 
 
-def run_storm(count: int, seed: int = 0, *, is_stranger: bool = False, kind: str = "robot") -> Storm:
-    """A storm against two clients from an admitted actor of ``kind``, or from a program that never was admitted."""
+def run_storm(
+    count: int, seed: int = 0, *, is_stranger: bool = False, kind: str = "robot", binds_names: bool = False
+) -> Storm:
+    """A storm against two clients from an admitted actor of ``kind``, or from a program that never was admitted.
+
+    Not ``binds_names``: messages under the names of others reach the clients' own checks.
+    """
     hub = MemoryHub(delay=0.005, seed=seed)
+    hub.binds_names = binds_names
     server = hub.bus("server")
     server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
     model = tree_row()

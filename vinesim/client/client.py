@@ -139,7 +139,12 @@ class Client:
             seed=self.scene.seed,
         )  # fmt: skip
         replicator = Replicator(
-            bus, hello, self.model, interest_radius=self._interest_radius, jitter_buffer=self._jitter_buffer
+            bus,
+            hello,
+            self.model,
+            interest_radius=self._interest_radius,
+            jitter_buffer=self._jitter_buffer,
+            hand_force=self.physics.parameters.hand_force,
         )
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
@@ -153,7 +158,12 @@ class Client:
             height=spec.height, seed=self.scene.seed,
         )  # fmt: skip
         replicator = Replicator(
-            bus, hello, self.model, interest_radius=self._interest_radius, jitter_buffer=self._jitter_buffer
+            bus,
+            hello,
+            self.model,
+            interest_radius=self._interest_radius,
+            jitter_buffer=self._jitter_buffer,
+            hand_force=self.physics.parameters.hand_force,
         )
         self.humans[spec.name] = human = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
         self._add_replicator(spec.name, replicator)

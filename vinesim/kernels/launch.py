@@ -41,7 +41,7 @@ def bind_launch(
     ]
     at = kernel.arg_indices[index_list] if index_list else -1
     if not wp.get_device(device).is_cpu:
-        return _recorded(commands, inputs, -1)
+        return _recorded(commands, inputs, at)
     try:
         calls = []
         for command in commands:
@@ -69,11 +69,13 @@ def bind_launch(
 
 def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> Callable[..., None]:
     """Warp's own replay: what CUDA uses, and what can be captured into a graph."""
+    starts = [0] * len(commands)
 
     def launch(threads: int, first: int = 0, partition: int = 0) -> None:
         if threads:
-            if at >= 0:
+            if at >= 0 and first != starts[partition]:
                 commands[partition].set_param_at_index(at, inputs[at][first:])
+                starts[partition] = first
             commands[partition].set_dim(threads)
             commands[partition].launch()
 

@@ -55,6 +55,8 @@ class Counters:
     couplings_refused: int = 0
     """Couplings of peers to trees that neither side owns, or that their arms do not reach."""
 
+    foreign: int = 0
+    """Messages and answers that the bus dropped: of a session that does not hold the name they came under."""
     lost: int = 0
     """Received samples that the bus discarded: its store was full, or the sample too large."""
     network_failures: int = 0

@@ -97,7 +97,10 @@ class Physics:
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
             ("plants: predict velocities without contacts", self.plants.predict),
-            ("contacts: solve for plants and rigid bodies together", self.contact_solver.solve),
+            (
+                "contacts: wake trees that others touch, solve plants and rigid bodies together",
+                self.contact_solver.solve,
+            ),
             ("plants: integrate with contact wrenches", self._integrate_plants),
             ("rigid: integrate with contact forces", self._integrate_rigid),
             ("faults: stop trees with invalid rates", self.fault_guard.stop_faulty_trees),
@@ -283,11 +286,12 @@ class Physics:
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
         """Apply in which pose trees rest at their owner, without waking them: ``joint_q`` [body of the tree, 4]
-        each."""
+        each. Of a tree that is named several times the last pose counts."""
         for tree, rotations in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(rotations, np.float32))
-        self.plants.put_to_sleep(np.array(trees, np.int32))
-        self.contact_solver.update_tree_bounds(np.array(trees, np.int32))
+        resting = np.unique(trees).astype(np.int32)
+        self.plants.put_to_sleep(resting)
+        self.contact_solver.update_tree_bounds(resting)
         self.remotely_posed = np.union1d(self.remotely_posed, trees).astype(np.int32)
         self._body_q = None
 

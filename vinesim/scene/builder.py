@@ -373,11 +373,10 @@ def segment_properties(
 def solve_rest_pose(model: Model) -> Model:
     """Turn rest rotations that hold the *drawn* shape into slack ones, so that the drawn shape is in equilibrium.
 
-    Each spring must carry the weight that hangs below its joint, so its slack axes are turned by theta = torque /
-    stiffness
-    (in joint axes), and ``joint_settled`` turns them back: drawn = rest * settled. Writes both fields of the model and
-    returns it. The weight of a bunch with clusters is that of its head and its clusters. :class:`ValueError` if a
-    joint has no stiffness.
+    Each spring must carry the weight that hangs below its joint, so its slack axes are turned by the theta at which
+    the gradient of theta^T K theta / 2 is the torque, and ``joint_settled`` turns them back: drawn = rest * settled.
+    Writes both fields of the model and returns it. The weight of a bunch with clusters is that of its head and its
+    clusters. :class:`ValueError` if a joint has no stiffness.
     """
     if not (model.joint_stiffness > 0.0).all():
         body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])
@@ -401,9 +400,10 @@ def solve_rest_pose(model: Model) -> Model:
     settled = np.broadcast_to(frames.IDENTITY, drawn.shape).copy()
     local = frames.rotate(frames.conjugate(world[:, 3:]), moment)
     open_joints = np.arange(len(settled))
-    for _ in range(60):  # the joint's axes depend on the answer; the map contracts for theta below ~1 rad
+    for _ in range(60):  # the joint's middle axes depend on the answer; the map contracts for theta below ~1 rad
         before = settled[open_joints]
-        torque = frames.rotate(before, local[open_joints])
+        theta = frames.log(before)
+        torque = _without_curvature(theta, frames.rotate(frames.exp(0.5 * theta), local[open_joints]))
         settled[open_joints] = after = frames.exp(torque / model.joint_stiffness[open_joints])
         change = np.abs(after - before).max(1, initial=0.0)
         if change.max(initial=0.0) < 1e-12:
@@ -412,6 +412,18 @@ def solve_rest_pose(model: Model) -> Model:
     model.body_rest[:] = frames.multiply(drawn, frames.conjugate(settled))
     model.joint_settled[:] = settled
     return model
+
+
+def _without_curvature(theta: np.ndarray, torque: np.ndarray) -> np.ndarray:
+    """K theta [n, 3] of springs at rotation vectors theta [n, 3] rad that hold a torque [n, 3] N m in middle axes.
+
+    The inverse of torque = s K theta + (1 - s) n n^T K theta, see ``spring_torque`` in
+    :mod:`vinesim.kernels.articulation.forces`.
+    """
+    half = 0.5 * np.linalg.norm(theta, axis=1, keepdims=True)
+    along = theta / np.maximum(2.0 * half, 1e-12)
+    share = np.sinc(half / np.pi)
+    return share * torque + (1.0 - share) * (along * torque).sum(1, keepdims=True) * along
 
 
 def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:

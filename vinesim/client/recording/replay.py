@@ -128,7 +128,7 @@ def _cell(key: str) -> tuple[int, int] | None:
 class ReplayBus:
     """A member of a recorded world; see :class:`vinesim.net.transport.bus.Bus`. What it publishes is discarded."""
 
-    bytes_out = failures = 0
+    bytes_out = failures = foreign = 0
     status_message = ""
 
     def __init__(
@@ -262,14 +262,16 @@ class Replay:
         self, recording: Recording, bus: Bus, live_bus: Callable[[str], Bus], now: float, *,
         speed: float = 1.0, start: float = 0.0, end: float | None = None,
     ) -> None:  # fmt: skip
-        """``bus`` is not live: it queries the clock and publishes for actors that are absent. ``live_bus(name)`` opens
-        the bus of an actor. ``now`` is any clock [s], as in :meth:`step`."""
+        """``bus`` is not live: it queries the clock. ``live_bus(name)`` opens the bus of an actor, also of an absent
+        one while its retained records are published. ``now`` is any clock [s], as in :meth:`step`."""
         self.playhead = Playhead(recording, start, end)
         self.sent = 0
         """Messages that had a subscriber."""
         self._bus, self._live_bus, self._speed = bus, live_bus, speed
         self._network_clock = NetworkClock(bus, now, time.time() - now)
         self._buses: dict[str, Bus] = {}
+        self._absent: dict[str, Bus] = {}
+        """Buses of actors that are not present and whose retained records are published now."""
         self._publishers: dict[str, Publisher] = {}
         self._start = self.playhead.time
         self._begun: float | None = None
@@ -303,6 +305,8 @@ class Replay:
             self._initial_messages = [
                 (key, payload) for key, payload in self._initial_messages if not self._publish(key, payload)
             ]
+            if not self._initial_messages:
+                self._close_absent(set(self._absent))
         for entry in entries:
             if entry.key.partition("/")[0] not in _ANSWERED:
                 # as old as it was when the recorder had it
@@ -314,12 +318,14 @@ class Replay:
         for bus in self._buses.values():
             bus.close()
         self._buses.clear()
+        self._close_absent(set(self._absent))
 
     def _update_actors(self) -> None:
         """Let actors join and leave."""
         for name in sorted(self._buses.keys() - self.playhead.live):
             self._buses.pop(name).close()
             self._publishers = {k: p for k, p in self._publishers.items() if sender_of(k) != name}
+        self._close_absent(self.playhead.live & self._absent.keys())
         for name in sorted(self.playhead.live - self._buses.keys()):
             greeting = self.playhead.greetings.get(name)
             if greeting is not None:
@@ -332,10 +338,27 @@ class Replay:
     def _publish(self, key: str, payload: bytes) -> bool:
         """Whether there was a subscriber."""
         if key not in self._publishers:
-            self._publishers[key] = self._bus.publisher(key, key.partition("/")[0] in RELIABLE)
+            name = sender_of(key)
+            bus = self._buses.get(name) or self._absent.get(name) or self._join_absent(name)
+            self._publishers[key] = bus.publisher(key, key.partition("/")[0] in RELIABLE)
         was_sent = self._publishers[key].put(payload)
         self.sent += was_sent
         return was_sent
+
+    def _join_absent(self, name: str) -> Bus:
+        """Join with the name of an actor that is not present, for records count only from who has joined."""
+        bus = self._absent[name] = self._live_bus(name)
+        greeting = self.playhead.greetings.get(name)
+        if greeting is None:
+            other = messages.decode_hello(next(iter(self.playhead.greetings.values())))
+            greeting = messages.encode_hello(messages.Hello(name, scene=other.scene, digest=other.digest))
+        bus.join(greeting)
+        return bus
+
+    def _close_absent(self, names: set[str]) -> None:
+        for name in sorted(names):
+            self._absent.pop(name).close()
+            self._publishers = {k: p for k, p in self._publishers.items() if sender_of(k) != name}
 
 
 def _record_key(cell: tuple[int, int], record: messages.RetainedRecord) -> str:

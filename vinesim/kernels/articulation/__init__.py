@@ -2,9 +2,16 @@
 
 Featherstone's articulated-body recursion (Rigid Body Dynamics Algorithms, 2008, chapter 7), one thread a tree. The
 springs enter the recursion implicitly: with theta the joint's rotation vector, w its rate and phi in [1/2, 1], the
-torque over one step is -K (theta + phi dt w_phi) - D w_phi, w_phi = w + phi dt dw/dt, so every joint inertia grows by
+torque over one step is about -K (theta + phi dt w_phi) - D w_phi, w_phi = w + phi dt dw/dt, so every joint inertia grows by
 the *metric* phi dt (phi dt K + D) and stiffness cannot make the step unstable. phi = 1 is backward Euler (MuJoCo's
 ``discrete`` integrator), phi = 1/2 the trapezoidal rule.
+
+K and D are diagonal in a joint's *middle axes*, turned from the joint's by half of its rotation, and the torque is the
+gradient of theta^T K theta / 2 (:func:`vinesim.kernels.articulation.forces.spring_torque`).
+
+A step slows a mode of rate w by (w dt)^2 / 12. A tree whose first mode turns by more than 0.3 rad in it takes substeps
+instead while nothing touches it: ``tree_steps`` says how many, :mod:`vinesim.kernels.articulation.first_mode` why.
+docs/decisions/integrator.md has the figures.
 
 Loads lend stiffness, too: a force F drawing out a lever d resists turning with (d.F)(1 - dd^T / d.d). Taken explicitly
 it gives a swing of rate w the damping ratio -(1 - phi) dt w / 2 (-0.018 for a bunch on 15 cm), and where a peduncle is
@@ -41,6 +48,6 @@ One after the other (pitch 1) suits a CPU; a GPU reads neighbouring trees at onc
 over children are read and stored, not added in place: that would be an atomic operation, in a GPU's far cache.
 
 Files: ``structs`` (arguments), ``spatial`` (rotations, inertias), ``forces`` (springs, ties, drag), ``kinematics``,
-``prediction`` (the three passes), ``impulse_response``, ``integration``, ``floating_components`` (what has been cut
+``prediction`` (the three passes), ``first_mode`` (substeps), ``impulse_response``, ``integration``, ``floating_components`` (what has been cut
 off), ``joint_wrench``, ``gather_scatter`` (rows between host and device).
 """

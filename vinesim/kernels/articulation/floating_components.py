@@ -15,6 +15,7 @@ from vinesim.kernels.articulation.structs import (
     FloatingScratch,
     JointState,
     SolverParameters,
+    substep_parameters,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -151,6 +152,7 @@ def correct_floating_momentum(
     roots: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
     tree_rate: wp.array(dtype=float),
+    tree_steps: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     bodies: BodyState,
     body_acceleration: wp.array(dtype=wp.spatial_vector),
@@ -161,13 +163,15 @@ def correct_floating_momentum(
 ):
     """One thread gives one floating component the momentum and the path of its centre of mass that outer forces leave it.
 
-    roots: [thread] the cut body; nothing happens in a tree with tree_rate [tree] above ``p.fault_rate``. bodies: at the
+    roots: [thread] the cut body; nothing happens in a tree with tree_rate [tree] above ``p.fault_rate``. tree_steps:
+    [tree] substeps that the step is divided into; this corrects one of them. bodies: at the
     start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it; lever: [body] m. joints_out: joints at the end
     of the step; rotation, rates and place of the root are corrected.
     """
-    dt = p.dt
     root = roots[wp.tid()]
     tree = model.body_tree[root]
+    step = substep_parameters(p, tree_steps[tree])
+    dt = step.dt
     if not tree_rate[tree] <= p.fault_rate:
         return
     last = model.tree_first[tree] + model.tree_moving[tree] * model.pitch
@@ -176,7 +180,7 @@ def correct_floating_momentum(
     place = wp.transform_get_translation(bodies.body_q[root])
     velocity = wp.spatial_top(bodies.body_qd[root])
     mass, mass_com, linear, angular, force, moment = component_before(
-        p, model, forces, bodies, body_acceleration, lever, root, last, tree_phi[tree], scratch_out
+        step, model, forces, bodies, body_acceleration, lever, root, last, tree_phi[tree], scratch_out
     )
     com = mass_com / mass
     goal_linear = linear + dt * (force + mass * p.gravity)

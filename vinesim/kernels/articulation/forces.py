@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from vinesim.kernels.articulation.spatial import logarithm
 from vinesim.kernels.articulation.structs import AppliedForces, ArticulationModel
 
 wp.set_module_options({"enable_backward": False})
@@ -33,9 +32,27 @@ def shear_stiffness(lever: wp.vec3, force: wp.vec3):
 
 
 @wp.func
-def spring_moment(frame: wp.mat33, stiffness: wp.vec3, q: wp.quat, share: float):
-    """A share of the moment [N m] that a spring bears, in world axes; ``frame`` holds the joint's axes."""
-    return share * (frame * wp.cw_mul(stiffness, logarithm(q)))
+def spring_torque(stiffness: wp.vec3, q: wp.quat):
+    """Torque [N m] that a spring holds against a rotation q, in the joint's middle axes.
+
+    The gradient of theta^T K theta / 2 by a turn of the joint, theta being the rotation vector of q. The middle axes are
+    turned from the joint's by half of q; in them it is s K theta + (1 - s) n n^T K theta, with n along theta and s the
+    ratio of |theta| / 2 to its sine. K theta itself is no gradient unless K is isotropic: it does work around a cycle of
+    bending and twist.
+    """
+    v = wp.vec3(q[0], q[1], q[2])
+    w = q[3]
+    if w < 0.0:
+        v = -v
+        w = -w
+    square = wp.dot(v, v)
+    excess = 1.0 / 6.0 + square * (3.0 / 40.0 + square * (5.0 / 112.0))  # (s - 1) / square, s = asin(|v|) / |v|
+    if square > 0.02:
+        sine = wp.sqrt(square)
+        excess = (wp.atan2(sine, w) / sine - 1.0) / square
+    s = 1.0 + excess * square
+    torque = wp.cw_mul(stiffness, 2.0 * s * v)
+    return s * torque - excess * wp.dot(v, torque) * v
 
 
 @wp.func

@@ -28,6 +28,7 @@ def integrate(
     trees: wp.array(dtype=wp.int32),
     tree_awake: wp.array(dtype=wp.bool),
     tree_phi: wp.array(dtype=float),
+    tree_steps: wp.array(dtype=wp.int32),
     joints: JointState,
     prediction: Prediction,
     # out
@@ -38,17 +39,19 @@ def integrate(
     """One thread moves the joints of one tree to the end of the step; a faulty tree stays where the step began.
 
     trees: [thread] which tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] as :func:`predict` used it.
+    tree_steps: [tree] substeps that the step is divided into; a tree that one of them stopped takes no other.
     tree_rate_out: [tree] rad/s of the fastest joint and m/s of the fastest floating root, as a length; NaN or above
-    ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] steps still to be taken with phi = 1, counted
-    down here. joints_out: [body] rotations by the exponential map of the mean rate; may be ``joints``.
+    ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] steps and substeps still to be taken with phi = 1,
+    counted down here. joints_out: [body] rotations by the exponential map of the mean rate; may be ``joints``.
     """
     tree = trees[wp.tid()]
-    if not tree_awake[tree]:
+    substeps = tree_steps[tree]
+    if not tree_awake[tree] or (substeps > 1 and not tree_rate_out[tree] <= p.fault_rate):
         return
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
     pitch = model.pitch
-    dt = p.dt
+    dt = p.dt / float(substeps)
     turning = max_joint_rate(prediction.joint_qd_free, first, size, pitch)
     falling = max_root_speed(
         joints.joint_x, prediction.joint_xd_free, model.body_parent, model.body_root, first, size, pitch

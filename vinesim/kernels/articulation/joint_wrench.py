@@ -17,6 +17,7 @@ def joint_wrench(
     # in
     joint_bodies: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
+    tree_steps: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     bodies: BodyState,
     body_acceleration: wp.array(dtype=wp.spatial_vector),
@@ -26,7 +27,8 @@ def joint_wrench(
     """One thread adds up what one joint must carry so that everything beyond it moves as it did in the last step.
 
     Newton-Euler of the subtree (Featherstone 2008, section 5.3). joint_bodies: [thread] body beyond the joint.
-    bodies: at the start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it. wrench_out: [thread] N, and N m
+    bodies: at the start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it; of the last substep if the step was
+    divided into tree_steps [tree]. wrench_out: [thread] N, and N m
     about the body's origin, world axes; zero for what has been cut off.
     """
     slot = wp.tid()
@@ -53,7 +55,7 @@ def joint_wrench(
             own = model.body_mass[k] * (a - p.gravity)
             given = forces.body_load[k] + forces.body_wrench[k]
             given += tie_and_drag_wrench(
-                k, p.dt, tree_phi[tree], forces.tree_air[tree], model, forces, pose, bodies.body_qd[k],
+                k, p.dt / float(tree_steps[tree]), tree_phi[tree], forces.tree_air[tree], model, forces, pose, bodies.body_qd[k],
                 body_acceleration[k],
             )  # fmt: skip
             arm = wp.transform_get_translation(pose) - pivot

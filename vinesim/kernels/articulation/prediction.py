@@ -20,14 +20,14 @@ from vinesim.kernels.articulation.forces import (
     drag_coefficient,
     residual_damping,
     shear_stiffness,
-    spring_moment,
+    spring_torque,
     tension_stiffness,
     tie_force,
 )
 from vinesim.kernels.articulation.kinematics import body_kinematics, max_joint_rate, parent_kinematics
 from vinesim.kernels.articulation.spatial import (
     cross_rows,
-    logarithm,
+    half_rotation,
     point_mass_inertia,
     rotated_diagonal,
     world_inertia,
@@ -41,6 +41,7 @@ from vinesim.kernels.articulation.structs import (
     Prediction,
     Scratch,
     SolverParameters,
+    substep_parameters,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -270,13 +271,15 @@ def eliminate_joints(
         turning = wp.vec3()
         if parent >= 0:
             turning = wp.spatial_bottom(bodies.body_qd[parent])
-        frame = wp.quat_to_matrix(factors_out.axes[k])
+        half = half_rotation(joints.joint_q[k])
+        frame = wp.quat_to_matrix(factors_out.axes[k] * half)
         stiffness = model.joint_stiffness[k]
         artificial = (2.0 * phi - 1.0) * dt  # [s] the scheme damps as if beta were larger by this
         damping = wp.max(model.joint_damping[k] - artificial * stiffness, wp.vec3())
         metric = rotated_diagonal(frame, phi * dt * (phi * dt * stiffness + damping))
-        rate = joints.joint_qd[k]
-        spring = wp.cw_mul(stiffness, logarithm(joints.joint_q[k]) + phi * dt * rate) + wp.cw_mul(damping, rate)
+        rate = wp.quat_rotate_inv(half, joints.joint_qd[k])
+        torque = spring_torque(stiffness, joints.joint_q[k])
+        spring = torque + wp.cw_mul(phi * dt * stiffness + damping, rate)
         bias = scratch_out.bias[k]
         J = scratch_out.J[k]
         H = scratch_out.H[k]
@@ -286,11 +289,11 @@ def eliminate_joints(
         u = metric * wp.cross(turning, omega) - frame * spring - wp.spatial_bottom(bias)
         if conservative:
             turns = turning + omega
-            u = u - wp.cross(turns, spring_moment(frame, stiffness, joints.joint_q[k], 0.5 * ahead))
+            u = u - 0.5 * ahead * wp.cross(turns, frame * torque)
         D = wp.inverse(J + metric)
         DJ = D * J
         if conservative and parent >= 0:
-            DJ = DJ - cross_rows(D, spring_moment(frame, stiffness, joints.joint_q[k], 0.5 * reach))
+            DJ = DJ - cross_rows(D, 0.5 * reach * (frame * torque))
         DH = D * H
         factors_out.D[k] = D
         factors_out.DJ[k] = DJ
@@ -301,7 +304,7 @@ def eliminate_joints(
             lever = factors_out.lever[k]
             add_to_parent(k, parent, ahead, reach, turning, metric, lever, J, H, M, bias, DJ, DH, Du, scratch_out)
             if conservative:
-                moment = spring_moment(frame, stiffness, joints.joint_q[k], 0.5 * reach)
+                moment = 0.5 * reach * (frame * torque)
                 centripetal = wp.cross(turning, wp.cross(turning, lever))
                 couple_bending_and_twist(k, parent, reach, moment, centripetal, lever, DJ, DH, scratch_out)
         else:
@@ -361,6 +364,7 @@ def predict(
     trees: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
     tree_euler_steps: wp.array(dtype=wp.int32),
+    tree_steps: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     joints: JointState,
     # out
@@ -375,7 +379,8 @@ def predict(
     The articulated-body algorithm (Featherstone 2008, table 7.1) with implicit springs.
 
     trees: [thread] which tree. tree_phi: [tree] phi asked for, 1/2 to 1; tree_phi_out: [tree] phi used, 1 for a tree
-    with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. bodies_out: poses and velocities
+    with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] substeps that the
+    step is divided into; this is one of them. bodies_out: poses and velocities
     at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
     that is needed later.
     """
@@ -385,12 +390,15 @@ def predict(
     factors = contiguous_factors(factors_out)
     scratch = contiguous_scratch(scratch_out)
     tree = trees[wp.tid()]
+    step = substep_parameters(p, tree_steps[tree])
     phi = tree_phi[tree]
     first = trees_model.tree_first[tree]
     fastest = max_joint_rate(state.joint_qd, first, trees_model.tree_moving[tree], trees_model.pitch)
     if fastest > p.fast_rate or tree_euler_steps[tree] > 0:
         phi = 1.0
     tree_phi_out[tree] = phi
-    assemble_bodies(p, trees_model, contiguous_forces(forces), state, tree, phi, bodies, factors, scratch)
-    eliminate_joints(p, trees_model, state, bodies, tree, phi, factors, scratch)
-    accelerate_bodies(p.dt, trees_model, state, bodies, factors, scratch, tree, contiguous_prediction(prediction_out))
+    assemble_bodies(step, trees_model, contiguous_forces(forces), state, tree, phi, bodies, factors, scratch)
+    eliminate_joints(step, trees_model, state, bodies, tree, phi, factors, scratch)
+    accelerate_bodies(
+        step.dt, trees_model, state, bodies, factors, scratch, tree, contiguous_prediction(prediction_out)
+    )

@@ -19,19 +19,14 @@ def exponential(v: wp.vec3):
 
 
 @wp.func
-def logarithm(q: wp.quat):
-    """Rotation vector [rad] of the unit quaternion q, the short way round."""
-    v = wp.vec3(q[0], q[1], q[2])
-    w = q[3]
-    if w < 0.0:
-        v = -v
-        w = -w
-    square = wp.dot(v, v)
-    scale = 2.0 + square * (1.0 / 3.0 + square * (3.0 / 20.0 + square * (5.0 / 56.0)))  # 2 asin(s) / s
-    if square > 0.02:
-        sine = wp.sqrt(square)
-        scale = 2.0 * wp.atan2(sine, w) / sine
-    return scale * v
+def half_rotation(q: wp.quat):
+    """Half of the rotation of the unit quaternion q, the short way round."""
+    w = wp.abs(q[3])
+    scale = 1.0 / wp.sqrt(2.0 * (1.0 + w))
+    sine = scale
+    if q[3] < 0.0:
+        sine = -scale
+    return wp.quat(sine * q[0], sine * q[1], sine * q[2], scale * (1.0 + w))
 
 
 @wp.func

@@ -29,6 +29,20 @@ class SolverParameters:
     gravity: wp.vec3  # [m/s^2]
 
 
+@wp.func
+def substep_parameters(p: SolverParameters, steps: int):
+    """The same numbers for one of so many substeps."""
+    return SolverParameters(
+        p.dt / float(steps),
+        p.fast_rate,
+        p.max_rate,
+        p.fault_rate,
+        p.contact_steps,
+        p.geometric_stiffness,
+        p.gravity,
+    )
+
+
 @wp.struct
 class ArticulationModel:
     """Topology, inertia, springs and ties: what no step changes."""

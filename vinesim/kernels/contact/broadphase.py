@@ -210,12 +210,28 @@ def block_aabbs(
     block_boxes_out.high[block] = high
 
 
+@wp.func
+def overlaps_capsule(
+    low: wp.vec3, high: wp.vec3, tree: int, capsules: Capsules, trees: Trees, capsule_states: CapsuleStates
+):
+    """Whether a box overlaps that of one of the capsules of a tree."""
+    overlaps = bool(False)
+    for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
+        if not aabbs_disjoint(low, high, capsule_states.low[s], capsule_states.high[s]):
+            overlaps = overlaps or is_collidable(
+                capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached
+            )
+    return overlaps
+
+
 @wp.kernel
 def mark_near_trees(
     # model
     actors: Actors,
+    capsules: Capsules,
     # in
     trees: Trees,
+    capsule_states: CapsuleStates,
     block_boxes: Aabbs,
     tree_boxes: Aabbs,
     actor_boxes: Aabbs,
@@ -225,7 +241,8 @@ def mark_near_trees(
 ):
     """One thread per block: mark those of its trees whose box a geom of an actor overlaps.
 
-    A remote actor counts at remote trees only.
+    Boxes and free bunches must overlap the box of a capsule: one that lies on a canopy for hours keeps few trees awake.
+    A remote actor counts at remote trees only. capsule_states: of the last step of each tree.
     """
     block = wp.tid()
     for actor in range(actors.count[0]):
@@ -239,4 +256,7 @@ def mark_near_trees(
                 if counts and not is_near_out[tree] and not aabbs_disjoint(low, high, actor_low, actor_high):
                     for g in range(actors.start[actor], actors.start[actor + 1]):
                         if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
-                            is_near_out[tree] = True
+                            if not actors.may_sleep[actor] or overlaps_capsule(
+                                geom_states.low[g], geom_states.high[g], tree, capsules, trees, capsule_states
+                            ):
+                                is_near_out[tree] = True

@@ -35,7 +35,14 @@ VELOCITY_LSB = 1e-5
 FINGER_SCALE = 255.0
 """Quantisation steps from a straight finger (0) to a fully bent one (1)."""
 
+MAX_REACH = 2.5
+"""Farthest head, hand or foot from the hips [m]: a person of 2.2 m reaches 1.5 m. GUESSED."""
+
+MAX_SPEED = 40.0
+"""Fastest point of a person [m/s]; the hand of one who throws reaches 25 m/s. GUESSED."""
+
 _POINTS = len(POINT_NAMES)
+_HIPS, _BODY = POINT_NAMES.index("hips"), slice(1, None)
 
 _HUMAN = struct.Struct(f"<3f{6 * _POINTS - 3}h2H{6 * _POINTS}bB10B")
 
@@ -100,6 +107,10 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
     points[:, 3:] = quaternion(turn)
     speeds, rest = np.array(scales[2 : 2 + 6 * _POINTS], float), scales[2 + 6 * _POINTS :]
     velocity = speeds.reshape(_POINTS, 2, 3) * (VELOCITY_LSB * np.array(scales[:2], float))[:, None]
+    if np.linalg.norm(points[_BODY, :3] - points[_HIPS, :3], axis=1).max() > MAX_REACH:
+        raise MessageError(f"human pose with a point more than {MAX_REACH} m from the hips")
+    if np.linalg.norm(velocity[:, 0], axis=1).max() > MAX_SPEED:
+        raise MessageError(f"human pose with a point faster than {MAX_SPEED} m/s")
     flags, bends = rest[0], [bend / FINGER_SCALE for bend in rest[1:]]
     if flags >= 1 << len(_FLAGS):
         raise MessageError("human pose with unknown flags")

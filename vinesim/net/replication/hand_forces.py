@@ -26,11 +26,11 @@ SEND_PERIOD = 1.0 / 60.0
 MAX_AGE = 0.1
 """A wrench is applied for so long after it arrived [s], unless a newer one does."""
 
-MAX_PERSON_FORCE = 200.0
-"""Largest sum of the forces of a person's two hands [N]: 100 N each (CANOPIES D6.4, section 3.1.1)."""
+HAND_FORCE = 100.0
+"""Largest force of one hand [N] (CANOPIES D6.4, section 3.1.1)."""
 
-MAX_PERSON_MOMENT = 200.0
-"""Largest sum of their moments about centres of mass [N m]: those forces at a lever of 1 m. GUESSED."""
+HAND_LEVER = 1.0
+"""Lever of that force about the centre of mass of a link [m], which bounds the moment. GUESSED."""
 
 MAX_PUSHING_PEOPLE = 4
 """All people together push a robot no harder than so many of them. GUESSED."""
@@ -58,27 +58,44 @@ class _PushedRobot:
     """The last message was not empty."""
 
 
-def limit(wrenches: dict[str, np.ndarray], people: int = 1) -> tuple[dict[str, np.ndarray], bool]:
-    """Wrenches [6] by link, all reduced alike to what the hands of so many people can do; whether that was needed."""
+def limit(wrenches: dict[str, np.ndarray], hands: int, hand_force: float) -> tuple[dict[str, np.ndarray], bool]:
+    """Wrenches [6] by link, all reduced alike to what so many hands of ``hand_force`` [N] can do; whether that was
+    needed."""
     force = sum(float(np.linalg.norm(wrench[:3])) for wrench in wrenches.values())
     moment = sum(float(np.linalg.norm(wrench[3:])) for wrench in wrenches.values())
-    excess = max(force / MAX_PERSON_FORCE, moment / MAX_PERSON_MOMENT) / people
+    excess = max(force, moment / HAND_LEVER) / (max(hands, 1) * hand_force)
     if excess <= 1.0:
         return wrenches, False
     return {link: wrench / excess for link, wrench in wrenches.items()}, True
 
 
-def is_within_reach(update: HumanUpdate, centre: np.ndarray | None) -> bool:
-    """Whether a hand of a person can touch a link with this centre of mass [3] m; None: there is no such link."""
+def hands_within_reach(update: HumanUpdate, centre: np.ndarray | None) -> frozenset[str]:
+    """Hands of a person that can touch a link with this centre of mass [3] m; None: there is no such link."""
     if centre is None:
-        return False
-    return min(float(np.linalg.norm(hand[:3] - centre)) for hand in (update.pose.left, update.pose.right)) <= REACH
+        return frozenset()
+    hands = {"left": update.pose.left, "right": update.pose.right}
+    return frozenset(side for side, hand in hands.items() if np.linalg.norm(hand[:3] - centre) <= REACH)
+
+
+def limit_by_hands(
+    wrenches: dict[str, np.ndarray], reach: dict[str, frozenset[str]], hand_force: float
+) -> tuple[dict[str, np.ndarray], bool]:
+    """Wrenches [6] by link, reduced to what the hands within ``reach`` of each link can do, and all of them together;
+    whether that was needed."""
+    is_limited = False
+    for link, wrench in wrenches.items():
+        reduced, is_reduced = limit({link: wrench}, len(reach[link]), hand_force)
+        wrenches, is_limited = wrenches | reduced, is_limited or is_reduced
+    wrenches, is_reduced = limit(wrenches, len(frozenset().union(*reach.values())), hand_force)
+    return wrenches, is_limited or is_reduced
 
 
 class WrenchSync:
     """Wrenches of the own hands on others' robots, and of others' hands on the own robot."""
 
-    def __init__(self, bus: Bus, name: str, counters: Counters) -> None:
+    def __init__(self, bus: Bus, name: str, counters: Counters, hand_force: float = HAND_FORCE) -> None:
+        """``hand_force`` [N]: limit of each hand."""
+        self._hand_force = hand_force
         self._bus, self._name, self._counters = bus, name, counters
         self._pushed: dict[str, _PushedRobot] = {}
         self._received: dict[str, tuple[float, WrenchMessage]] = {}
@@ -98,13 +115,12 @@ class WrenchSync:
         if sender.name in self._received and message.time <= self._received[sender.name][1].time:
             self._counters.dropped += 1
             return
-        reached = {}
+        reach: dict[str, frozenset[str]] = {}
         if isinstance(pose, HumanUpdate):
-            reached = {
-                link: wrench for link, wrench in message.wrenches.items() if is_within_reach(pose, link_centre(link))
-            }
+            reach = {link: hands_within_reach(pose, link_centre(link)) for link in message.wrenches}
+        reached = {link: wrench for link, wrench in message.wrenches.items() if reach.get(link)}
         self._counters.wrenches_refused += len(message.wrenches) - len(reached)
-        reached, is_limited = limit(reached)
+        reached, is_limited = limit_by_hands(reached, {link: reach[link] for link in reached}, self._hand_force)
         self._counters.wrenches_limited += is_limited
         self._received[sender.name] = now, WrenchMessage(message.time, reached)
 
@@ -122,7 +138,7 @@ class WrenchSync:
                 continue
             for link, wrench in message.wrenches.items():
                 links[link] = links.get(link, 0.0) + wrench
-        links, is_limited = limit(links, MAX_PUSHING_PEOPLE)
+        links, is_limited = limit(links, 2 * MAX_PUSHING_PEOPLE, self._hand_force)
         self._counters.wrenches_limited += is_limited
         return links
 
@@ -146,7 +162,7 @@ class WrenchSync:
             if now < robot_state.due - 1e-9:
                 continue
             mean = {link: total / robot_state.ticks for link, total in robot_state.total.items()}
-            payload = encode_wrenches(WrenchMessage(time, limit(mean)[0]))
+            payload = encode_wrenches(WrenchMessage(time, limit(mean, 2, self._hand_force)[0]))
             robot_state.due = max(robot_state.due, now - SEND_PERIOD) + SEND_PERIOD
             robot_state.total, robot_state.ticks, robot_state.is_active = {}, 0, bool(mean)
             if robot_state.publisher.put(payload):

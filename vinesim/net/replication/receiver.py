@@ -22,7 +22,7 @@ from vinesim.net.replication.early_messages import EarlyMessages
 from vinesim.net.replication.hand_forces import MAX_POSE_AGE, LinkCentre
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.model_check import check_record, check_tree_states
-from vinesim.net.replication.replication_state import ReplicationState, put_counted
+from vinesim.net.replication.replication_state import SPECTATOR, ReplicationState, put_counted
 from vinesim.net.transport.bus import Reply
 from vinesim.scene.values import Coupling, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 
@@ -98,6 +98,7 @@ class Receiver:
         for key, payload in early + state.bus.poll():
             self._dispatch(key, payload, step)
         state.counters.lost, state.counters.network_failures = state.bus.dropped, state.bus.failures
+        state.counters.foreign = state.bus.foreign
         state.ownership.expire(time)
         inbox.released = state.ownership.released()
         for object_id in inbox.released:
@@ -130,6 +131,8 @@ class Receiver:
                 counters.dropped += self._keep_early(sender, key, payload) if family == "fact" else 1
             return
         try:
+            if family != "a" and peer is not None and peer.hello.kind == SPECTATOR:
+                raise MessageError(f"a spectator publishes only its pose, not {key!r}")
             if family == "a":
                 assert peer is not None
                 counters.dropped += not peer.receive(decode_pose(payload, sender), step.time)

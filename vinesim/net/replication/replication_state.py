@@ -26,12 +26,14 @@ SPECTATOR = "spectator"
 class ReplicationState:
     """The replicated state as one actor knows it."""
 
-    def __init__(self, bus: Bus, hello: Hello, model: Model, interest_radius: float, jitter_buffer: float) -> None:
+    def __init__(
+        self, bus: Bus, hello: Hello, model: Model, interest_radius: float, jitter_buffer: float, hand_force: float
+    ) -> None:  # fmt: skip
         self.bus, self.hello, self.model = bus, hello, model
         self.cells = CellChannels(bus, interest_radius)
         self.counters = Counters()
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
-        self.wrench_sync = WrenchSync(bus, hello.name, self.counters)
+        self.wrench_sync = WrenchSync(bus, hello.name, self.counters, hand_force)
         self.coupling_sync = CouplingSync(bus, hello.name, model, self.counters)
         self.ownership = Ownership(hello.name, self.peers.known)
         self.retained = RetainedSync(bus, self.counters)

@@ -21,7 +21,7 @@ from vinesim.net.counters import Counters
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.clock_sync import STEP_THRESHOLD
-from vinesim.net.replication.hand_forces import LinkCentre
+from vinesim.net.replication.hand_forces import HAND_FORCE, LinkCentre
 from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
 from vinesim.net.replication.sender import LocalStep, Sender
@@ -41,17 +41,18 @@ class Replicator:
 
     def __init__(
         self, bus: Bus, hello: Hello, model: Model, *, interest_radius: float = interest.INTEREST_RADIUS,
-        jitter_buffer: float = 0.0,
+        jitter_buffer: float = 0.0, hand_force: float = HAND_FORCE,
     ) -> None:  # fmt: skip
         """``interest_radius`` [m]: peers nearer than this to an object receive its states; at most 5 m.
 
         ``jitter_buffer`` [s]: delay with which poses of peers are shown (:mod:`vinesim.net.replication.jitter_buffer`).
+        ``hand_force`` [N]: limit of each hand of a peer that pushes this robot.
         Raises ValueError if the hello has another name than the bus.
         """
         if hello.name != bus.name:
             raise ValueError(f"greeting of {hello.name!r} on the bus of {bus.name!r}: one actor has one name")
         self.bus, self.hello, self.model = bus, hello, model
-        self._state = ReplicationState(bus, hello, model, interest_radius, jitter_buffer)
+        self._state = ReplicationState(bus, hello, model, interest_radius, jitter_buffer, hand_force)
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
         self._last_sent = -1e9

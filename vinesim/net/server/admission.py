@@ -35,6 +35,8 @@ class AdmissionControl:
         self._pinned: set[str] = set()
         self._alive: dict[tuple[str, str], set[str]] = {}
         self._admitted: dict[tuple[str, str], tuple[str, float]] = {}
+        self._spectators: set[tuple[str, str]] = set()
+        """Those of the admitted who publish no records."""
         self.joined = 0
         """Number of joins since the start."""
         self.refused = 0
@@ -71,6 +73,16 @@ class AdmissionControl:
             del self._admitted[actor]
         self._forget(world)
 
+    def may_publish(self, world: str, name: str, session: str) -> bool:
+        """Whether records under this name come from the session that was admitted with it, and not as a spectator.
+
+        Until an actor is admitted again by a server that was restarted: from the only session with this name.
+        """
+        actor = (world, name)
+        if actor in self._admitted:
+            return self._admitted[actor][0] == session and actor not in self._spectators
+        return self._alive.get(actor) == {session}
+
     def decide(self, world: str, name: str, session: str, greeting: bytes, now: float) -> Welcome:
         """Decide about an encoded hello under this name at ``now`` [s]; repeated queries are allowed."""
         for actor, (admitted_session, since) in list(self._admitted.items()):
@@ -90,6 +102,7 @@ class AdmissionControl:
         else:
             if not reason:
                 self._admitted[world, name] = (session, now)
+                (self._spectators.add if hello.kind == "spectator" else self._spectators.discard)((world, name))
                 self._scenes.setdefault(world, SceneId(hello.scene, hello.digest))
         self.refused += bool(reason)
         return Welcome(reason, *self.scene_of(world))

@@ -231,15 +231,18 @@ class RetainedStore:
 
     def _recover(self) -> None:
         """After a disk error: try to write everything again."""
-        error, self.status_message = self.status_message, ""
+        error = self.status_message
         for world, records in list(self._states.items()):
             if (journal := self._journals.get(world)) is not None:
-                self._try_write(journal.rewrite)
+                write = journal.rewrite
             elif len(records):
-                self._try_write(functools.partial(self._open_journal, world))
-        if self.status_message:
-            self.status_message = error
-        else:
+                write = functools.partial(self._open_journal, world)
+            else:
+                continue
+            if not self._try_write(write):
+                return
+        if self.status_message == error:
+            self.status_message = ""
             log.warning("records are written again")
 
     def _ingest_guarded(self, key: str, payload: bytes) -> str:
@@ -321,14 +324,16 @@ class RetainedStore:
         path = self._folder / f"{world}{SUFFIX}"
         self._journals[world] = Journal(path, world, self._scenes[world], self._states[world])
 
-    def _try_write(self, write: Callable[[], object]) -> None:
-        """Write; after an error records stay in memory until writing succeeds."""
+    def _try_write(self, write: Callable[[], object]) -> bool:
+        """Write; after an error records stay in memory until writing succeeds. Whether it did."""
         try:
             write()
+            return True
         except JournalError as error:
             if not self.status_message:
                 log.error("records are kept in memory only until this is mended: %s", error)
             self.status_message = str(error)
+            return False
 
     def _count_malformed(self, world: str, actor: str, reason: str) -> None:
         self.counters.malformed += 1

@@ -23,7 +23,7 @@ from vinesim.net.replication.interest import Cell
 from vinesim.net.server.admission import AdmissionControl, SceneId
 from vinesim.net.server.retained_store import Quota, RetainedStore
 from vinesim.net.transport import endpoints
-from vinesim.net.transport.access_control import SERVER, acl_config, tls_config
+from vinesim.net.transport.access_control import SERVER, acl_config, server_answers_config, tls_config
 from vinesim.net.transport.bus import BusError
 from vinesim.net.transport.zenoh_bus import ROOT, WORLD
 from vinesim.net.transport.zenoh_session import close_session, config, open_session
@@ -82,7 +82,7 @@ class Server:
                 f"a server linked to {linked[0]} only carries: give --state-dir, --scene and --max-clients "
                 "to the one server that connects to no other"
             )
-        settings: dict[str, Any] = {}
+        settings: dict[str, Any] = {} if linked else server_answers_config(ROOT)
         if certificates is not None:
             from vinesim.net.transport.certificates import roles
 
@@ -95,6 +95,8 @@ class Server:
         """Time of day [s] at the origin of the monotonic clock: a later step of the time of day moves no world."""
         self.pings = 0
         """Queries of the clock."""
+        self.foreign = 0
+        """Messages with records under the name of another session."""
         self._malformed = 0
         self._admission = AdmissionControl(scene, max_actors)
         self._lock = threading.Lock()
@@ -158,6 +160,7 @@ class Server:
             "refused": self._admission.refused,
             "pings": self.pings,
             "malformed": self.malformed,
+            "foreign": self.foreign,
         }
         if self.store is not None:
             counters = self.store.counters
@@ -203,9 +206,20 @@ class Server:
         log.info("%s/%s %s", world, name, "came" if is_live else "left")
 
     def _on_record(self, sample: zenoh.Sample) -> None:
-        if sample.kind == zenoh.SampleKind.PUT and self.store is not None:
-            payload = sample.payload.to_bytes() if len(sample.payload) <= messages.MAX_MESSAGE else b""
-            self.store.submit(_strip_root(sample.key_expr), payload)
+        if sample.kind != zenoh.SampleKind.PUT or self.store is None:
+            return
+        key, source = _strip_root(sample.key_expr), sample.source_info
+        world, _, rest = key.partition("/")
+        with self._lock:
+            is_own = source is not None and self._admission.may_publish(
+                world, rest.rpartition("/")[2], str(source.source_id.zid)
+            )
+        if not is_own:
+            self.foreign += 1
+            self._warn_once(key, "records of a session that did not join with this name, or as a spectator: dropped")
+            return
+        payload = sample.payload.to_bytes() if len(sample.payload) <= messages.MAX_MESSAGE else b""
+        self.store.submit(key, payload)
 
     def _on_clock_query(self, query: zenoh.Query) -> None:
         with query:
@@ -264,9 +278,12 @@ class Server:
     def _count_malformed(self, key: str, error: MessageError) -> None:
         """Count an invalid query; log the first of each key."""
         self._malformed += 1
+        self._warn_once(key, f"this question cannot be answered: {error}")
+
+    def _warn_once(self, key: str, reason: str) -> None:
         if key not in self._warned and len(self._warned) < 1000:
             self._warned.add(key)
-            log.warning("a question to %s cannot be answered (logged once): %s", key, error)
+            log.warning("%s: %s (logged once)", key, reason)
 
 
 def _open_router(

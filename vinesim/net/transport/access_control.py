@@ -65,6 +65,22 @@ def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
     }
 
 
+def server_answers_config(root: str) -> dict[str, Any]:
+    """Access control of a server without certificates under ``root`` (like ``vs/1``): what actors ask the server, no
+    other program that connects to it answers."""
+    questions = [f"{root}/*/{question}" for question in ("clock", "join/**", "snap/**")]
+    rule = {
+        "id": "answers of the server", "permission": "deny", "flows": ["ingress"],
+        "messages": ["declare_queryable", "reply"], "key_exprs": questions,
+    }  # fmt: skip
+    return {
+        "access_control": {
+            "enabled": True, "default_permission": "allow", "rules": [rule], "subjects": [{"id": "all"}],
+            "policies": [{"rules": [rule["id"]], "subjects": ["all"]}],
+        }
+    }  # fmt: skip
+
+
 def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
     """Access control of a router for the one world under ``root`` (like ``vs/1/vineyard``)."""
     rules: list[dict[str, Any]] = []

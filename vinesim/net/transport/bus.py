@@ -92,6 +92,8 @@ class Bus(Protocol):
         """Received samples that were discarded because the store was full or the sample too large."""
         ...
 
+    foreign: int
+    """Samples and replies that were dropped because their session does not hold the name they came under."""
     failures: int
     """Puts, declarations and queries that the network refused; none of them raises."""
 
@@ -112,7 +114,8 @@ class Bus(Protocol):
         ...
 
     def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> Subscription:
-        """Receive samples of other members: the last ``depth`` of each key until polled.
+        """Receive samples of other members: the last ``depth`` of each key until polled. A sample under the name of an
+        actor comes from the session that holds this name (:mod:`vinesim.net.transport.name_holders`).
 
         Reliable samples need ``KEEP_ALL``: they use another session than poses.
         """

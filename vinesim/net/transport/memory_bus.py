@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Self
 
 from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Reply, SampleStore, matches
+from vinesim.net.transport.name_holders import bound_name
 
 
 class MemoryHub:
@@ -29,6 +30,8 @@ class MemoryHub:
         self.delay, self.jitter, self.loss, self.duplicated = delay, jitter, loss, duplicated
         self.down = False
         """True: partitioned. Nothing passes, and every member sees only itself."""
+        self.binds_names = True
+        """False: members may send and answer under the names of others, as if no bus checked it."""
         self.rejection_reason: Callable[[bytes], str] = lambda greeting: ""
         """Why the emulated server rejects a hello; empty: it admits the actor."""
         self._random = random.Random(seed)
@@ -93,10 +96,10 @@ class MemoryHub:
             if name == sender:
                 continue
             if reliable:
-                self._schedule(functools.partial(self._deliver, bus, key, payload), (sender, name))
+                self._schedule(functools.partial(self._deliver, bus, sender, key, payload), (sender, name))
             elif self._random.random() >= self.loss:
                 for _ in range(1 + (self.duplicated > 0.0 and self._random.random() < self.duplicated)):
-                    self._schedule(functools.partial(self._deliver, bus, key, payload))
+                    self._schedule(functools.partial(self._deliver, bus, sender, key, payload))
 
     def query(self, sender: MemoryBus, key: str, payload: bytes) -> None:
         """Send a query to every other member with a matching queryable, and its reply back."""
@@ -104,10 +107,10 @@ class MemoryHub:
         def respond(bus: MemoryBus, served_key: str) -> None:
             if not self.down and served_key in bus.queryables:
                 answer = bus.queryables[served_key](payload)
-                self._schedule(functools.partial(reply, served_key, answer))
+                self._schedule(functools.partial(reply, bus.name, served_key, answer))
 
-        def reply(served_key: str, answer: bytes) -> None:
-            if not self.down:
+        def reply(replier: str, served_key: str, answer: bytes) -> None:
+            if not self.down and not self._is_foreign(sender, replier, served_key):
                 sender.pending_replies.append((served_key, answer, self.time))
 
         for name in sorted(self._members):
@@ -132,8 +135,14 @@ class MemoryHub:
         if observer in self._visible_names:
             (self._visible_names[observer].add if there else self._visible_names[observer].discard)(name)
 
-    def _deliver(self, bus: MemoryBus, key: str, payload: bytes) -> None:
-        if not self.down:
+    def _is_foreign(self, bus: MemoryBus, source: str, key: str) -> bool:
+        """Whether a member sends under another's name; then it is counted."""
+        is_foreign = self.binds_names and bound_name(key) not in ("", source)
+        bus.foreign += is_foreign
+        return is_foreign
+
+    def _deliver(self, bus: MemoryBus, source: str, key: str, payload: bytes) -> None:
+        if not self.down and not self._is_foreign(bus, source, key):
             bus.deliver(key, payload)
 
 
@@ -173,7 +182,7 @@ class MemoryBus:
 
     def __init__(self, hub: MemoryHub, name: str) -> None:
         self.hub, self.name = hub, name
-        self.bytes_in = self.bytes_out = self.failures = 0
+        self.bytes_in = self.bytes_out = self.failures = self.foreign = 0
         self.queryables: dict[str, Callable[[bytes], bytes]] = {}
         self.pending_replies: list[tuple[str, bytes, float]] = []
         self._store = SampleStore()

@@ -37,13 +37,20 @@ class ServerAdmission:
         """The server of this world is there, or there never was one."""
         self.rejection = ""
         """Empty, or why a server that was restarted rejects this actor."""
+        self._servers: frozenset[str] | None = None
+        """The session that admitted this actor, if any did; None: it has not joined."""
         self._declared: list[object] = []
+
+    def is_server(self, replier: zenoh.EntityGlobalId | None) -> bool:
+        """Whether answers for all actors (clock, retained records) count from here: from the server that admitted this
+        one; from any for a program that never joins."""
+        return self._servers is None or (replier is not None and str(replier.zid) in self._servers)
 
     def join(self, hello: bytes) -> None:
         """Send an encoded hello; :class:`JoinRejected` if a server rejects it. Without a server nothing happens."""
         welcomes = self._query(hello)
-        if any(welcome.refused for welcome in welcomes):
-            raise JoinRejected(next(welcome.refused for welcome in welcomes if welcome.refused))
+        if welcomes and welcomes[0].refused:
+            raise JoinRejected(welcomes[0].refused)
         if not welcomes and self._is_secured:
             raise JoinRejected(
                 f"the server at {self._endpoint} refuses actors named {self._name!r}: its folder of certificates must "
@@ -72,28 +79,37 @@ class ServerAdmission:
         again, behind what else the thread has to do, as long as the server is announced.
         """
         welcomes = self._query(hello)
-        if not welcomes and has_match(querier):
-            time.sleep(RETRY_PERIOD)
-            self._submit(lambda: self._join_again(querier, hello))
+        if not welcomes:
+            if has_match(querier):
+                time.sleep(RETRY_PERIOD)
+                self._submit(lambda: self._join_again(querier, hello))
             return
-        self.rejection = next((welcome.refused for welcome in welcomes if welcome.refused), "")
+        self.rejection = welcomes[0].refused
         if self.rejection:
             log.error("%s: the server that came back rejects this actor: %s", self._name, self.rejection)
 
     def _query(self, hello: bytes) -> list[messages.Welcome]:
-        """Replies of all servers; an unreadable reply counts as a rejection."""
+        """Replies of all servers, first the one that counts; an unreadable reply counts as a rejection."""
         replies = self._session.get(
             self._key, payload=hello, timeout=CONNECT_TIMEOUT, consolidation=zenoh.ConsolidationMode.NONE
         )
-        answers = [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]
+        found = {
+            str(reply.replier_id.zid): reply.ok.payload.to_bytes()
+            for reply in replies
+            if reply.ok is not None and reply.replier_id is not None
+        }
+        known, routers = self._servers or frozenset(), {str(router) for router in self._session.info.routers_zid()}
+        order = sorted(found, key=lambda zid: (zid not in routers, zid not in known, zid))
+        self._servers = frozenset(order[:1]) or known
+        return [self._decode(found[zid]) for zid in order]
+
+    def _decode(self, answer: bytes) -> messages.Welcome:
         try:
-            return [messages.decode_welcome(answer) for answer in answers]
+            return messages.decode_welcome(answer)
         except messages.WrongVersion as error:
-            return [
-                messages.Welcome(
-                    f"the server at {self._endpoint} speaks protocol version {error.theirs}, {self._name!r} version "
-                    f"{messages.PROTOCOL}: use the same release of vinesim"
-                )
-            ]
+            return messages.Welcome(
+                f"the server at {self._endpoint} speaks protocol version {error.theirs}, {self._name!r} version "
+                f"{messages.PROTOCOL}: use the same release of vinesim"
+            )
         except messages.MessageError as error:
-            return [messages.Welcome(f"the reply of the server at {self._endpoint} cannot be decoded: {error}")]
+            return messages.Welcome(f"the reply of the server at {self._endpoint} cannot be decoded: {error}")

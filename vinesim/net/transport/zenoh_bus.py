@@ -26,6 +26,7 @@ from vinesim.net.codec import messages
 from vinesim.net.transport.access_control import tls_config
 from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore
 from vinesim.net.transport.endpoints import Endpoint, client_links
+from vinesim.net.transport.name_holders import NameHolders, bound_name
 from vinesim.net.transport.zenoh_admission import ServerAdmission
 from vinesim.net.transport.zenoh_entities import BusPublisher, BusSubscription
 from vinesim.net.transport.zenoh_session import (
@@ -87,15 +88,12 @@ class ZenohBus:
         links = client_links(connect, secured=certificates is not None)
         self._credentials = {} if certificates is None else tls_config(certificates, name)
         self.name, self.world, self.endpoint = name, world, str(links.bulk)
-        self.bytes_in = self.bytes_out = self._oversized = self.failures = 0
+        self.bytes_in = self.bytes_out = self._oversized = self.failures = self.foreign = 0
         self._put_count = self._put_bytes = self._sent_count = self._sent_bytes = 0
         self._prefix = f"{ROOT}/{world}/"
         self._store = SampleStore()
         self._replies: collections.deque[tuple[str, bytes, float]] = collections.deque()
-        self._sessions_of: dict[str, set[str]] = {}
-        self._own_name = frozenset((name,)) if live else frozenset()
-        self._alive = self._own_name
-        self._lock = threading.Lock()
+        self._names = NameHolders(frozenset((name,) if live else ()))
         self._lost_endpoints: set[str] = set()
         """Endpoints that are not connected now."""
         self._datagram_endpoint = links.live
@@ -108,6 +106,8 @@ class ZenohBus:
         self.unreliable: set[BusPublisher | BusSubscription] = set()
         """Publishers and subscriptions of the pose session."""
         self._session = self._pose_session = open_client(links.bulk, self._credentials)
+        self.source = zenoh.SourceInfo(self._session.id, 0)
+        """Stated with every sample, also of the session of poses: the session that holds the name."""
         self._admission = ServerAdmission(
             self._session, self._prefix, name=name, world=world, endpoint=self.endpoint,
             is_secured=certificates is not None, submit=self.submit,
@@ -118,9 +118,8 @@ class ZenohBus:
                 self._watch_connection(self._session, self.endpoint),
                 *([self._claim_name()] if live else []),
             ]
-            for reply in liveliness.get(f"{self._prefix}live/*/*", timeout=CONNECT_TIMEOUT):
-                if reply.ok is not None:
-                    self._update_liveliness(str(reply.ok.key_expr), True)
+            tokens = liveliness.get(f"{self._prefix}live/*/*", timeout=CONNECT_TIMEOUT)
+            self._names.start([_token(reply.ok.key_expr) for reply in tokens if reply.ok is not None])
             self._declared.append(
                 liveliness.declare_subscriber(f"{self._prefix}live/*/*", self._on_liveliness, history=True)
             )
@@ -250,14 +249,21 @@ class ZenohBus:
         return session.info.declare_transport_events_listener(on_event)
 
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
-        self._update_liveliness(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+        self._names.update(*_token(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-    def _update_liveliness(self, key: str, is_live: bool) -> None:
-        name, session = key.split("/")[-2:]
-        with self._lock:
-            sessions = self._sessions_of.setdefault(name, set())
-            (sessions.add if is_live else sessions.discard)(session)
-            self._alive = frozenset(name for name, sessions in self._sessions_of.items() if sessions) | self._own_name
+    def _is_foreign(self, key: str, source: zenoh.EntityGlobalId | None) -> bool:
+        """Whether what arrived under a key is of another session than the one that holds its name; then it is
+        counted."""
+        name = bound_name(key)
+        if not name or (source is not None and str(source.zid) == self._names.holder(name)):
+            return False
+        self.foreign += 1
+        if self.foreign == 1:
+            log.warning(
+                "%s: dropped %s, of a session that does not hold the name %r, further ones only counted",
+                self.name, key[:100], name[:50],
+            )  # fmt: skip
+        return True
 
     # ------------------------------------------------------------ the bus
 
@@ -301,12 +307,12 @@ class ZenohBus:
         skip = len(self._prefix)
 
         def store(sample: zenoh.Sample) -> None:
-            size = len(sample.payload)
+            size, source, key = len(sample.payload), sample.source_info, str(sample.key_expr)[skip:]
             self.bytes_in += size
             if size > messages.MAX_MESSAGE:
                 self._oversized += 1
-            else:
-                self._store.put(depth, str(sample.key_expr)[skip:], sample.payload.to_bytes())
+            elif not self._is_foreign(key, source.source_id if source is not None else None):
+                self._store.put(depth, key, sample.payload.to_bytes())
 
         def declare(session: zenoh.Session) -> zenoh.Subscriber:
             return session.declare_subscriber(self._prefix + pattern, store, allowed_origin=zenoh.Locality.REMOTE)
@@ -321,11 +327,16 @@ class ZenohBus:
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None and len(reply.ok.payload) <= messages.MAX_MESSAGE:
-                arrived = time.monotonic()
+                arrived, reply_key = time.monotonic(), str(reply.ok.key_expr)[skip:]
+                if bound_name(reply_key):
+                    is_foreign = self._is_foreign(reply_key, reply.replier_id)
+                else:
+                    is_foreign = not self._admission.is_server(reply.replier_id)
+                    self.foreign += is_foreign
                 if len(self._replies) >= MAX_PENDING_REPLIES:
                     self._oversized += 1
-                else:
-                    self._replies.append((str(reply.ok.key_expr)[skip:], reply.ok.payload.to_bytes(), arrived))
+                elif not is_foreign:
+                    self._replies.append((reply_key, reply.ok.payload.to_bytes(), arrived))
 
         # Zenoh's own choice would keep one reply of a key: a snapshot comes in several
         no_consolidation = zenoh.ConsolidationMode.NONE
@@ -354,7 +365,7 @@ class ZenohBus:
         self._declared.append(self._session.declare_queryable(self._prefix + key, on_query))
 
     def alive(self) -> frozenset[str]:
-        return self._alive
+        return self._names.live
 
     def submit(self, task: Callable[[], object]) -> None:
         """Run a function that may block, in order, in the bus's own thread."""
@@ -426,3 +437,9 @@ class ZenohBus:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _token(key: zenoh.KeyExpr) -> tuple[str, str]:
+    """Name and session of a liveliness token."""
+    name, session = str(key).split("/")[-2:]
+    return name, session

@@ -49,11 +49,11 @@ class BusPublisher:
         if publisher is None or not self.matching:
             return False
         if self._reliable:
-            if not self._bus.submit_put(lambda: publisher.put(payload), len(payload)):
+            if not self._bus.submit_put(lambda: publisher.put(payload, source_info=self._bus.source), len(payload)):
                 return False
         else:
             try:
-                publisher.put(payload)
+                publisher.put(payload, source_info=self._bus.source)
             except zenoh.ZError as error:
                 self._fail(error)
                 return False

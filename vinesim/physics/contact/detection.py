@@ -85,19 +85,20 @@ class ContactDetection:
     # ------------------------------------------------------------------ broadphase
 
     def update_tree_bounds(self, trees: np.ndarray) -> None:
-        """Bring the boxes of some trees [k], and of their blocks, up to the poses of their bodies.
-
-        All awake trees are then compared anew with those that sleep.
-        """
+        """Bring the boxes of some trees [k], and of their blocks, up to the poses of their bodies."""
         self.arrays.trees.awake[: len(trees)] = trees
         self._launch_over_trees(len(trees), self._tree_aabbs)
-        self._clearances.distance[:] = -1.0
+        self.compare_anew()
         self._update_blocks(np.unique(trees // AABB_BLOCK))
 
     def _update_blocks(self, blocks: np.ndarray) -> None:
         """Bring the boxes of some blocks [k] up to those of their trees."""
         self._blocks[: len(blocks)] = blocks
         self._block_aabbs(len(blocks))
+
+    def compare_anew(self) -> None:
+        """Compare all capsules of awake trees with the sleeping ones in the next step, however little they move."""
+        self._clearances.distance[:] = -1.0
 
     def find_near_trees(self) -> np.ndarray:
         """Trees [k] whose box a geom of an actor overlaps within the step."""
@@ -199,7 +200,7 @@ class ContactDetection:
         )
         self._mark_near_trees = bind_launch(
             broadphase.mark_near_trees,
-            [actors, trees, block_boxes, tree_boxes, actor_boxes, geom_states],
+            [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
             [share(self._is_near, wp.bool)],
         )
         self._find_reached_trees = bind_launch(

@@ -23,16 +23,20 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.errors import checked_index
+from vinesim.kernels.articulation.first_mode import MAX_SUBSTEPS, substeps_for
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
 from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
+from vinesim.physics.plants.remote_pose import blend_towards
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
 from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+
+_NO_TREES = np.zeros(0, np.int32)
 
 
 class ArticulationSolver:
@@ -56,6 +60,7 @@ class ArticulationSolver:
         fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
+        substeps: divide the step of trees whose first mode is too fast for it; off only to compare with other solvers.
         buffers: where arrays live, instead of what ``device`` says.
     """
 
@@ -73,6 +78,7 @@ class ArticulationSolver:
         max_rate: float | None = None,
         fault_rate: float | None = None,
         geometric_stiffness: bool = True,
+        substeps: bool = True,
         buffers: DeviceBuffers | None = None,
     ) -> None:
         p = parameters
@@ -101,9 +107,12 @@ class ArticulationSolver:
             weakref.finalize(self, self.thread_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
         self._onset_steps = numbers["contact_steps"] - 1
-        self.launches = KernelLaunches(self, numbers, threads)
+        self.launches = KernelLaunches(self, numbers, threads, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
-        self._runner = StepRunner(buffers, self.launches, model.tree_size, self._stepping, self.thread_pool)
+        self._runner = StepRunner(
+            buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
+            tree_rate=self.tree_rate, stepping=self._stepping, floating=self._floating, thread_pool=self.thread_pool,
+        )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self.berry_clusters = BerryClusters(self)
@@ -124,6 +133,8 @@ class ArticulationSolver:
         """phi of each tree's last ``predict()`` [tree]."""
         self.tree_rate = np.zeros(trees, np.float32)
         """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
+        self.tree_substeps = np.ones(trees, np.int32)
+        """Into how many substeps the step of each awake tree is divided while nothing touches it [tree]."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -151,7 +162,7 @@ class ArticulationSolver:
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
         self._floating, self._roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
-        self._euler_steps = np.zeros(trees, np.int32)
+        self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
         self._last_contact = np.full(trees, -2, np.int64)  # tick of the last contact
         self._loaded_bodies = np.zeros(0, np.int32)
         self._stepping, self._subset = np.zeros(trees, np.int32), np.zeros(trees, np.int32)
@@ -171,7 +182,8 @@ class ArticulationSolver:
         return {
             wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
                        "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
-                       "tree_euler_steps": self._euler_steps, "floating": self._floating},
+                       "tree_euler_steps": self._euler_steps, "tree_steps": self._steps,
+                       "tree_substeps": self.tree_substeps, "floating": self._floating},
             float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
                     "tie_damping": ties.damping, "tree_phi": self.phi, "phi_used": self.phi_used,
                     "tree_rate": self.tree_rate},
@@ -298,16 +310,13 @@ class ArticulationSolver:
         """
         self._checked, launches = None, self.launches
         self._runner.list_trees(self._awake)
-        launches.upload_changed()
         if trees is None:
-            count = len(self._runner.stepped)
-            launches.upload_step(count)
+            launches.upload_step(count := len(self._runner.stepped))
             self._runner.predict()
             launches.download_prediction(count)
         else:
-            count = len(trees)
             self.list_subset(trees)
-            launches.upload_subset_step(count)
+            launches.upload_subset_step(count := len(trees))
             launches.predict_subset(count)
             launches.download_subset_prediction(count)
         self.buffers.synchronize()
@@ -332,9 +341,10 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, count, changed = self.launches, len(self._runner.stepped), len(self._loaded_bodies) > 0
+        launches, touched, changed = self.launches, _NO_TREES, len(self._loaded_bodies) > 0
+        count = len(self._runner.stepped)
         self._wrench[self._loaded_bodies] = 0.0
-        self._loaded_bodies = np.zeros(0, np.int32)
+        self._loaded_bodies = _NO_TREES
         if bodies is not None and len(bodies):
             self._require_stepped(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
@@ -348,19 +358,18 @@ class ArticulationSolver:
             self._last_contact[touched] = self.tick
         elif changed:
             launches.upload_wrenches(count)
-        self._runner.integrate(self._list_floating_roots())
+        self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)
         self.buffers.synchronize()
         self.tick += 1
 
-    def _list_floating_roots(self) -> int:
-        """List the floating roots that this step moves; how many there are."""
+    def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
+        """The floating roots that this step moves: where kernels find them, and their trees."""
         if len(self._roots) == 0:
-            return 0
+            return _NO_TREES, _NO_TREES
         tree = self.model.body_tree[self._roots]
         roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
-        self._floating[: len(roots)] = self.buffers.slots[roots]
-        return len(roots)
+        return self.buffers.slots[roots], self.model.body_tree[roots]
 
     def advance(self, steps: int) -> None:
         """Many steps of the awake trees with nothing in between: no contacts, no sleep, no fault guard.
@@ -371,21 +380,21 @@ class ArticulationSolver:
         ``fault_rate``).
         """
         self._runner.list_trees(self._awake)
-        floating = self._list_floating_roots()
+        floating = self._floating_roots()
         if len(self._loaded_bodies) and steps > 0:  # the next prediction still knows the last contacts
-            self._runner.advance(1, floating)
+            self._runner.predict()
             self._wrench[self._loaded_bodies] = 0.0
-            self._loaded_bodies = np.zeros(0, np.int32)
+            self._loaded_bodies = _NO_TREES
             self.launches.upload_wrenches(len(self._runner.stepped))
-            self._runner.advance(steps - 1, floating)
+            self._runner.integrate(_NO_TREES, *floating)
+            self._runner.advance(steps - 1, *floating)
         else:
-            self._runner.advance(steps, floating)
+            self._runner.advance(steps, *floating)
         self.tick += steps
 
     def upload(self) -> None:
         """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
         self._runner.list_trees(self._awake)
-        self.launches.upload_changed()
         self.launches.upload_step(len(self._runner.stepped))
         self.buffers.synchronize()
 
@@ -433,20 +442,7 @@ class ArticulationSolver:
 
     def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
-        bodies = self.model.bodies_of(tree)
-        there, rates = np.asarray(joint_q, np.float32), np.asarray(joint_qd, np.float32)
-        here = self.state.joint_q[bodies]
-        if there.shape != here.shape or rates.shape != (len(here), 3):
-            raise ValueError(f"tree {tree}: pulled by joints {there.shape}, {rates.shape}; it has {len(here)} bodies")
-        there = frames.normalize(there)
-        if not np.isfinite(there).all() or not np.isfinite(rates).all() or not (there != 0.0).any(-1).all():
-            raise ValueError(
-                f"tree {tree}: pulled to a pose that is not finite or has zero quaternions; drop the update"
-            )
-        turn = frames.log(frames.multiply(frames.conjugate(here), there))
-        self.state.joint_q[bodies] = frames.normalize(frames.multiply(here, frames.exp(blend * turn)))
-        self.state.joint_qd[bodies] = rates
-        self.state.joint_qd[bodies.start + self.tree_moving[tree] : bodies.stop] = 0.0  # what rides does not turn
+        blend_towards(self, tree, joint_q, joint_qd, blend)
 
     # ------------------------------------------------------------------ ties, wrenches, damping
 
@@ -498,6 +494,6 @@ class ArticulationSolver:
         return self.launches.joint_wrench(bodies)
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
-        """Least damping ratio that a spring mode of this frequency [Hz] can show: pi f (2 phi - 1) dt."""
+        """Least damping ratio that a first mode of this frequency [Hz] can show: pi f (2 phi - 1) dt / substeps."""
         phi = float(self.phi.max(initial=0.5)) if phi is None else phi
-        return math.pi * frequency * (2.0 * phi - 1.0) * self.dt
+        return math.pi * frequency * (2.0 * phi - 1.0) * self.dt / substeps_for(frequency, self.dt)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.articulation import structs
+from vinesim.kernels.articulation import first_mode, structs
 from vinesim.kernels.articulation.floating_components import correct_floating_momentum
 from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.articulation.integration import integrate
@@ -61,12 +61,16 @@ class KernelLaunches:
     :meth:`upload_changed` carries over when :attr:`changed` says so. Everything else a GPU reads where it is.
     """
 
-    def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], threads: int) -> None:
+    def __init__(
+        self, solver: ArticulationSolver, parameters: dict[str, float], threads: int, max_substeps: int
+    ) -> None:
         """``parameters``: numbers of :class:`vinesim.kernels.articulation.structs.SolverParameters` but gravity."""
-        self.buffers, self._threads = solver.buffers, threads
+        self.buffers, self._threads, self._max_substeps = solver.buffers, threads, max_substeps
         self._body_tree = solver.model.body_tree
         self.changed = False
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
+        self.substeps_due = False
+        """Whether they have changed since the substeps of trees were counted."""
         self._seldom: list[str] = []
         self._register_arrays(solver)
         self._record_transfers()
@@ -100,7 +104,7 @@ class KernelLaunches:
         """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
         if self.changed:
             self.buffers.upload(self._seldom)
-            self.changed = False
+            self.changed, self.substeps_due = False, True
 
     def fill(self, struct: Any, **values: Any) -> Any:
         """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named
@@ -147,15 +151,15 @@ class KernelLaunches:
         partitioned = {"index_list": "trees", "partitions": self._threads}
         self.predict, self.predict_subset = (
             record(
-                predict, parameters, self._model, trees, "tree_phi", "tree_euler_steps", self._forces, joints,
-                "phi_used",
+                predict, parameters, self._model, trees, "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
+                joints, "phi_used",
                 self._bodies, self._factors, scratch, prediction, **options,
             )
             for trees, options in (("stepping", partitioned), ("subset", {"index_list": "trees"}))
         )  # fmt: skip
         self.integrate = record(
-            integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", joints, prediction, "tree_rate",
-            "tree_euler_steps", joints, **partitioned,
+            integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
+            "tree_rate", "tree_euler_steps", joints, **partitioned,
         )  # fmt: skip
         self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
         self.apply_wrenches = record(
@@ -163,8 +167,14 @@ class KernelLaunches:
             scratch, prediction,
         )  # fmt: skip
         self.correct_floating_momentum = record(
-            correct_floating_momentum, parameters, self._model, "floating", "phi_used", "tree_rate", self._forces,
-            self._bodies, "body_acceleration", "lever", fill(s.FloatingScratch), joints,
+            correct_floating_momentum, parameters, self._model, "floating", "phi_used", "tree_rate", "tree_steps",
+            self._forces, self._bodies, "body_acceleration", "lever", fill(s.FloatingScratch), joints,
+            index_list="roots",
+        )  # fmt: skip
+
+        self.count_substeps = record(
+            first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
+            scratch, fill(s.WrenchScratch), "tree_substeps",
         )  # fmt: skip
 
     def _record_impact(self, parameters: Any) -> None:
@@ -173,8 +183,8 @@ class KernelLaunches:
         joints, scratch = fill(s.JointState), fill(s.Scratch)
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         self.factor_impact = self.record(
-            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", self._forces, joints,
-            "impact_phi",
+            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
+            joints, "impact_phi",
             self._bodies, self._factors, scratch, prediction, index_list="trees",
         )  # fmt: skip
         self.apply_impulses = self.record(
@@ -242,6 +252,6 @@ class KernelLaunches:
         buffers.add_shared("joint_bodies", self._joint_bodies, wp.int32)
         buffers.add_shared("joint_wrench", self._joint_wrench, wrench)
         self._sum_joint_wrenches = self.record(
-            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", self._forces, self._bodies,
-            "body_acceleration", "joint_wrench",
+            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", "tree_steps", self._forces,
+            self._bodies, "body_acceleration", "joint_wrench",
         )  # fmt: skip

@@ -7,6 +7,8 @@ keeps only joints, every ``checkpoint`` ticks; on the way back each segment is r
 loss is yours, in NumPy, PyTorch or by hand: :meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient`
 takes the loss's derivatives by them. docs/gradients.md shows it at work.
 
+A rollout takes whole steps, where the solver divides those of trees that swing above 5 Hz: give those a shorter ``dt``.
+
 The gradient is of the scheme as it steps, so it is exact where the scheme is smooth. It is not at the tick in which a
 joint passes ``fast_rate`` (phi becomes 1), and damping below ``(2 phi - 1) dt`` times stiffness has none: the scheme
 itself damps that much, and asking for less changes nothing.

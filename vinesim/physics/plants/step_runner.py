@@ -1,8 +1,14 @@
-"""Launches over the awake trees: dealt out to threads on a CPU, captured into a graph on a GPU."""
+"""Launches over the awake trees: dealt out to threads on a CPU, captured into a graph on a GPU.
+
+A tree whose first mode is too fast for the step takes substeps instead, of which all others see the sum:
+:mod:`vinesim.kernels.articulation.first_mode` says how many. While contacts act on it, it takes the whole step that
+they were solved for.
+"""
 
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -18,95 +24,197 @@ MIN_TREES_PER_THREAD = 16
 MIN_INTEGRATED_TREES_PER_THREAD = 100
 """[tree] The same for an integration, which is twelve times as short. MEASURED"""
 
+Levels = tuple[int, ...]
+"""How many of a list take a first, a second, a third substep."""
+
 
 class StepRunner:
     """Runs predictions and integrations of the listed trees.
+
+    The list that the kernels read has the trees of one step first, then the others, those of most substeps first.
 
     Args:
         buffers: of the solver.
         launches: of the solver; bound with as many partitions as there are threads.
         tree_size: [tree] bodies, by which trees are dealt out.
+        tree_substeps: [tree] into how many substeps each tree's step is to be divided.
+        tree_steps: [tree] into how many it is divided now, which the kernels read.
+        tree_rate: [tree] what the kernels write of each tree's speed.
         stepping: [tree] int32, the list that the kernels read.
-        thread_pool: who shares the work; none for one thread.
+        floating: [tree] int32, the floating roots that the kernels read.
+        thread_pool: threads that share the work; none for one thread.
     """
 
     def __init__(
         self,
         buffers: DeviceBuffers,
         launches: KernelLaunches,
+        *,
         tree_size: np.ndarray,
+        tree_substeps: np.ndarray,
+        tree_steps: np.ndarray,
+        tree_rate: np.ndarray,
         stepping: np.ndarray,
+        floating: np.ndarray,
         thread_pool: ThreadPool | None,
     ) -> None:
         self._buffers, self._launches, self._tree_size, self._list = buffers, launches, tree_size, stepping
+        self._substeps, self._steps_of, self._rate, self._floating = tree_substeps, tree_steps, tree_rate, floating
         self._pool, self._threads = thread_pool, 1 if thread_pool is None else thread_pool.size
         self.stepped = np.zeros(0, np.int32)
         """The trees of this step [k], sorted."""
-        self.partition_ends = [0] * (self._threads + 1)
-        """Thread i works on ``stepped[partition_ends[i] : partition_ends[i + 1]]``."""
+        self.fast = np.zeros(0, np.int32)
+        """Those of them whose step is to be divided [k], sorted."""
+        self._whole, self._levels, self._roots, self._root_levels = 0, (), 0, ()
+        self._divided = np.zeros(0, np.int32)
+        """Into how many substeps the steps of ``fast`` were divided when the list was put in order [k]."""
         self._graph: wp.Graph | None = None
-        self._graph_of = (-1, -1)
-        ends = self.partition_ends
+        self._graph_of: tuple = ()
+        self._whole_ends = [0] * (self._threads + 1)
+        """Thread i works on places ``_whole_ends[i]`` to ``_whole_ends[i + 1]`` of the trees of whole steps."""
+        self.partition_ends = [0] * (self._threads + 1)
+        """The same of all trees."""
 
-        def part(launch: Callable[..., None], i: int) -> Callable[[], None]:
+        def part(launch: Callable[..., None], ends: list[int], i: int) -> Callable[[], None]:
             return lambda: launch(ends[i + 1] - ends[i], ends[i], i)
 
         self._parts = {
-            launch: [part(launch, i) for i in range(self._threads)] for launch in (launches.predict, launches.integrate)
+            launch: [part(launch, ends, i) for i in range(self._threads)]
+            for launch, ends in ((launches.predict, self.partition_ends), (launches.integrate, self._whole_ends))
         }
 
+    # ------------------------------------------------------------------ which trees, in which order
+
     def list_trees(self, trees: np.ndarray) -> None:
-        """Step these trees [k] from now on; deal them out to the threads by their bodies."""
-        if self.stepped is trees:
+        """Step these trees [k] from now on, as the model is now; count their substeps if one of both has changed."""
+        self._launches.upload_changed()
+        if self.stepped is trees and not self._launches.substeps_due:
             return
+        self._launches.substeps_due = False
         self.stepped = trees
         self._list[: len(trees)] = trees
-        bodies = np.cumsum(self._tree_size[trees])
-        shares = np.arange(self._threads + 1) * (int(bodies[-1]) if len(trees) else 0) // self._threads
-        self.partition_ends[:] = np.searchsorted(bodies, shares, side="right").tolist()
+        self._launches.count_substeps(len(trees))
+        self._buffers.synchronize()
+        self.fast = trees[self._substeps[trees] > 1]
+        self._steps_of[trees] = 1
+        self._divided = np.ones(len(self.fast), np.int32)
+        self._order()
+
+    def _order(self) -> None:
+        """List the trees by what ``_steps_of`` says of each, and deal them out to the threads by their bodies."""
+        trees, self._whole, self._levels = _by_substeps(self.stepped, self._steps_of[self.stepped])
+        self._list[: len(trees)] = trees
+        for ends, some in ((self.partition_ends, trees), (self._whole_ends, trees[: self._whole])):
+            bodies = np.cumsum(self._tree_size[some])
+            shares = np.arange(self._threads + 1) * (int(bodies[-1]) if len(some) else 0) // self._threads
+            ends[:] = np.searchsorted(bodies, shares, side="right").tolist()
+
+    def _divide(self, touched: np.ndarray) -> None:
+        """Divide the coming step of all fast trees but those ``touched`` [k]."""
+        if len(self.fast) == 0:
+            return
+        steps = self._substeps[self.fast]
+        if len(touched):
+            steps[np.isin(self.fast, touched)] = 1
+        self._steps_of[self.fast] = steps
+        self._rate[self.fast] = 0.0
+        if not np.array_equal(steps, self._divided):
+            self._divided = steps
+            self._order()
+
+    def _list_roots(self, roots: np.ndarray, trees: np.ndarray) -> None:
+        """List floating roots [k] (places of bodies) of trees [k] as their trees are listed."""
+        order, self._roots, self._root_levels = _by_substeps(np.arange(len(roots)), self._steps_of[trees])
+        self._floating[: len(roots)] = roots[order]
+
+    # ------------------------------------------------------------------ a step
 
     def predict(self) -> None:
-        """Predict the listed trees."""
-        self._launch(self._launches.predict, MIN_TREES_PER_THREAD)
+        """Predict the listed trees over the whole step."""
+        if len(self.fast):
+            self._steps_of[self.fast] = 1
+        self._launch(self._launches.predict, len(self.stepped), MIN_TREES_PER_THREAD)
 
-    def integrate(self, floating: int) -> None:
-        """Integrate the listed trees and correct the listed floating roots."""
-        self._launch(self._launches.integrate, MIN_INTEGRATED_TREES_PER_THREAD)
-        self._launches.correct_floating_momentum(floating)
+    def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
+        """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
 
-    def _launch(self, launch: Callable[..., None], least: int) -> None:
-        """Launch over the listed trees, on all threads if there are ``least`` for each."""
-        if self._pool is None or len(self.stepped) < least * self._threads:
-            launch(len(self.stepped))
+        ``roots`` [j]: places of floating roots, of trees ``root_trees`` [j].
+        """
+        self._divide(touched)
+        self._list_roots(roots, root_trees)
+        self._launch(self._launches.integrate, self._whole, MIN_INTEGRATED_TREES_PER_THREAD)
+        self._launches.correct_floating_momentum(self._roots)
+        self._take_substeps(self._levels, self._whole, 0, self._root_levels)
+
+    def _launch(self, launch: Callable[..., None], count: int, least: int) -> None:
+        """Launch over the first trees of the list, on all threads if there are ``least`` for each."""
+        if self._pool is None or count < least * self._threads:
+            launch(count)
         else:
             self._pool.run(self._parts[launch])
 
-    def advance(self, steps: int, floating: int) -> None:
+    def _take_substeps(self, levels: Levels, first: int, partition: int, roots: Levels = ()) -> None:
+        for level, count in enumerate(levels):
+            self._launches.predict(count, first, partition)
+            self._launches.integrate(count, first, partition)
+            if level < len(roots):
+                self._launches.correct_floating_momentum(roots[level], self._roots)
+
+    # ------------------------------------------------------------------ many steps
+
+    def advance(self, steps: int, roots: np.ndarray, root_trees: np.ndarray) -> None:
         """Predict and integrate so many times without coming back in between."""
-        count, ends = len(self.stepped), self.partition_ends
+        self._divide(np.zeros(0, np.int32))
+        self._list_roots(roots, root_trees)
+        count = len(self.stepped)
         if count == 0:
             return
         if not self._buffers.device.is_cpu:
-            if self._graph is None or self._graph_of != (count, floating):
+            what = (self._whole, self._levels, self._roots, self._root_levels)
+            if self._graph is None or self._graph_of != what:
                 with wp.ScopedCapture(self._buffers.device) as capture:
-                    self._steps(1, count, floating)
-                self._graph, self._graph_of = capture.graph, (count, floating)
+                    self._steps(1)
+                self._graph, self._graph_of = capture.graph, what
             for _ in range(steps):
                 wp.capture_launch(self._graph)  # pyright: ignore[reportArgumentType]  (captured above)
             self._buffers.synchronize()
-        elif self._pool is None or count < self._threads or floating:
-            self._steps(steps, count, floating)
+        elif self._pool is None or count < self._threads or len(roots):
+            self._steps(steps)
         else:
-            parts = [(ends[i + 1] - ends[i], ends[i], i) for i in range(self._threads)]
-            self._pool.run([functools.partial(self._steps_of_part, steps, *part) for part in parts])
+            ends, jobs = self._whole_ends, []
+            for i, (first, levels) in enumerate(self._shares_of_substeps()):
+                jobs.append(
+                    functools.partial(self._steps_of_part, steps, ends[i + 1] - ends[i], ends[i], i, levels, first)
+                )
+            self._pool.run(jobs)
 
-    def _steps(self, steps: int, count: int, floating: int) -> None:
+    def _shares_of_substeps(self) -> list[tuple[int, Levels]]:
+        """For each thread where its fast trees begin in the list, and how many take each substep."""
+        fast = self._list[self._whole : len(self.stepped)]
+        ends = np.arange(self._threads + 1) * len(fast) // self._threads
+        return [(self._whole + int(a), _levels(self._steps_of[fast[a:b]])) for a, b in itertools.pairwise(ends)]
+
+    def _steps(self, steps: int) -> None:
         for _ in range(steps):
-            self._launches.predict(count)
-            self._launches.integrate(count)
-            self._launches.correct_floating_momentum(floating)
+            self._launches.predict(self._whole)
+            self._launches.integrate(self._whole)
+            self._launches.correct_floating_momentum(self._roots)
+            self._take_substeps(self._levels, self._whole, 0, self._root_levels)
 
-    def _steps_of_part(self, steps: int, count: int, first: int, partition: int) -> None:
+    def _steps_of_part(self, steps: int, count: int, first: int, partition: int, levels: Levels, fast: int) -> None:
         for _ in range(steps):
             self._launches.predict(count, first, partition)
             self._launches.integrate(count, first, partition)
+            self._take_substeps(levels, fast, partition)
+
+
+def _levels(steps: np.ndarray) -> Levels:
+    """How many of some numbers of substeps [k] are above 0, above 1, and so on."""
+    return tuple(int(np.count_nonzero(steps > level)) for level in range(int(steps.max(initial=0))))
+
+
+def _by_substeps(items: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, int, Levels]:
+    """Items [k] of so many substeps each: those of one step first, then by falling number; how many of each."""
+    whole = steps == 1
+    rest = items[~whole][np.argsort(-steps[~whole], kind="stable")]
+    return np.concatenate([items[whole], rest]), int(np.count_nonzero(whole)), _levels(steps[~whole])

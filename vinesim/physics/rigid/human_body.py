@@ -6,7 +6,7 @@ that its force follows from how far it is held back: 100 N/m up to 100 N by defa
 holds rigid objects by a weld; what is lifted hangs from the same spring. Gravity does not act on a hand itself.
 
 Head, trunk and legs are kinematic: exactly where the tracked points put them, whatever pushes them
-(``docs/decisions/hands.md``).
+(``docs/decisions/hands.md``). Those of a remote person pass through rigid bodies while its messages let them jump.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_posture import PostureSolver
 from vinesim.physics.rigid.human_shapes import BODY_PARTS, SIDES, body_shapes, hand_shapes
+from vinesim.physics.rigid.passing_parts import PassingParts
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROBOTS, contact_friction
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
@@ -69,6 +70,7 @@ class HumanBody:
         self.part_dofs = np.zeros((0, 6), int)
         """[part, 6] MuJoCo's degrees of freedom of the same."""
         self._part_q = self._hand_q = np.zeros((0, 7), int)
+        self._passing = PassingParts(len(BODY_PARTS))
         self._posture = PostureSolver(spec.height)
         self.set_pose(spec.pose)
         self._last_poses = self._poses
@@ -157,6 +159,7 @@ class HumanBody:
         self._part_q = m.jnt_qposadr[joints].astype(int)[:, None] + np.arange(7)
         self.part_dofs = m.jnt_dofadr[joints].astype(int)[:, None] + np.arange(6)
         self.bodies = dict(zip(BODY_PARTS, self.part_bodies.tolist(), strict=True))
+        self._passing.find_indices(m, self.part_bodies)
         for hand in self.hands:
             hand.find_indices(m, names, name)
             self.bodies[hand.link] = hand.body
@@ -174,7 +177,8 @@ class HumanBody:
     def apply_controls(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
         """Before a step: place the kinematic parts at its start with their velocity, and drive both hands."""
         p = self.parameters
-        if self._last_poses is not self._poses and self._has_teleported():
+        has_teleported = self._last_poses is not self._poses and self._has_teleported()
+        if has_teleported:
             self._teleport(d)
         at = d.qpos[self._hand_q]
         at[:, 3:] = frames.from_wxyz(at[:, 3:])
@@ -184,6 +188,9 @@ class HumanBody:
         way, turn, turn_within = self._posture.difference((self._last_poses, at), (self._poses, goal))
         velocity = way[:parts] / dt
         speed = np.sqrt((velocity * velocity).sum(1, keepdims=True))
+        if self.is_remote:
+            jumped = (speed[:, 0] > p.max_body_speed) | has_teleported
+            self._passing.update(m, d, self._poses[:parts, :3], jumped)
         self._place_parts(d, start)
         d.qvel[self.part_dofs[:, :3]] = velocity * np.minimum(
             1.0, p.max_body_speed / np.maximum(speed, p.max_body_speed)
