@@ -271,7 +271,13 @@ def test_a_mimicking_finger_presses_like_the_driven_one(clusters):
         reference.step()
         force.append([[force_on(ours, f)[1], reference.contact_force_on(f)[1]] for f in FINGERS])
         error = max(
-            error, float(np.linalg.norm(held_point(model, ours.snapshot().body_q[body], body) - held_point(model, reference.body_pose(body), body)))
+            error,
+            float(
+                np.linalg.norm(
+                    held_point(model, ours.snapshot().body_q[body], body)
+                    - held_point(model, reference.body_pose(body), body)
+                )
+            ),
         )
     force = np.array(force)
     for phase in (slice(150, 240), slice(400, 450)):

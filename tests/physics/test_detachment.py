@@ -105,7 +105,9 @@ def test_two_runs_are_bitwise_equal(clusters):
     assert data[0].qpos.tobytes() + data[0].qvel.tobytes() == data[1].qpos.tobytes() + data[1].qvel.tobytes()
 
 
-def pull_bunch(pull: float, bend: float, ticks: int = 400, *, clusters: bool = False) -> tuple[Physics, tuple[Detachment, ...], np.ndarray]:
+def pull_bunch(
+    pull: float, bend: float, ticks: int = 400, *, clusters: bool = False
+) -> tuple[Physics, tuple[Detachment, ...], np.ndarray]:
     """A gripper closes on a bunch and moves down: the detachments, and the peduncle's wrench tick by tick."""
     model, _, middle = bunch_scene(clusters=clusters)
     model.bunch_pull[0], model.bunch_bend[0] = pull, bend
@@ -339,7 +341,9 @@ def test_a_picked_bunch_takes_its_momentum_along_and_nothing_of_its_neighbour():
     plants.wake(0)
     physics.step()
     assert state.tree_fine[0]
-    bodies = [np.append(model.bunch_cluster[i] + np.arange(model.bunch_clusters[i]), model.bunch_body[i]) for i in (0, 1)]
+    bodies = [
+        np.append(model.bunch_cluster[i] + np.arange(model.bunch_clusters[i]), model.bunch_body[i]) for i in (0, 1)
+    ]
     for own in bodies:
         state.joint_qd[own[0]] = 0.5, 2.0, -1.0
     for _ in range(7):
