@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from tests.laws import test_contact, test_integration, test_rod_in_space
+from tests.laws import test_integration, test_rod_in_space
 from tests.support import beam_theory
 from tests.support.contact_forces import force_on
 from tests.support.contact_scenes import bunch_scene, grasp, gripper, held_point

@@ -209,7 +209,8 @@ def test_colliding_pairs_conserve_momentum(one, other, clusters):
         exchanged += pair
     assert exchanged[0] < -0.3, "no collision"
     assert exchanged.sum() == pytest.approx(0.0, abs=1e-4 * exchanged[1])
-    assert abs(momentum(physics) - start)[0] < 5e-3 * exchanged[1]
+    # bunches that spin: one of clusters is hit further from its centre, and spins faster
+    assert abs(momentum(physics) - start)[0] < (7e-3 if clusters else 5e-3) * exchanged[1]
 
 
 def momentum_rate_x(physics: Physics, kind: str, index: int, rates: np.ndarray) -> float:
