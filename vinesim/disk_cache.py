@@ -80,6 +80,23 @@ def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndar
     return arrays
 
 
+def load(name: str, digest: str) -> Arrays | None:
+    """The arrays that :func:`keep` was given; None if they are not there or broken."""
+    try:
+        return _read(folder() / f"{name}-{digest}.npz")
+    except RuntimeError as error:  # no home folder
+        _warn(error)
+        return None
+
+
+def keep(name: str, digest: str, arrays: Mapping[str, np.ndarray]) -> None:
+    """Keep arrays that came from elsewhere; if the folder cannot be written, that is said once."""
+    try:
+        _write(folder() / f"{name}-{digest}.npz", dict(arrays))
+    except RuntimeError as error:
+        _warn(error)
+
+
 def source_digest(*sources: pathlib.Path | str | bytes) -> str:
     """A digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and bytes.
 

@@ -123,6 +123,7 @@ class _SlowlyRouted:
     def __init__(self, lost: int) -> None:
         self.lost, self.queries = lost, 0
         self.matching_status = types.SimpleNamespace(matching=True)
+        self.info = types.SimpleNamespace(routers_zid=list)
 
     def zid(self) -> str:
         return "a1"
@@ -138,7 +139,8 @@ class _SlowlyRouted:
         if self.queries <= self.lost:
             return []
         payload = types.SimpleNamespace(to_bytes=lambda: messages.encode_welcome(messages.Welcome()))
-        return [types.SimpleNamespace(ok=types.SimpleNamespace(payload=payload))]
+        server = types.SimpleNamespace(zid="b2")
+        return [types.SimpleNamespace(ok=types.SimpleNamespace(payload=payload), replier_id=server)]
 
 
 def test_a_hello_is_repeated_until_the_server_that_is_announced_replies(monkeypatch):

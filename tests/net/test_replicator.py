@@ -200,7 +200,7 @@ def test_a_protocol_mismatch_names_both_versions():
     hub = MemoryHub()
     old = hub.bus("old")
     old.declare_queryable(
-        "hello/old", lambda _: control._pack(messages.MessageKind.HELLO, Hello("old", digest="same", protocol=7))
+        "hello/old", lambda _: control.pack(messages.MessageKind.HELLO, Hello("old", digest="same", protocol=7))
     )
     new = Client(hub, "new", 1.0)
     with pytest.raises(WorldMismatch, match=r"'old' speaks protocol version 7, 'new' version 1"):

@@ -9,11 +9,12 @@ from vinesim.net.transport.access_control import SERVER, Role
 from vinesim.net.transport.certificates import create as new_certificate
 
 
-def new(actor: str, folder: pathlib.Path, role: str, hosts: list[str]) -> int:
+def new(actor: str, folder: pathlib.Path, role: str, hosts: list[str], authority: pathlib.Path | None) -> int:
     """Make certificates and print the names of their files; the exit code."""
     possible = [each.value for each in Role if each != Role.SERVER]
     if role not in possible:
         raise UsageError(f"--role {role!r}: give {', '.join(possible)}")
-    for path in new_certificate(folder, actor, Role.SERVER if actor == SERVER else Role(role), hosts):
+    kind = Role.SERVER if actor == SERVER else Role(role)
+    for path in new_certificate(folder, actor, kind, hosts, authority=authority):
         print(path)
     return 0

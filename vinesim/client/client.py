@@ -24,6 +24,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.avatar.local_human import LocalHuman
 from vinesim.client.recording.bunch_trace import Trace
+from vinesim.client.remote.mesh_exchange import MeshExchange
 from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
 from vinesim.client.remote.plant_couplings import PlantCouplings
 from vinesim.client.remote.remote_human import RemoteHuman
@@ -96,6 +97,8 @@ class Client:
         """Robots that this client simulates, by name; the first is :attr:`robot`."""
         self.humans: dict[str, LocalHuman] = {}
         """Humans that this client simulates, by name."""
+        self.meshes = MeshExchange()
+        """Meshes of local robots for other clients, and of remote ones for this client."""
         self.replicators: dict[str, Replicator] = {}
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
         self.objects = ObjectSync(self.physics, self.replicators)
@@ -103,6 +106,7 @@ class Client:
         self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
         self._add_own_actor(description, pose, source, height, bus)
         self.replicator = self.replicators[name]
+        self.meshes.bus = bus
         self.remote_actors: dict[str, RemoteRobot | RemoteHuman] = {}
         self.pre_step: list[Callable[[float], None]] = []
         """Called before every step with the simulation time [s]: tasks and commands of robots."""
@@ -117,7 +121,7 @@ class Client:
         self.interest_audit = InterestAudit()
         self._clock = clock
         self._remote_trees: dict[int, TreeUpdate] = {}
-        self.spawner = RemoteSpawner(self.physics.rigid, description, executor)
+        self.spawner = RemoteSpawner(self.physics.rigid, description, executor, self.meshes)
 
     def _add_own_actor(
         self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
@@ -148,6 +152,7 @@ class Client:
         )
         self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
         robot.fit_cutters(self.physics)
+        self.meshes.offer(bus, description.urdf)
         self._add_replicator(name, replicator)
         return robot
 
@@ -196,6 +201,7 @@ class Client:
                 self.spawner.enqueue(hello)
         for name in inbox.left:
             self.spawner.cancel(name)
+            self.meshes.forget(name)
             if (other := self.remote_actors.pop(name, None)) is not None:
                 other.remove()
                 self.physics.contact_solver.remote_actors.discard(name)
@@ -210,6 +216,8 @@ class Client:
                     robot.follow(update)
                 case [RemoteHuman() as human, HumanUpdate()]:
                     human.follow(update)
+        for renewed in self.spawner.renewed():
+            self.remote_actors[renewed.name] = renewed
         self._apply_remote_trees(inbox)
 
     def control(self) -> None:
@@ -264,6 +272,7 @@ class Client:
 
     def leave(self) -> None:
         """Before the buses close: publish objects at rest on local robots in the world frame, as their parent goes."""
+        self.meshes.close()
         now = self._clock()
         for name, robot in self.robots.items():
             supported = self.objects.supported_by(name)

@@ -19,6 +19,8 @@ DESCRIPTIONS = {
     "couplings_refused": "forces of other actors on plants were refused, as too many bodies of plants were held",
     "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",
     "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
+    "meshes_refused": "meshes of other clients were refused, as they were corrupt or too many: they stay boxes",
+    "meshes_not_taken": "meshes of robots here were not taken by the server: others see boxes in their place",
     "deadlines_dropped": "steps were skipped after the process had stood still",
 }
 """What each fault is, for a person."""
@@ -31,6 +33,8 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
         "couplings_refused": client.couplings.refused,
         "messages_refused": sum(one.malformed for one in counters),
         "wrenches_refused": sum(one.wrenches_refused for one in counters),
+        "meshes_refused": client.meshes.refused_count,
+        "meshes_not_taken": client.meshes.refused_offers,
         "deadlines_dropped": deadlines_dropped,
     }
     return {name: count for name, count in counts.items() if count}

@@ -97,10 +97,7 @@ class Physics:
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
             ("plants: predict velocities without contacts", self.plants.predict),
-            (
-                "contacts: wake trees that others touch, solve plants and rigid bodies together",
-                self.contact_solver.solve,
-            ),
+            ("contacts: wake trees that others touch, solve all together", self.contact_solver.solve),
             ("plants: integrate with contact wrenches", self._integrate_plants),
             ("rigid: integrate with contact forces", self._integrate_rigid),
             ("faults: stop trees with invalid rates", self.fault_guard.stop_faulty_trees),

@@ -66,9 +66,13 @@ def ros_build_interfaces(
 
 def certs_new(
     actor: Annotated[str, typer.Argument(help="The actor's name, or server.")],
-    dir: Annotated[pathlib.Path, typer.Option(help="Folder of the authority; made at first use.")] = pathlib.Path(
-        "certs"
-    ),
+    dir: Annotated[
+        pathlib.Path, typer.Option(help="Folder of certificates, for --tls of a server; made at first use.")
+    ] = pathlib.Path("certs"),
+    authority: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Folder of the authority's key ca.key; made at first use; default DIR-authority."),
+    ] = None,
     role: Annotated[str, typer.Option(help="robot, human or spectator, who only reads.")] = "robot",
     host: Annotated[
         list[str] | None, typer.Option(help="For server: name or address by which clients reach it; repeatable.")
@@ -76,15 +80,15 @@ def certs_new(
 ) -> None:
     """Make the certificate and key of an actor; at first use the authority's and the server's as well.
 
-    An actor needs ca.pem, NAME.pem and NAME.key; ca.key stays where it is made. The server reads its folder when it
-    starts: an actor made later is admitted after a restart, one whose .pem is removed is not.
+    An actor needs ca.pem, NAME.pem and NAME.key. The authority's key signs, stays where it is made, and belongs to no
+    server or client. A running server notices within seconds what is added to, replaced in or removed from its folder.
 
     \b
     Examples:
       vinesim certs new server --host 192.168.1.5
       vinesim certs new picker
-      vinesim certs new visitor --role spectator --dir certs
+      vinesim certs new visitor --role spectator --dir certs --authority /media/stick/authority
     """
     from vinesim.cli.certs import new
 
-    raise typer.Exit(new(actor, dir, role, host or []))
+    raise typer.Exit(new(actor, dir, role, host or [], authority))

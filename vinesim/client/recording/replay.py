@@ -202,6 +202,13 @@ class ReplayBus:
         answers, self._answers = self._answers, []
         return answers
 
+    def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
+        return []
+
+    @property
+    def admissions(self) -> int:
+        return 0
+
     def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         pass
 

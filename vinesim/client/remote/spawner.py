@@ -9,6 +9,9 @@ import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+
+from vinesim.client.remote.mesh_exchange import MeshExchange
 from vinesim.client.remote.remote_human import RemoteHuman, human_spec
 from vinesim.net.codec.messages import Hello, is_valid_name
 from vinesim.physics.rigid.mujoco_world import CompiledWorld
@@ -36,12 +39,24 @@ class Prepared:
 
 
 class RemoteSpawner:
-    """Remote actors that have joined but have no body here yet, and room for free bunches that runs short."""
+    """Remote actors that have joined but have no body here yet, room for free bunches that runs short, and robots whose
+    meshes arrive after they have a body."""
 
     def __init__(
-        self, rigid: RigidWorld, own: RobotDescription | None, executor: concurrent.futures.Executor | None = None
+        self,
+        rigid: RigidWorld,
+        own: RobotDescription | None,
+        executor: concurrent.futures.Executor | None = None,
+        meshes: MeshExchange | None = None,
     ) -> None:
-        """``own``: a description that is loaded already, if any; without ``executor`` actors are compiled at once."""
+        """``own``: a description that is loaded already, if any; without ``executor`` actors are compiled at once.
+        ``meshes``: those of remote robots; without it they are boxes."""
+        self.meshes = meshes or MeshExchange()
+        self._spawned: dict[str, Hello] = {}
+        """Robots that have a body here."""
+        self._outdated: set[str] = set()
+        """Robots of which meshes have arrived since their last compilation began."""
+        self._renewing: concurrent.futures.Future[Prepared] | None = None
         self.rigid, self.own = rigid, own
         self._executor = executor
         self._enqueued: dict[str, Hello] = {}
@@ -57,6 +72,8 @@ class RemoteSpawner:
     def cancel(self, name: str) -> None:
         """Remove an actor that has left."""
         self._enqueued.pop(name, None)
+        self._spawned.pop(name, None)
+        self._outdated.discard(name)
 
     def spawn(self, updates: Mapping[str, RobotUpdate | HumanUpdate]) -> dict[str, RemoteRobot | RemoteHuman]:
         """The bodies of enqueued actors that became ready, at their poses in ``updates``; between steps.
@@ -96,9 +113,56 @@ class RemoteSpawner:
         """The copy of an actor that the rigid world contains now."""
         if description is None or not isinstance(update, RobotUpdate):
             return RemoteHuman(self.rigid, hello.name)
+        self._spawned[hello.name] = hello
+        if description.urdf != hello.urdf:  # not the text of an installed robot, whose meshes are files
+            self.meshes.want(hello.name, hello.urdf)
         other = RemoteRobot(self.rigid, description, hello.name, hello.index, update.base_q, is_in_world=True)
         self.rigid.place_robot(hello.name, update.base_q, update.position)
         return other
+
+    def renewed(self) -> list[RemoteRobot]:
+        """Robots whose meshes have arrived and now stand in the place of boxes, in the state that they were in."""
+        self._outdated.update(self.meshes.changed())
+        if self._renewing is None:
+            hellos = [self._spawned[name] for name in sorted(self._outdated & self._spawned.keys())]
+            if not hellos:
+                return []
+            self._outdated -= {hello.name for hello in hellos}
+            self._renewing = self._submit(lambda: self._prepare_again(hellos))
+        if not self._renewing.done():
+            return []
+        done, self._renewing = self._renewing, None
+        prepared = done.result()
+        for hello, error in prepared.refused:
+            log.warning("the meshes of %s cannot be used, boxes stay in their place: %s", hello.name, error)
+            self.meshes.refuse(hello.name)
+        is_current = all(self._spawned.get(hello.name) is hello for hello, _ in prepared.actors)
+        if prepared.world is None or not is_current or not self.rigid.adopt(prepared.world):
+            # another actor joined or left meanwhile: compiled again from the next step on
+            self._outdated |= {hello.name for hello, _ in prepared.actors} & self._spawned.keys()
+            return []
+        return [
+            RemoteRobot(
+                self.rigid, description, hello.name, hello.index, self.rigid.base_state(hello.name)[0], is_in_world=True
+            )
+            for hello, description in prepared.actors
+            if description is not None
+        ]
+
+    def _prepare_again(self, hellos: list[Hello]) -> Prepared:
+        """Compile a world in which robots that are here have the meshes that were received."""
+        specs, actors, refused, world = [], [], [], None
+        for hello in hellos:
+            try:
+                description = resolve_description(hello, self.own, self.meshes.received(hello.name))
+                spec = description.to_spec(hello.name, hello.index)
+                world = self.rigid.compile_with(*specs, spec, replaces=True)
+            except (ValueError, OSError) as error:
+                refused.append((hello, error))
+            else:
+                specs.append(spec)
+                actors.append((hello, description))
+        return Prepared(tuple(actors), tuple(refused), world)
 
     def _submit(self, work: Callable[[], Prepared]) -> concurrent.futures.Future[Prepared]:
         if self._executor is not None:
@@ -144,9 +208,11 @@ class RemoteSpawner:
         return description, description.to_spec(hello.name, hello.index, update.base_q)
 
 
-def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDescription:
+def resolve_description(
+    hello: Hello, own: RobotDescription | None, received: Mapping[str, np.ndarray] | None = None
+) -> RobotDescription:
     """The robot of another client: an installed one with the same URDF text and sidecar, or one loaded from what it
-    sent."""
+    sent. ``received``: corners [face, 3, 3] m of its meshes by digest; boxes stand in for those that are not there."""
 
     def is_same(known: RobotDescription) -> bool:
         return known.urdf == hello.urdf and encode_sidecar(known.base_limits, known.groups) == hello.sidecar
@@ -164,4 +230,4 @@ def resolve_description(hello: Hello, own: RobotDescription | None) -> RobotDesc
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / f"{name}.urdf"
         file.write_text(hello.urdf)
-        return load_description(file, is_remote=True, sidecar=sidecar)
+        return load_description(file, is_remote=True, sidecar=sidecar, received=received)

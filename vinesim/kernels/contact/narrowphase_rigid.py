@@ -242,9 +242,7 @@ def find_rigid_contacts(
     near_count = wp.min(near_count, room)
     is_impact = bool(False)
     count = int(0)  # noqa: RUF046
-    last = capsules.tree_start[tree + 1]
-    if near_count == 0:
-        last = capsules.tree_start[tree]
+    last = capsules.tree_start[tree + wp.where(near_count > 0, 1, 0)]
     for s in range(capsules.tree_start[tree], last):
         if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):
             radius = wp.float64(capsules.radius[s])

@@ -108,11 +108,13 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
         return Claim(self.ownership, self.authority, self.author)
 
 
-def _pack(kind: int, value: Any) -> bytes:
+def pack(kind: int, value: Any) -> bytes:
+    """A message of this kind in msgpack."""
     return MAGIC + bytes((PROTOCOL, kind)) + _encoder.encode(value)
 
 
-def _unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decoder) -> Any:
+def unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decoder) -> Any:
+    """The value of a message, which must be of this kind; ``name``: what it is, for :class:`MessageError`."""
     if (found := kind_of(payload)) != kind:
         raise MessageError(f"message of kind {found} where {name} (kind {kind}) was expected")
     try:
@@ -127,7 +129,7 @@ def encode_hello(hello: Hello) -> bytes:
     if not is_valid_name(hello.name):
         raise MessageError(f"actor name {hello.name!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
     _check_hello(hello)
-    payload = _pack(MessageKind.HELLO, hello)
+    payload = pack(MessageKind.HELLO, hello)
     if len(payload) > MAX_MESSAGE:
         raise MessageError(f"greeting of {len(payload)} B, at most {MAX_MESSAGE} B: the URDF is too long")
     return payload
@@ -135,7 +137,7 @@ def encode_hello(hello: Hello) -> bytes:
 
 def decode_hello(payload: bytes) -> Hello:
     """Decode a hello; :class:`MessageError`, or :class:`WrongVersion` for another protocol version."""
-    hello = _unpack(payload, MessageKind.HELLO, "greeting", _hello_decoder)
+    hello = unpack(payload, MessageKind.HELLO, "greeting", _hello_decoder)
     if not is_valid_name(hello.name):
         raise MessageError(f"greeting of an actor named {hello.name[:60]!r}")
     if hello.protocol != PROTOCOL:
@@ -160,17 +162,17 @@ def _check_hello(hello: Hello) -> None:
 
 def encode_welcome(welcome: Welcome) -> bytes:
     """Encode a welcome."""
-    return _pack(MessageKind.WELCOME, welcome)
+    return pack(MessageKind.WELCOME, welcome)
 
 
 def decode_welcome(payload: bytes) -> Welcome:
     """Decode a welcome; :class:`WrongVersion` from a server of another protocol version."""
-    return _unpack(payload, MessageKind.WELCOME, "welcome", _welcome_decoder)
+    return unpack(payload, MessageKind.WELCOME, "welcome", _welcome_decoder)
 
 
 def encode_claims(claims: list[tuple[int, Claim, bool]]) -> bytes:
     """Encode claims: (object id, claim, whether the owner is in contact with the object)."""
-    return _pack(MessageKind.CLAIMS, [(int(object_id), *claim, touching) for object_id, claim, touching in claims])
+    return pack(MessageKind.CLAIMS, [(int(object_id), *claim, touching) for object_id, claim, touching in claims])
 
 
 def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list[tuple[int, Claim, bool]]:
@@ -178,7 +180,7 @@ def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list
 
     ``counts``: number of objects of each kind in the scene.
     """
-    rows = _unpack(payload, MessageKind.CLAIMS, "claims", _claims_decoder)
+    rows = unpack(payload, MessageKind.CLAIMS, "claims", _claims_decoder)
     if len(rows) > MAX_TREES:
         raise MessageError(f"{len(rows)} claims in one message, at most {MAX_TREES}")
     for object_id, ownership, authority, owner, _ in rows:
@@ -193,7 +195,7 @@ def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list
 
 def encode_records(records: list[RetainedRecord]) -> bytes:
     """Encode retained records."""
-    return _pack(MessageKind.RETAINED, records)
+    return pack(MessageKind.RETAINED, records)
 
 
 def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> list[RetainedRecord]:
@@ -202,7 +204,7 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
     ``counts``: number of objects of each kind in the scene, if known. Records of trees are not checked against the
     model.
     """
-    records = _unpack(payload, MessageKind.RETAINED, "retained records", _records_decoder)
+    records = unpack(payload, MessageKind.RETAINED, "retained records", _records_decoder)
     if len(records) > MAX_RECORDS:
         raise MessageError(f"{len(records)} records in one message, at most {MAX_RECORDS}")
     for record in records:
@@ -223,12 +225,12 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
 def encode_time(sent: float, server: float = 0.0) -> bytes:
     """Encode a clock query (own time ``sent`` [s]) or its reply, which repeats ``sent`` and adds the ``server``'s
     time [s]."""
-    return _pack(MessageKind.CLOCK, (float(sent), float(server)))
+    return pack(MessageKind.CLOCK, (float(sent), float(server)))
 
 
 def decode_time(payload: bytes) -> tuple[float, float]:
     """Own time of the query [s] and the server's time of the reply [s], both finite."""
-    sent, server = _unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
+    sent, server = unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
     if not (math.isfinite(sent) and math.isfinite(server)):
         raise MessageError(f"clock message ({sent}, {server}) that is not finite")
     return sent, server

@@ -32,6 +32,9 @@ class MessageKind(enum.IntEnum):
     HELLO = 16
     CLOCK = 17
     WELCOME = 18
+    MESH_PART = 19
+    MESH_REQUEST = 20
+    MESH_WANTED = 21
 
 
 _RARE = (MessageKind.CLAIMS, MessageKind.RETAINED, MessageKind.HELLO, MessageKind.CLOCK, MessageKind.WELCOME)

@@ -1,8 +1,8 @@
 """All encoders and decoders of network messages under one name; the modules beside this one define them.
 
 ``header`` (magic, version, kind, count, time), ``robot``, ``human``, ``trees``, ``objects``, ``wrenches`` and
-``couplings`` hold packed binary messages that travel many times a second; ``control`` holds the rare messages in
-msgpack.
+``couplings`` hold packed binary messages that travel many times a second; ``control`` and ``meshes`` hold the
+rare messages in msgpack.
 """
 
 from __future__ import annotations
@@ -35,6 +35,15 @@ from vinesim.net.codec.header import is_valid_name as is_valid_name
 from vinesim.net.codec.header import kind_of as kind_of
 from vinesim.net.codec.header import shift_time as shift_time
 from vinesim.net.codec.header import time_of as time_of
+from vinesim.net.codec.meshes import MAX_PART as MAX_PART
+from vinesim.net.codec.meshes import MeshPart as MeshPart
+from vinesim.net.codec.meshes import MeshWanted as MeshWanted
+from vinesim.net.codec.meshes import decode_part as decode_part
+from vinesim.net.codec.meshes import decode_request as decode_request
+from vinesim.net.codec.meshes import decode_wanted as decode_wanted
+from vinesim.net.codec.meshes import encode_part as encode_part
+from vinesim.net.codec.meshes import encode_request as encode_request
+from vinesim.net.codec.meshes import encode_wanted as encode_wanted
 from vinesim.net.codec.objects import ObjectStates as ObjectStates
 from vinesim.net.codec.objects import check_object_id as check_object_id
 from vinesim.net.codec.objects import decode_objects as decode_objects

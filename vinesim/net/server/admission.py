@@ -47,6 +47,14 @@ class AdmissionControl:
         """Actors that are live now, as ``world/name``, sorted."""
         return sorted(f"{world}/{name}" for (world, name), sessions in self._alive.items() if sessions)
 
+    def is_admitted(self, world: str, name: str) -> bool:
+        """Whether an actor has been admitted and has not left."""
+        return (world, name) in self._admitted
+
+    def is_live(self, world: str, name: str) -> bool:
+        """Whether a session with this name is live."""
+        return bool(self._alive.get((world, name)))
+
     def scene_of(self, world: str) -> SceneId:
         """The scene of a world now."""
         return self._required_scene or self._scenes.get(world, SceneId())
@@ -72,6 +80,14 @@ class AdmissionControl:
         if self._admitted.get(actor, ("", 0.0))[0] == session:
             del self._admitted[actor]
         self._forget(world)
+
+    def forget_actors(self) -> None:
+        """No session is connected any more."""
+        self._alive.clear()
+        self._admitted.clear()
+        self._spectators.clear()
+        for world in list(self._scenes):
+            self._forget(world)
 
     def may_publish(self, world: str, name: str, session: str) -> bool:
         """Whether records under this name come from the session that was admitted with it, and not as a spectator.

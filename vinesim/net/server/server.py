@@ -21,12 +21,14 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.replication.interest import Cell
 from vinesim.net.server.admission import AdmissionControl, SceneId
+from vinesim.net.server.mesh_store import MeshStore
 from vinesim.net.server.retained_store import Quota, RetainedStore
 from vinesim.net.transport import endpoints
 from vinesim.net.transport.access_control import SERVER, acl_config, server_answers_config, tls_config
 from vinesim.net.transport.bus import BusError
 from vinesim.net.transport.zenoh_bus import ROOT, WORLD
 from vinesim.net.transport.zenoh_session import close_session, config, open_session
+from vinesim.scene.triangles import is_digest
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +37,10 @@ LISTEN = "tcp/127.0.0.1:7447"
 
 LEASE = 1000
 """A server that is silent for this long is taken to be gone [ms]: half of what actors are granted."""
+
+
+RELEASE_TIMEOUT = 5.0
+"""Time limit for the release of the ports of a session that was closed [s]."""
 
 
 class PortTaken(BusError):
@@ -68,7 +74,8 @@ class Server:
         ``connect``: routers or servers to link to. A linked server only routes; of linked servers the one that connects
         to none admits and retains. ``state_folder``: folder of the journals; without one the state lives as long as the
         server. ``scene``: the only one allowed. ``max_actors``: at a time. ``certificates``: folder of a server, see
-        :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate.
+        :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate. It is read
+        again when its files change.
 
         Raises :class:`PortTaken`, :class:`vinesim.errors.UsageError` for an invalid endpoint or combination,
         :class:`vinesim.net.server.journal.JournalError` and
@@ -82,11 +89,11 @@ class Server:
                 f"a server linked to {linked[0]} only carries: give --state-dir, --scene and --max-clients "
                 "to the one server that connects to no other"
             )
-        settings: dict[str, Any] = {} if linked else server_answers_config(ROOT)
-        if certificates is not None:
-            from vinesim.net.transport.certificates import roles
-
-            settings = tls_config(certificates, SERVER) | acl_config(f"{ROOT}/{world}", roles(certificates))
+        self._certificates, self._linked = certificates, linked
+        self._root = f"{ROOT}/{'*' if certificates is None else world}"
+        """Key of all worlds; with certificates access control denies declarations beyond the one world."""
+        self._watcher = self._new_watcher()  # before the files are read: a change meanwhile is noticed
+        settings = self._access_settings()
         try:
             self.endpoints = endpoints.resolve_ports(listen, secured=is_secured)
         except OSError as error:
@@ -100,19 +107,34 @@ class Server:
         self._malformed = 0
         self._admission = AdmissionControl(scene, max_actors)
         self._lock = threading.Lock()
+        self._session_lock = threading.Lock()
+        """While the router is closed and opened again."""
         self._stop = threading.Event()
         self._warned: set[str] = set()
         self.store = None if linked else RetainedStore(state_folder, quota)
         """The retained state; None if another server keeps it."""
+        self.meshes = MeshStore()
+        """Meshes of robots, for clients that have no files of them."""
         try:
             self._session = _open_router(self.endpoints, linked, settings)
         except PortTaken:
             if self.store is not None:
                 self.store.close()
             raise
-        # access control denies declarations that reach beyond the one world
-        self._declared = self._declare(f"{ROOT}/{'*' if certificates is None else world}")
+        self._declared = self._declare(self._root)
+        if self._watcher is not None:
+            self._watcher.start()
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
+
+    def _access_settings(self) -> dict[str, Any]:
+        """Zenoh's settings of who may connect and say what; :class:`CertificateError` if a certificate is unusable."""
+        if self._certificates is None:
+            return {} if self._linked else server_answers_config(ROOT)
+        from vinesim.net.transport import certificates
+
+        settings = tls_config(self._certificates, SERVER)
+        certificates.check(self._certificates, SERVER)
+        return settings | acl_config(self._root, certificates.roles(self._certificates))
 
     def _declare(self, root: str) -> list[object]:
         """Subscribe to liveliness; where this server decides, declare queryables and subscribe to retained records."""
@@ -126,6 +148,8 @@ class Server:
                 session.declare_queryable(f"{root}/clock", self._on_clock_query),
                 session.declare_queryable(f"{root}/snap/*/*", self._on_snapshot_query),
                 session.declare_subscriber(f"{root}/fact/**", self._on_record),
+                session.declare_queryable(f"{root}/offer/*", self._on_mesh_offer),
+                session.declare_queryable(f"{root}/mesh/*", self._on_mesh_query),
             ]
         return declared
 
@@ -155,7 +179,7 @@ class Server:
         figures: dict[str, Any] = {
             "endpoints": [str(endpoint) for endpoint in self.endpoints],
             "actors": self.actors,
-            "links": len(self._session.info.links()),
+            "links": self._link_count(),
             "joined": self.joined,
             "refused": self._admission.refused,
             "pings": self.pings,
@@ -171,9 +195,17 @@ class Server:
                 "facts_strange": counters.rejected,
                 "facts_failed": counters.errors,
                 "snapshots": counters.snapshots,
+                "meshes": len(self.meshes),
+                "mesh_bytes": self.meshes.bytes,
+                "meshes_corrupt": self.meshes.counters.corrupt,
+                "meshes_refused": self.meshes.counters.refused,
                 "trouble": self.store.status_message,
             }
         return figures
+
+    def _link_count(self) -> int:
+        with self._session_lock:
+            return 0 if self._session.is_closed() else len(self._session.info.links())
 
     def run(self, duration: float | None = None) -> None:
         """Block until :meth:`stop` (from a signal handler or another thread), at most ``duration`` [s]."""
@@ -186,7 +218,8 @@ class Server:
     def close(self) -> None:
         """Close the router and the store. Idempotent."""
         self.stop()
-        close_session(self._session)
+        with self._session_lock:
+            close_session(self._session)
         if self.store is not None:
             self.store.close()
 
@@ -196,6 +229,54 @@ class Server:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    # ------------------------------------------------------------ certificates that change
+
+    def _new_watcher(self) -> threading.Thread | None:
+        """A thread that opens the router again with the certificates of a folder that changed.
+
+        Zenoh 1.10 reads certificates and access control only when a session is opened. Actors come back by themselves,
+        as after a restart; the store, the clock and the counters stay.
+        """
+        if self._certificates is None:
+            return None
+        from vinesim.net.transport.certificate_watch import WATCH_PERIOD, CertificateWatch
+
+        watch = CertificateWatch(self._certificates)
+
+        def run() -> None:
+            watch.warn()
+            while not self._stop.wait(WATCH_PERIOD):
+                if watch.has_changed() or self._session.is_closed():
+                    self._open_again()
+                watch.warn()
+
+        return threading.Thread(target=run, name="certificates of the server", daemon=True)
+
+    def _open_again(self) -> None:
+        """Open the router with the certificates that the folder holds now, unless they are unusable."""
+        try:
+            settings = self._access_settings()
+        except (BusError, OSError) as error:
+            log.error("the certificates changed and cannot be used; the earlier ones stay in use: %s", error)
+            return
+        with self._session_lock:
+            if self._stop.is_set():
+                return
+            close_session(self._session)
+            with self._lock:
+                self._admission.forget_actors()
+            # a session that fails to open may keep some of its sockets: so only when all are free
+            until = time.monotonic() + RELEASE_TIMEOUT
+            while time.monotonic() < until and not all(map(endpoints.can_listen, self.endpoints)):
+                self._stop.wait(0.02)
+            try:
+                self._session = _open_router(self.endpoints, self._linked, settings)
+                self._declared = self._declare(self._root)
+            except BusError as error:
+                log.error("no client can connect until the server listens again, which is tried on: %s", error)
+                return
+        log.warning("the certificates changed: opened the server again with them; actors come back by themselves")
+
     # ------------------------------------------------------------ called by Zenoh's threads
 
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
@@ -203,6 +284,9 @@ class Server:
         is_live = sample.kind == zenoh.SampleKind.PUT
         with self._lock:
             (self._admission.on_join if is_live else self._admission.on_leave)(world, name, session)
+            has_left = not self._admission.is_live(world, name)
+        if has_left:
+            self.meshes.release((world, name))
         log.info("%s/%s %s", world, name, "came" if is_live else "left")
 
     def _on_record(self, sample: zenoh.Sample) -> None:
@@ -274,6 +358,35 @@ class Server:
                 return
             for cell, payload in self.store.snapshot(world, cells):
                 query.reply(f"{ROOT}/{world}/snap/{cell[0]}/{cell[1]}", payload)
+
+    def _on_mesh_offer(self, query: zenoh.Query) -> None:
+        with query:
+            key = _strip_root(query.key_expr)
+            world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
+            try:
+                if "*" in key:
+                    raise MessageError("an actor offers its own meshes")
+                with self._lock:
+                    if not self._admission.is_admitted(world, name):
+                        raise MessageError("only an actor that has joined offers meshes")
+                wanted = self.meshes.offer((world, name), messages.decode_part(_query_payload(query)))
+            except MessageError as error:
+                self._count_malformed(key, error)
+                return
+            query.reply(str(query.key_expr), messages.encode_wanted(wanted))
+
+    def _on_mesh_query(self, query: zenoh.Query) -> None:
+        with query:
+            key = _strip_root(query.key_expr)
+            digest = key.rpartition("/")[2]
+            try:
+                if not is_digest(digest) or "*" in key:
+                    raise MessageError("the question names no mesh")
+                part = self.meshes.part(digest, messages.decode_request(_query_payload(query)))
+            except MessageError as error:
+                self._count_malformed(key, error)
+                return
+            query.reply(str(query.key_expr), messages.encode_part(part))
 
     def _count_malformed(self, key: str, error: MessageError) -> None:
         """Count an invalid query; log the first of each key."""

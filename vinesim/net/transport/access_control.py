@@ -1,8 +1,9 @@
 """TLS and access control of Zenoh: which certificate may publish, subscribe and query what; everything else is denied.
 
 Every actor has a certificate with its name as common name. It may subscribe to its whole world, query, and publish only
-under keys that end with its own name. A spectator publishes only its presence, its hello and its viewpoint. The rules
-are applied by the router, so a foreign key ends there.
+under keys that end with its own name. A robot also offers its meshes to the server, under its own name. A spectator
+publishes only its presence, its hello and its viewpoint. The rules are applied by the router, so a foreign key ends
+there.
 """
 
 from __future__ import annotations
@@ -43,8 +44,25 @@ _EVERYTHING = [
 ]  # fmt: skip
 
 
+def authority_folder(folder: pathlib.Path) -> pathlib.Path:
+    """Where the key of the authority of a folder of certificates lies by default."""
+    folder = folder.absolute() if not folder.name else folder
+    return folder.with_name(f"{folder.name}-authority")
+
+
+def refuse_authority_key(folder: pathlib.Path) -> None:
+    """Raise :class:`CertificateError` if the key of the authority lies in a folder of certificates."""
+    if (folder / f"{CA_NAME}.key").exists():
+        place = authority_folder(folder)
+        raise CertificateError(
+            f"{folder / CA_NAME}.key: who has it can make certificates for every name, so no server or client may hold "
+            f"it: mkdir -m 700 {place} && cp {folder}/{CA_NAME}.pem {place}/ && mv {folder}/{CA_NAME}.key {place}/"
+        )
+
+
 def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
     """Settings of a session with the certificate of ``name`` that trusts only what ``folder/ca.pem`` signed."""
+    refuse_authority_key(folder)
     authority, certificate, key = (folder / file for file in (f"{CA_NAME}.pem", f"{name}.pem", f"{name}.key"))
     for file in (authority, certificate, key):
         if not file.is_file():
@@ -98,7 +116,7 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         rule(
             "subscribe", "ingress", ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], world
         ),
-        rule("query", "ingress", ["query"], f"{root}/hello/*", f"{root}/clock", f"{root}/snap/*/*"),
+        rule("query", "ingress", ["query"], f"{root}/hello/*", f"{root}/clock", f"{root}/snap/*/*", f"{root}/mesh/*"),
         rule("be queried", "egress", ["query"], f"{root}/hello/*"),
         # without the declarations of subscribers a publisher would never match and never send
         rule("see queryables", "egress", ["declare_queryable"], world),
@@ -114,6 +132,8 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
             ),
             rule(f"{name} asks to be let in", "ingress", ["query"], f"{root}/join/{name}/*"),
         ]  # fmt: skip
+        if role == Role.ROBOT:
+            own.append(rule(f"{name} offers its meshes", "ingress", ["query"], f"{root}/offer/{name}"))
         written = (f"{root}/a/{name}", *(f"{root}/a/{name}/{layer}" for layer in ("far", "mid", "near")))
         if role != Role.SPECTATOR:
             written += (f"{root}/force/*/{name}", *(f"{root}/{family}/*/*/{name}" for family in FAMILIES))

@@ -133,6 +133,16 @@ class Bus(Protocol):
         """Replies that arrived since the last call."""
         ...
 
+    def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
+        """Ask all queryables that match ``key`` and wait for their replies, some seconds at most: not for the real-time
+        loop. Any thread may call it; it delays no other message, and returns nothing if the network fails."""
+        ...
+
+    @property
+    def admissions(self) -> int:
+        """How often a server has admitted this actor: 0 without one, once more for each that is started again."""
+        ...
+
     def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         """Reply to queries for ``key``; ``respond`` is called from any thread and must return quickly."""
 

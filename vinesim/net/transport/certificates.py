@@ -1,8 +1,9 @@
-"""Certificates for secured links: one authority for each folder, one certificate for each actor.
+"""Certificates for secured links: one authority, one certificate for each actor.
 
-``ca.pem`` and ``ca.key`` belong to the authority, ``server.pem`` and ``server.key`` to the server; ``NAME.pem`` and
-``NAME.key`` to an actor, who needs only those two and ``ca.pem``. The role of an actor is the organisational unit of
-its certificate. Keys are elliptic (P-256), readable only by their owner.
+``server.pem`` and ``server.key`` belong to the server; ``NAME.pem`` and ``NAME.key`` to an actor, who needs only those
+two and ``ca.pem``. The key of the authority, ``ca.key``, lies in a folder of its own: who has it can make certificates
+for every name, so no server and no client takes a folder that holds it. The role of an actor is the organisational
+unit of its certificate. Keys are elliptic (P-256), readable only by their owner.
 """
 
 from __future__ import annotations
@@ -16,7 +17,14 @@ from collections.abc import Sequence
 
 from vinesim.errors import UsageError
 from vinesim.net.codec.messages import is_valid_name
-from vinesim.net.transport.access_control import CA_NAME, SERVER, CertificateError, Role
+from vinesim.net.transport.access_control import (
+    CA_NAME,
+    SERVER,
+    CertificateError,
+    Role,
+    authority_folder,
+    refuse_authority_key,
+)  # fmt: skip
 
 try:
     from cryptography import x509
@@ -33,6 +41,8 @@ AUTHORITY_YEARS = 10
 """Validity of the certificate of an authority [a]."""
 CERTIFICATE_DAYS = 825
 """Validity of the certificate of an actor or a server [d]."""
+WARNING_DAYS = 30
+"""A certificate that is valid for less is warned of [d]."""
 
 
 class CryptographyMissing(RuntimeError):
@@ -45,12 +55,14 @@ class CryptographyMissing(RuntimeError):
 
 
 def create(
-    folder: pathlib.Path, name: str, role: Role = Role.ROBOT, hosts: Sequence[str] = (), days: int = CERTIFICATE_DAYS
-) -> list[pathlib.Path]:
+    folder: pathlib.Path, name: str, role: Role = Role.ROBOT, hosts: Sequence[str] = (),
+    days: float = CERTIFICATE_DAYS, authority: pathlib.Path | None = None,
+) -> list[pathlib.Path]:  # fmt: skip
     """Create the certificate of an actor, and at first use those of the authority and the server; the paths written.
 
     ``hosts``: for ``server``, names and addresses under which clients reach it, besides those of this machine; its
-    certificate is replaced. Raises :class:`CertificateError` if an actor has one already, and
+    certificate is replaced. ``authority``: folder of ``ca.key``, by default ``folder`` with ``-authority`` appended.
+    Raises :class:`CertificateError` if an actor has one already, and
     :class:`vinesim.errors.UsageError` for an impossible name or role.
     """
     if _missing is not None:
@@ -63,12 +75,19 @@ def create(
         raise UsageError(f"hosts {', '.join(hosts)} for {name!r}: only the server's certificate names hosts")
     if name != SERVER and (folder / f"{name}.pem").exists():
         raise CertificateError(f"{folder / name}.pem is there already: remove it and its key first, if that is meant")
+    refuse_authority_key(folder)
+    authority = authority_folder(folder) if authority is None else authority
+    if authority.resolve() == folder.resolve():
+        raise UsageError(
+            f"--authority {authority}: give a folder of its own for {CA_NAME}.key, e.g. {folder}-authority"
+        )
     try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        written = [] if (folder / f"{CA_NAME}.key").exists() else _create_authority(folder)
+        for each in (authority, folder):
+            each.mkdir(parents=True, exist_ok=True, mode=0o700)
+        written = _authority_of(folder, authority)
         if name != SERVER and not (folder / f"{SERVER}.pem").exists():
-            written += _signed(folder, SERVER, Role.SERVER, (), days)
-        return written + _signed(folder, name, role, hosts, days)
+            written += _signed(folder, authority, SERVER, Role.SERVER, (), days)
+        return written + _signed(folder, authority, name, role, hosts, days)
     except OSError as error:
         place = error.filename or folder  # a full disk names no file
         raise CertificateError(f"{place}: {error.strerror}: the certificate cannot be made there") from error
@@ -96,16 +115,57 @@ def roles(folder: pathlib.Path) -> dict[str, Role]:
             ) from error
         if name != file.stem:
             raise CertificateError(f"{file}: is the certificate of {name!r}: rename it to {name}.pem")
-        if role == Role.SERVER:
-            now = datetime.datetime.now(datetime.UTC)
-            first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-            if not first <= now <= last:
-                raise CertificateError(
-                    f"{file}: not valid now, but from {first:%Y-%m-%d} to {last:%Y-%m-%d}: make it anew with "
-                    f"'vinesim certs new {name} --dir {folder} --host HOST'"
-                )
         found[name] = role
     return found
+
+
+def check(folder: pathlib.Path, name: str) -> None:
+    """Raise :class:`CertificateError` if the certificate of ``name`` or the authority's is not valid now, or if the
+    certificate does not belong to its key."""
+    if _missing is not None:
+        raise CryptographyMissing from _missing
+    now = datetime.datetime.now(datetime.UTC)
+    for file in (folder / f"{CA_NAME}.pem", folder / f"{name}.pem"):
+        certificate = _read(file)
+        first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+        if not first <= now <= last:
+            remedy = (
+                f"make it anew with 'vinesim certs new {name} --dir {folder}'" if file.stem == name else
+                "make a new authority and all certificates anew, in empty folders"
+            )  # fmt: skip
+            raise CertificateError(f"{file}: not valid now, but from {first:%Y-%m-%d} to {last:%Y-%m-%d}: {remedy}")
+    if _load_key(folder / f"{name}.key").public_key() != _read(folder / f"{name}.pem").public_key():
+        raise CertificateError(f"{folder / name}.key: not the key of {name}.pem: copy both files of one certificate")
+
+
+def expiring(folder: pathlib.Path) -> list[str]:
+    """One line, with the date, for each certificate of this folder that expires within :data:`WARNING_DAYS`."""
+    if _missing is not None:
+        return []
+    soon = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=WARNING_DAYS)
+    lines = []
+    for file in sorted(folder.glob("*.pem")):
+        last = _read(file).not_valid_after_utc
+        if last < soon:
+            lines.append(
+                f"{file} is valid until {last:%Y-%m-%d %H:%M} UTC, and refused afterwards: make it anew in time"
+            )
+    return lines
+
+
+def _authority_of(folder: pathlib.Path, authority: pathlib.Path) -> list[pathlib.Path]:
+    """Create the authority if there is none, and copy its certificate to ``folder``; the paths written."""
+    own, public = authority / f"{CA_NAME}.pem", folder / f"{CA_NAME}.pem"
+    has_key = (authority / f"{CA_NAME}.key").exists()
+    if public.exists() and not (has_key and own.exists() and own.read_bytes() == public.read_bytes()):
+        raise CertificateError(
+            f"{public} is not of the authority in {authority}: give the folder of its {CA_NAME}.key with --authority"
+        )
+    written = [] if has_key else _create_authority(authority)
+    if not public.exists():
+        _write(public, _read(own).public_bytes(serialization.Encoding.PEM), 0o644)
+        written.append(public)
+    return written
 
 
 def _create_authority(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -125,16 +185,11 @@ def _create_authority(folder: pathlib.Path) -> list[pathlib.Path]:
     return _save(folder, CA_NAME, key, certificate)
 
 
-def _signed(folder: pathlib.Path, name: str, role: Role, hosts: Sequence[str], days: int) -> list[pathlib.Path]:
-    """Create a key and its certificate, signed by the folder's authority."""
-    authority = _read(folder / f"{CA_NAME}.pem")
-    try:
-        signer = serialization.load_pem_private_key((folder / f"{CA_NAME}.key").read_bytes(), None)
-    except ValueError as error:
-        raise CertificateError(
-            f"{folder / CA_NAME}.key is no private key: restore it, or begin a new folder"
-        ) from error
-    assert isinstance(signer, ec.EllipticCurvePrivateKey)
+def _signed(
+    folder: pathlib.Path, authority_at: pathlib.Path, name: str, role: Role, hosts: Sequence[str], days: float
+) -> list[pathlib.Path]:
+    """Create a key and its certificate, signed by the authority in ``authority_at``."""
+    authority, signer = _read(authority_at / f"{CA_NAME}.pem"), _load_key(authority_at / f"{CA_NAME}.key")
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name(
         [
@@ -163,7 +218,7 @@ def _signed(folder: pathlib.Path, name: str, role: Role, hosts: Sequence[str], d
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float
 ) -> x509.CertificateBuilder:
     now = datetime.datetime.now(datetime.UTC)
     return (
@@ -193,14 +248,30 @@ def _save(
     public = certificate.public_bytes(serialization.Encoding.PEM)
     files = []
     for suffix, content, mode in ((".key", secret, 0o600), (".pem", public, 0o644)):
-        path = folder / f"{name}{suffix}"
-        part = folder / f"{name}{suffix}.part"
-        part.unlink(missing_ok=True)
-        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.write(content)
-        part.replace(path)
-        files.append(path)
+        _write(folder / f"{name}{suffix}", content, mode)
+        files.append(folder / f"{name}{suffix}")
     return files
+
+
+def _write(path: pathlib.Path, content: bytes, mode: int) -> None:
+    """Write a file whole or not at all."""
+    part = path.with_name(f"{path.name}.part")
+    part.unlink(missing_ok=True)
+    with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
+        file.write(content)
+    part.replace(path)
+
+
+def _load_key(file: pathlib.Path) -> ec.EllipticCurvePrivateKey:
+    try:
+        key = serialization.load_pem_private_key(file.read_bytes(), None)
+    except (OSError, ValueError, TypeError) as error:
+        raise CertificateError(
+            f"{file} cannot be read as a private key: restore it, or make the certificate anew"
+        ) from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise CertificateError(f"{file} is no elliptic key: make the certificate anew with 'vinesim certs new'")
+    return key
 
 
 def _read(file: pathlib.Path) -> x509.Certificate:

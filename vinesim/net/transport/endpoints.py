@@ -126,6 +126,21 @@ def resolve_ports(listen: Sequence[str], *, secured: bool = False) -> tuple[Endp
     return tuple(found)
 
 
+def can_listen(endpoint: Endpoint) -> bool:
+    """Whether no socket listens at an endpoint: Zenoh 1.10 may release that of datagrams 0.1 s after its session."""
+    family = socket.AF_INET6 if endpoint.host.startswith("[") else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM if endpoint.datagrams else socket.SOCK_STREAM) as probe:
+        if not endpoint.datagrams:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((endpoint.host.strip("[]"), endpoint.port))
+            if not endpoint.datagrams:
+                probe.listen()
+        except OSError:
+            return False
+        return True
+
+
 def _free_port(host: str) -> int:
     family = socket.AF_INET6 if host.startswith("[") else socket.AF_INET
     while True:

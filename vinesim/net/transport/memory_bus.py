@@ -118,6 +118,18 @@ class MemoryHub:
                 if matches(key, served_key) and name != sender.name:
                     self._schedule(functools.partial(respond, self._members[name], served_key))
 
+    def fetch(self, sender: str, key: str, payload: bytes) -> list[bytes]:
+        """Ask every other member with a matching queryable, at once, whatever the delay: callers do not wait for the
+        clock."""
+        if self.down:
+            return []
+        return [
+            respond(payload)
+            for name, bus in sorted(self._members.items())
+            for served_key, respond in sorted(bus.queryables.items())
+            if name != sender and matches(served_key, key)
+        ]
+
     def visible_names(self, name: str) -> frozenset[str]:
         """Names that a member sees as live."""
         return frozenset((name,)) if self.down else frozenset(self._visible_names.get(name, ()))
@@ -235,6 +247,13 @@ class MemoryBus:
     def replies(self) -> list[Reply]:
         pending_replies, self.pending_replies = self.pending_replies, []
         return [Reply(key, payload, self.hub.time - at) for key, payload, at in pending_replies]
+
+    def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
+        return self.hub.fetch(self.name, key, payload)
+
+    @property
+    def admissions(self) -> int:
+        return 0
 
     def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         self.queryables[key] = respond

@@ -37,6 +37,8 @@ class ServerAdmission:
         """The server of this world is there, or there never was one."""
         self.rejection = ""
         """Empty, or why a server that was restarted rejects this actor."""
+        self.count = 0
+        """How often a server has admitted this actor."""
         self._servers: frozenset[str] | None = None
         """The session that admitted this actor, if any did; None: it has not joined."""
         self._declared: list[object] = []
@@ -54,13 +56,14 @@ class ServerAdmission:
         if not welcomes and self._is_secured:
             raise JoinRejected(
                 f"the server at {self._endpoint} refuses actors named {self._name!r}: its folder of certificates must "
-                f"hold {self._name}.pem, and it reads them when it starts"
+                f"hold {self._name}.pem, which it notices within seconds"
             )
         if not welcomes:
             log.info("%s: no vinesim server keeps world %r; actors check each other", self._name, self._world)
         elif len(welcomes) > 1:
             log.warning("%s: %d servers keep world %r; link all but one to it with --connect", self._name,
                         len(welcomes), self._world)  # fmt: skip
+        self.count += bool(welcomes)
         querier = self._session.declare_querier(self._key)
 
         def on_matching(status: zenoh.MatchingStatus) -> None:
@@ -85,6 +88,7 @@ class ServerAdmission:
                 self._submit(lambda: self._join_again(querier, hello))
             return
         self.rejection = welcomes[0].refused
+        self.count += not self.rejection
         if self.rejection:
             log.error("%s: the server that came back rejects this actor: %s", self._name, self.rejection)
 

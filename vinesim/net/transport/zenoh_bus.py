@@ -17,7 +17,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import zenoh
 
@@ -35,6 +35,9 @@ from vinesim.net.transport.zenoh_session import (
     close_session,
     open_client,
 )
+
+if TYPE_CHECKING:
+    from vinesim.net.transport.certificate_watch import CertificateWatch
 
 log = logging.getLogger(__name__)
 
@@ -55,6 +58,9 @@ SILENCE_TIMEOUT = 3.0
 
 DATAGRAM_RETRY_PERIOD = 10.0
 """Time between two attempts to send poses over datagrams again [s]."""
+
+FETCH_TIMEOUT = 10.0
+"""Time limit of :meth:`ZenohBus.fetch` [s]: large replies over slow links."""
 
 MAX_PENDING_PUTS = 10_000
 """Reliable messages that wait to be sent; further ones are refused."""
@@ -87,6 +93,7 @@ class ZenohBus:
                 raise UsageError(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
         links = client_links(connect, secured=certificates is not None)
         self._credentials = {} if certificates is None else tls_config(certificates, name)
+        self._certificate_watch = None if certificates is None else _watch(certificates, name)
         self.name, self.world, self.endpoint = name, world, str(links.bulk)
         self.bytes_in = self.bytes_out = self._oversized = self.failures = self.foreign = 0
         self._put_count = self._put_bytes = self._sent_count = self._sent_bytes = 0
@@ -153,6 +160,14 @@ class ZenohBus:
     def session_for(self, reliable: bool) -> zenoh.Session:
         """The session of events (reliable) or of poses."""
         return self._session if reliable else self._pose_session
+
+    def _watch_links(self) -> None:
+        """What the bus's own thread does once a :data:`WATCH_PERIOD`."""
+        self._watch_datagrams()
+        if (watch := self._certificate_watch) is not None:
+            if watch.has_changed():  # Zenoh reads the files whenever it connects
+                log.warning("%s: its certificates changed: they are used from the next connection on", self.name)
+            watch.warn()
 
     def _watch_datagrams(self) -> None:
         """Move poses to the stream when datagrams stop passing while the stream works, and back."""
@@ -353,6 +368,22 @@ class ZenohBus:
             found.append(Reply(key, payload, now - arrived))
         return found
 
+    def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
+        try:
+            replies = self._session.get(
+                self._prefix + key, payload=payload, timeout=FETCH_TIMEOUT, priority=zenoh.Priority.BACKGROUND,
+                consolidation=zenoh.ConsolidationMode.NONE,
+            )  # fmt: skip
+            found = [reply.ok.payload for reply in replies if reply.ok is not None]
+        except zenoh.ZError as error:
+            self.count_failure(error)
+            return []
+        return [payload.to_bytes() for payload in found if len(payload) <= messages.MAX_MESSAGE]
+
+    @property
+    def admissions(self) -> int:
+        return self._admission.count
+
     def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
         def on_query(query: zenoh.Query) -> None:
             with query:
@@ -405,13 +436,13 @@ class ZenohBus:
         """Body of the bus's own thread."""
         due = time.monotonic() + WATCH_PERIOD
         while True:
-            task: Callable[[], object] | None = self._watch_datagrams
+            task: Callable[[], object] | None = self._watch_links
             if (left := due - time.monotonic()) > 0.0:
                 with contextlib.suppress(queue.Empty):
                     task = self._work.get(timeout=left)
             if task is None:
                 return
-            if task == self._watch_datagrams:
+            if task == self._watch_links:
                 due = time.monotonic() + WATCH_PERIOD
             try:
                 task()
@@ -437,6 +468,21 @@ class ZenohBus:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _watch(folder: pathlib.Path, name: str) -> CertificateWatch | None:
+    """Check the certificate of ``name``, and watch it from now on; None without the library that reads certificates."""
+    from vinesim.net.transport import certificates
+    from vinesim.net.transport.certificate_watch import CertificateWatch
+
+    try:
+        certificates.check(folder, name)
+    except certificates.CryptographyMissing:
+        log.info(
+            "%s: whether the certificates in %s are valid is not checked here without 'vinesim[tls]'", name, folder
+        )
+        return None
+    return CertificateWatch(folder)
 
 
 def _token(key: zenoh.KeyExpr) -> tuple[str, str]:

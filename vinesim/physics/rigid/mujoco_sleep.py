@@ -19,3 +19,11 @@ def wake_body(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
         d.tree_awake[tree] = 1
         if d.tree_asleep[tree] < 0:
             d.tree_asleep[tree] = AWAKE_COUNTER
+
+
+def keep_touching_awake(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
+    """Start the counters anew of all trees that touch the tree of a body: what rests on it may lose its support."""
+    island = d.tree_island[m.body_treeid[body]]
+    touching = (d.tree_island == island) & (d.tree_asleep < 0)
+    if island >= 0:
+        d.tree_asleep[touching] = AWAKE_COUNTER

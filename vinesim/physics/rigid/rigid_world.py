@@ -11,13 +11,14 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import mujoco
 import numpy as np
 
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid import free_bunch, recompile, static_world
+from vinesim.physics.rigid import free_bunch, mujoco_sleep, recompile, static_world
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
 from vinesim.physics.rigid.mujoco_world import CompiledWorld
@@ -73,17 +74,24 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         del self._humans[name]
         self._recompile()
 
-    def compile_with(self, *specs: RobotSpec | HumanSpec, is_remote: bool = False) -> CompiledWorld:
+    def compile_with(
+        self, *specs: RobotSpec | HumanSpec, is_remote: bool = False, replaces: bool = False
+    ) -> CompiledWorld:
         """Compile the world with more actors and a full pool of spare bodies for free bunches, for :meth:`adopt`.
 
         Any thread may call this while steps go on. Raises :class:`RobotError` if a URDF does not compile, of several
-        robots without saying which. ``is_remote``: see :meth:`add_human`.
+        robots without saying which. ``is_remote``: see :meth:`add_human`. ``replaces``: the robots
+        are here and keep their states; only their shapes are others.
         """
         robots, humans = list(self._robots.values()), list(self._humans.values())
         for spec in specs:
             if isinstance(spec, HumanSpec):
                 code = _free_code(spec.name, "human", static_world.HUMAN_CODES, humans, robots, HumanError)
                 humans.append(HumanBody(spec, code, self.parameters, is_remote=is_remote))
+            elif replaces:
+                old = self.robot(spec.name)
+                new = RobotBody(dataclasses.replace(spec, pose=old.spec.pose), old.code, self.parameters)
+                robots = [new if robot is old else robot for robot in robots]
             else:
                 code = _free_code(spec.name, "robot", static_world.ROBOT_CODES, robots, humans, RobotError)
                 robots.append(RobotBody(spec, code, self.parameters))
@@ -96,21 +104,31 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             raise build_error(added[-1], error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
-        """Use a world that was compiled with more actors or more room for free bunches; between steps.
+        """Use a world that was compiled with more actors, with other shapes of robots, or with more room for free
+        bunches; between steps.
 
         False, and nothing is changed, if other actors joined or left meanwhile: compile it anew.
         """
         present = (*self._robots.values(), *self._humans.values())
         planned = (*compiled.robots, *compiled.humans)
         added = [actor for actor in planned if actor not in present]
-        stays = tuple(actor for actor in planned if actor not in added) == present
+        replaced = {
+            actor: self._robots[actor.spec.name]
+            for actor in added
+            if isinstance(actor, RobotBody) and actor.spec.name in self._robots
+        }
+        kept = [replaced.get(actor, actor) for actor in planned if actor in replaced or actor not in added]
+        stays = tuple(kept) == present
         if not stays or compiled.bunch_slots <= max(self._bunch_slot.values(), default=-1):
             return False
+        for new, old in replaced.items():
+            new.take_over(old)
+            mujoco_sleep.keep_touching_awake(self.mj_model, self.mj_data, self.mj_model.body(new.spec.name).id)
         self._robots = {robot.spec.name: robot for robot in compiled.robots}
         self._humans = {human.spec.name: human for human in compiled.humans}
         self._replace_world(compiled)
         for actor in added:
-            if isinstance(actor, RobotBody):
+            if isinstance(actor, RobotBody) and actor not in replaced:
                 self.place_robot(actor.spec.name, actor.spec.pose, actor.spec.home)
         return True
 

@@ -15,7 +15,8 @@ from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import recompile
 from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction
-from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, shapes_of
+from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, shapes_of_robot
+from vinesim.scene.triangles import to_stl
 from vinesim.scene.values import RobotSpec
 
 _PLANAR = ("x", "y", "yaw")
@@ -33,7 +34,7 @@ class RobotBody:
             self._parsed = _parse(spec, code, parameters.friction)
         except ValueError as error:
             raise build_error(spec, error) from error
-        self.shapes = shapes_of(spec.urdf)
+        self.shapes = shapes_of_robot(spec)
         self.stiffness = np.array([d.stiffness for d in spec.drives], float)
         self.damping = np.array([d.damping for d in spec.drives], float)
         self.servo_limit = np.array([d.effort for d in spec.drives], float)
@@ -140,6 +141,16 @@ class RobotBody:
         servo = np.clip(servo, -self.servo_limit, self.servo_limit)
         return np.clip(servo + d.qfrc_gravcomp[self.v], -self.effort_limit, self.effort_limit)
 
+    def take_over(self, other: RobotBody) -> None:
+        """Go on as ``other``, the same robot with other shapes: its targets, gains, limits and sensors."""
+        for name in (
+            "stiffness", "damping", "servo_limit", "target", "target_velocity", "feedforward", "control", "base_target",
+            "base_velocity", "has_exact_damping",
+        ):  # fmt: skip
+            getattr(self, name)[:] = getattr(other, name)
+        self.base_slip, self.base_height = other.base_slip, other.base_height
+        self.sensor_links, self.remote_wrenches = other.sensor_links, other.remote_wrenches
+
     # ------------------------------------------------------------------ commands
 
     def command(self, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
@@ -224,7 +235,8 @@ class RobotBody:
 
 def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
     """A robot without base and servos from its URDF; its shapes carry the collision ``code``."""
-    child = mujoco.MjSpec.from_string(collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives)))
+    text = collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives))
+    child = mujoco.MjSpec.from_string(text, assets={name: to_stl(corners) for name, corners in given.meshes.items()})
     for geom in child.geoms:
         geom.contype, geom.conaffinity = code, ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
         geom.friction = contact_friction(friction)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene.appearance import SURFACES
-from vinesim.scene.values import RobotSpec, Shape
+from vinesim.scene.appearance import SURFACES, received_surface
+from vinesim.scene.triangles import TrianglesError
+from vinesim.scene.values import Mesh, RobotSpec, Shape
 
 
 class RobotError(ValueError):
@@ -72,6 +74,30 @@ def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
         seen = link.findall("visual") or link.findall("collision")
         shapes[link.get("name", "")] = tuple(filter(None, (_shape(element, paints) for element in seen)))
     return shapes
+
+
+def shapes_of_robot(spec: RobotSpec) -> dict[str, tuple[Shape, ...]]:
+    """:func:`shapes_of` of a robot, some of whose meshes may be in no file.
+
+    Raises :class:`RobotError` for triangles that cannot be shown.
+    """
+    shapes = shapes_of(spec.urdf)
+    if not spec.meshes:
+        return shapes
+    surfaces: dict[tuple[str, tuple[float, ...]], Mesh] = {}
+
+    def with_mesh(shape: Shape) -> Shape:
+        if shape.file not in spec.meshes:
+            return shape
+        key = (shape.file, shape.size)
+        if key not in surfaces:
+            try:
+                surfaces[key] = received_surface(spec.meshes[shape.file], shape.size)
+            except TrianglesError as error:
+                raise RobotError(f"robot {spec.name!r}: mesh {shape.file} cannot be shown: {error}") from error
+        return dataclasses.replace(shape, mesh=surfaces[key])
+
+    return {link: tuple(map(with_mesh, pieces)) for link, pieces in shapes.items()}
 
 
 _SURFACES = {name: name for name in SURFACES} | {"steel": "metal", "aluminium": "metal", "lens": "glass"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -46,6 +47,8 @@ class RobotDescription:
     """[kg]"""
     notes: tuple[str, ...]
     """What was changed or derived at loading, one line each."""
+    meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Corners [face, 3, 3] m of meshes that came over the network, by the file name that ``urdf`` gives them."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -92,5 +95,6 @@ class RobotDescription:
         """The robot as physics needs it, under ``name``, with its base at ``pose`` [7] (the origin unless given)."""
         pose = frames.pose([0.0, 0.0, 0.0]) if pose is None else np.asarray(pose, float)
         return RobotSpec(
-            name, index, self.urdf, self.base, pose, self.drives, self.home.copy(), self.base_limits.effort
-        )
+            name, index, self.urdf, self.base, pose, self.drives, self.home.copy(), self.base_limits.effort,
+            self.meshes,
+        )  # fmt: skip

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import pathlib
+from collections.abc import Mapping
 
 import msgspec
 import numpy as np
@@ -46,12 +47,17 @@ BOLTED_EFFORT = (1e6, 1e6)
 
 
 def load_description(
-    name: str | pathlib.Path, *, is_remote: bool = False, sidecar: Sidecar | None = None
+    name: str | pathlib.Path,
+    *,
+    is_remote: bool = False,
+    sidecar: Sidecar | None = None,
+    received: Mapping[str, np.ndarray] | None = None,
 ) -> RobotDescription:
     """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
 
-    ``is_remote``: its text came over the network, so no file that it names is opened. ``sidecar``: instead of the
-    TOML file beside the URDF.
+    ``is_remote``: its text came over the network, so no file that it names is opened; its meshes are those of
+    ``received``, corners [face, 3, 3] by digest, and boxes where there are none. ``sidecar``: instead of the TOML file
+    beside the URDF.
     Raises :class:`DescriptionError` in one line if it cannot be simulated.
     """
     file = _locate(str(name))
@@ -59,8 +65,9 @@ def load_description(
     check_numbers(root, file)
     notes: list[str] = []
     assumed: list[str] = []
+    meshes: dict[str, np.ndarray] = {}
     if is_remote:
-        replace_unopened_meshes(root, assumed)
+        meshes = replace_unopened_meshes(root, assumed, received)
     else:
         resolve_meshes(root, file, notes)
     fix_wheels(root, notes)
@@ -83,6 +90,7 @@ def load_description(
     add_missing_masses(root, parsed, base, order, assumed)
     urdf = etree.tostring(root, encoding="unicode")
     description = _assemble(parse_robot(root), base, order, file, urdf, sidecar, notes, assumed)
+    description = dataclasses.replace(description, meshes=meshes)
     for note in notes:
         log.info("%s: %s", file.name, note)
     if assumed:

@@ -1,13 +1,16 @@
 """Meshes of a URDF: found, named by absolute path, and replaced where physics cannot read their format.
 
-Each mesh gets an attribute ``bounds``, its bounding box. A client that receives the URDF over the network opens no file
-that it names: it makes boxes of these bounds.
+Each mesh gets the attributes ``bounds``, its bounding box, and ``digest`` and ``faces``, by which others ask for its
+triangles (:mod:`vinesim.scene.triangles`). A client that receives the URDF over the network opens no file that it
+names: it makes boxes of these bounds where it has no triangles of that digest.
 """
 
 from __future__ import annotations
 
 import functools
 import pathlib
+from collections.abc import Mapping
+from typing import NamedTuple, cast
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
@@ -15,6 +18,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has n
 from vinesim.robot.description.errors import description_error
 from vinesim.robot.description.package_resources import find_installed
 from vinesim.robot.description.urdf_model import parse_origin
+from vinesim.scene import triangles
 
 MESH_FORMATS = (".stl", ".obj", ".msh")
 """File formats that MuJoCo reads; meshes of others, such as Collada, are replaced."""
@@ -22,6 +26,22 @@ MAX_STL_FACES = 200_000
 """Of an STL file that MuJoCo reads."""
 MIN_BOX_EDGE = 1e-4
 """[m] Smallest edge of a box in place of a mesh, which may be flat."""
+
+
+MAX_MESHES = 256
+"""Most meshes of one robot that are asked for; a robot with more is seen as boxes for the rest."""
+
+MAX_ROBOT_BYTES = 64 << 20
+"""Size of all meshes of one robot that are asked for [B]."""
+
+
+class MeshOffer(NamedTuple):
+    """A mesh that a URDF names, by its digest."""
+
+    file: str
+    """As the URDF names it: on the machine that wrote the text, and never opened on another."""
+    size: int
+    """Of its triangles, encoded [B]."""
 
 
 def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
@@ -66,7 +86,7 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
     for link in root.iterfind("link"):
         for shape in [shape for shape in link.iterfind("collision") if not readable(shape)]:
             mesh = shape.find("geometry/mesh")
-            _replace_by_box(shape, mesh, _bounds(mesh, file))
+            _replace_by_box(shape, mesh, _facts(mesh, file).bounds)
         for shape in [shape for shape in link.iterfind("visual") if not readable(shape)]:
             material = shape.find("material")
             for solid in link.findall("collision"):
@@ -79,20 +99,68 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
         formats = ", ".join(sorted(unread))
         notes.append(f"meshes of format {formats} cannot be read: seen as collision shapes, touched as boxes")
     for mesh in root.iterfind("link//geometry/mesh"):
-        mesh.set("bounds", " ".join(f"{value:.6g}" for value in _bounds(mesh, file).ravel()))
+        facts = _facts(mesh, file)
+        mesh.set("bounds", " ".join(f"{value:.6g}" for value in facts.bounds.ravel()))
+        mesh.set("digest", facts.digest)
+        mesh.set("faces", str(facts.faces))
 
 
-def replace_unopened_meshes(root: etree._Element, assumed: list[str]) -> None:
-    """Replace all meshes by boxes of their ``bounds``, without opening a file; those without bounds are removed.
+def list_meshes(urdf: str) -> dict[str, MeshOffer]:
+    """The meshes that a URDF offers, by digest, in its order; without those beyond what one robot may have.
 
-    For a URDF from the network, whose numbers were checked. Adds to ``assumed``.
+    ``urdf`` may come over the network: what is no URDF offers none.
+    """
+    found: dict[str, MeshOffer] = {}
+    try:
+        root = etree.fromstring(urdf.encode(), etree.XMLParser(remove_comments=True, resolve_entities=False))
+    except (etree.XMLSyntaxError, ValueError):
+        return {}
+    for mesh in root.iterfind("link//geometry/mesh"):
+        digest, faces = mesh.get("digest", ""), mesh.get("faces", "")
+        if triangles.is_digest(digest) and faces.isascii() and faces.isdecimal() and len(faces) < 9:
+            found.setdefault(digest, MeshOffer(mesh.get("filename", ""), int(faces) * triangles.FACE_BYTES))
+    room = MAX_ROBOT_BYTES
+    allowed = {}
+    for digest, mesh in found.items():
+        if 0 < mesh.size <= min(room, triangles.MAX_BYTES) and len(allowed) < MAX_MESHES:
+            allowed[digest] = mesh
+            room -= mesh.size
+    return allowed
+
+
+def read_triangles(file: str) -> np.ndarray:
+    """Corners [face, 3, 3] m of a mesh file, binary32; the errors of its format if it is unreadable."""
+    if file.lower().endswith(".stl") and _is_binary_stl(file):
+        facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+        with open(file, "rb") as opened:
+            faces = int.from_bytes(opened.read(84)[80:84], "little")
+            return np.fromfile(opened, facet, faces)["corners"]
+    import trimesh
+
+    return np.asarray(cast("trimesh.Trimesh", trimesh.load(file, force="mesh")).triangles, np.float32)
+
+
+def replace_unopened_meshes(
+    root: etree._Element, assumed: list[str], received: Mapping[str, np.ndarray] | None = None
+) -> dict[str, np.ndarray]:
+    """Replace all file names of meshes, without opening a file: by the name of ``received`` triangles (by digest), or
+    the mesh by the box of its ``bounds``; a mesh without bounds is removed.
+
+    For a URDF from the network, whose numbers were checked. Adds to ``assumed``. Returns the corners [face, 3, 3] of
+    the meshes, by the names that they have in ``root`` now.
     """
     links = list(root.iterfind("link"))
-    count = 0
+    count, meshes = 0, {}
     for link in links:
         for shape in (*link.findall("visual"), *link.findall("collision")):
             mesh = shape.find("geometry/mesh")
             if mesh is None:
+                continue
+            digest = mesh.get("digest", "")
+            if received is not None and digest in received:
+                name = f"{digest}.stl"
+                mesh.set("filename", name)
+                meshes[name] = received[digest]
                 continue
             count += 1
             if mesh.get("bounds") is None:
@@ -101,6 +169,7 @@ def replace_unopened_meshes(root: etree._Element, assumed: list[str]) -> None:
                 _replace_by_box(shape, mesh, np.array(mesh.get("bounds").split(), float).reshape(2, 3))
     if count:
         assumed.append(f"{count} meshes of another client are not opened: boxes of their size stand in")
+    return meshes
 
 
 def _is_binary_stl(filename: str) -> bool:
@@ -111,26 +180,36 @@ def _is_binary_stl(filename: str) -> bool:
     return 1 <= faces <= MAX_STL_FACES and pathlib.Path(filename).stat().st_size >= 84 + 50 * faces
 
 
-def _bounds(mesh: etree._Element, file: pathlib.Path) -> np.ndarray:
-    """Lower and upper corner [2, 3] m of a mesh before it is scaled; :class:`DescriptionError` if it is unreadable."""
+class _Facts(NamedTuple):
+    """What others must know of a mesh file."""
+
+    bounds: np.ndarray
+    """Lower and upper corner [2, 3] m before it is scaled."""
+    digest: str
+    """Of its triangles; empty if it has too many to be sent, or none."""
+    faces: int
+
+
+def _facts(mesh: etree._Element, file: pathlib.Path) -> _Facts:
+    """What others must know of a mesh; :class:`DescriptionError` if its file is unreadable."""
     name = mesh.get("filename")
     try:
-        return _file_bounds(name, pathlib.Path(name).stat().st_mtime_ns)
+        return _file_facts(name, pathlib.Path(name).stat().st_mtime_ns)
     except Exception as error:  # each format has errors of its own
         raise description_error(file, f"mesh {name!r} cannot be read ({error})", "convert it to STL or OBJ") from error
 
 
 @functools.lru_cache(1024)  # a mesh is often there as visual and collision shape, and for several robots
-def _file_bounds(name: str, modified: int) -> np.ndarray:
-    """Lower and upper corner [2, 3] m of a mesh file that was ``modified`` then [ns]."""
-    if name.lower().endswith(".stl") and _is_binary_stl(name):
-        facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-        faces = int.from_bytes(pathlib.Path(name).read_bytes()[80:84], "little")
-        corners = np.fromfile(name, facet, faces, offset=84)["corners"].reshape(-1, 3)
-        return np.array([corners.min(axis=0), corners.max(axis=0)], float)
-    import trimesh
-
-    return np.array(trimesh.load(name, force="mesh").bounds, float)
+def _file_facts(name: str, modified: int) -> _Facts:
+    """The same of a mesh file that was ``modified`` then [ns]."""
+    corners = read_triangles(name)
+    points = corners.reshape(-1, 3)
+    bounds = np.array([points.min(axis=0), points.max(axis=0)], float)
+    try:
+        digest = triangles.digest_of(triangles.encode_triangles(corners))
+    except triangles.TrianglesError:
+        digest = ""
+    return _Facts(bounds, digest, len(corners))
 
 
 def _replace_by_box(shape: etree._Element, mesh: etree._Element, bounds: np.ndarray) -> None:

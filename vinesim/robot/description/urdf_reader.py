@@ -21,7 +21,7 @@ NUMBER_COUNTS = {
     **{("limit", key): 1 for key in ("lower", "upper", "effort", "velocity")},
     ("mimic", "multiplier"): 1, ("mimic", "offset"): 1, ("box", "size"): 3, ("sphere", "radius"): 1,
     **{(solid, key): 1 for solid in ("cylinder", "capsule") for key in ("radius", "length")}, ("mesh", "scale"): 3,
-    ("mesh", "bounds"): 6,
+    ("mesh", "bounds"): 6, ("mesh", "faces"): 1,
 }  # fmt: skip
 """Count of numbers in each attribute, by element and attribute."""
 

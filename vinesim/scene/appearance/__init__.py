@@ -8,6 +8,7 @@ through rings), each with a colour and a surface by name. The bodies that touch 
 from vinesim.scene.appearance.crates import crate_shapes
 from vinesim.scene.appearance.human import FINGERS, PHALANGES, HumanModel, Limbs, load_human_model
 from vinesim.scene.appearance.lofts import smooth_normals
+from vinesim.scene.appearance.mesh_surfaces import read_surface, received_surface
 from vinesim.scene.appearance.postures import apply_posture, posture_names
 from vinesim.scene.appearance.shapes import SURFACES, AppearanceError
 
@@ -22,5 +23,7 @@ __all__ = [
     "crate_shapes",
     "load_human_model",
     "posture_names",
+    "read_surface",
+    "received_surface",
     "smooth_normals",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -56,6 +57,8 @@ class RobotSpec:
     """[joint] start position."""
     base_effort: tuple[float, float] = (800.0, 400.0)
     """Largest force [N] and moment [N m] with which the tracks hold or drive the base."""
+    meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    """Corners [face, 3, 3] m of meshes that are in no file, by the file name that the URDF gives them."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

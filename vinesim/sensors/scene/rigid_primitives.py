@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import cast
 
 import numpy as np
 
 from vinesim import frames
 from vinesim.kernels.shading import materials
-from vinesim.scene.appearance import smooth_normals
+from vinesim.scene.appearance import read_surface
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import Mesh, RigidVisual, Shape
 from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE
 from vinesim.sensors.scene.bunch_primitives import Ripeness, bunch_batches
 from vinesim.sensors.scene.primitive_batches import Batch, make_batch
-
-_MAX_MESH_FACES = 4000
-"""Most triangles of one mesh; finer ones are simplified."""
 
 _DEFAULT_SURFACE = {Organ.BOX: "plastic", Organ.HUMAN: "cloth"}
 """Surfaces of bodies that name none; robots are painted."""
@@ -115,27 +111,10 @@ _meshes: dict[tuple[str, tuple[float, ...]], Mesh] = {}
 
 
 def _load_mesh(file: str, scale: tuple[float, ...]) -> Mesh:
-    """A mesh file [m], simplified by merging near vertices until it has few enough faces."""
+    """A mesh file [m], with few enough faces."""
     key = (file, scale)
     if key not in _meshes:
-        import trimesh
-
         if not pathlib.Path(file).is_file():
             raise ValueError(f"mesh file {file!r} of a link does not exist; give an absolute path")
-        mesh = cast("trimesh.Trimesh", trimesh.load(file, force="mesh", process=True))
-        vertices, faces = np.asarray(mesh.vertices) * scale, np.asarray(mesh.faces)
-        if np.prod(scale) < 0.0:
-            faces = faces[:, ::-1]
-        extent = float(np.ptp(vertices, axis=0).max(initial=1e-6))
-        cells = 256
-        while len(faces) > _MAX_MESH_FACES and cells > 8:
-            spot = np.floor(vertices / extent * cells).astype(np.int64)
-            _, member = np.unique(spot, axis=0, return_inverse=True)
-            member = member.reshape(-1)
-            count = np.bincount(member)
-            merged = np.stack([np.bincount(member, vertices[:, k]) / count for k in range(3)], 1)
-            linked = member[faces]
-            whole = (linked[:, 0] != linked[:, 1]) & (linked[:, 1] != linked[:, 2]) & (linked[:, 0] != linked[:, 2])
-            vertices, faces, cells = merged, linked[whole], int(cells * 0.75)
-        _meshes[key] = Mesh(vertices[faces].astype(np.float32), smooth_normals(vertices, faces))
+        _meshes[key] = read_surface(file, scale)
     return _meshes[key]

@@ -1,0 +1,70 @@
+"""Meshes as sensors see them: few enough triangles, with smooth normals, from a file or from received triangles."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+
+from vinesim.scene.appearance.lofts import smooth_normals
+from vinesim.scene.triangles import TrianglesError
+from vinesim.scene.values import Mesh
+
+MAX_SURFACE_FACES = 4000
+"""Most triangles of one mesh; finer ones are simplified."""
+
+_MAX_NEIGHBOURS = 10_000_000
+"""Pairs of corners of received triangles at one point, which smooth normals are computed from: memory grows with them.
+Meshes of robots have a tenth of it."""
+
+
+def smooth_surface(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, ...]) -> Mesh:
+    """A mesh [m] of ``vertices`` [vertex, 3], scaled and simplified by merging near vertices until it has few enough
+    ``faces`` [face, 3]."""
+    return _with_normals(*_simplify(vertices, faces, scale))
+
+
+def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
+    """The same of received triangles with ``corners`` [face, 3, 3]: exactly what a file with these would give.
+
+    Raises :class:`TrianglesError` for triangles that cannot be simplified, or too many of which meet at one point.
+    """
+    import trimesh
+
+    every = np.arange(3 * len(corners)).reshape(-1, 3)
+    merged = trimesh.Trimesh(corners.reshape(-1, 3).astype(float), every, process=True)
+    vertices, faces = _simplify(np.asarray(merged.vertices), np.asarray(merged.faces), scale)
+    _, count = np.unique(np.round(vertices[faces.ravel()], 6), axis=0, return_counts=True)
+    if not 1 <= len(faces) <= 4 * MAX_SURFACE_FACES or (count.astype(float) ** 2).sum() > _MAX_NEIGHBOURS:
+        raise TrianglesError(f"{len(corners)} triangles that lie on one another or vanish")
+    return _with_normals(vertices, faces)
+
+
+def read_surface(file: str, scale: tuple[float, ...]) -> Mesh:
+    """The same of a mesh ``file``."""
+    import trimesh
+
+    mesh = cast("trimesh.Trimesh", trimesh.load(file, force="mesh", process=True))
+    return smooth_surface(np.asarray(mesh.vertices), np.asarray(mesh.faces), scale)
+
+
+def _simplify(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    vertices = vertices * scale
+    if np.prod(scale) < 0.0:
+        faces = faces[:, ::-1]
+    extent = float(np.ptp(vertices, axis=0).max(initial=1e-6))
+    cells = 256
+    while len(faces) > MAX_SURFACE_FACES and cells > 8:
+        spot = np.floor(vertices / extent * cells).astype(np.int64)
+        _, member = np.unique(spot, axis=0, return_inverse=True)
+        member = member.reshape(-1)
+        count = np.bincount(member)
+        merged = np.stack([np.bincount(member, vertices[:, k]) / count for k in range(3)], 1)
+        linked = member[faces]
+        whole = (linked[:, 0] != linked[:, 1]) & (linked[:, 1] != linked[:, 2]) & (linked[:, 0] != linked[:, 2])
+        vertices, faces, cells = merged, linked[whole], int(cells * 0.75)
+    return vertices, faces
+
+
+def _with_normals(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    return Mesh(vertices[faces].astype(np.float32), smooth_normals(vertices, faces))
