@@ -1,4 +1,4 @@
-"""Body parts of a remote person that jumped: they touch nothing until they are clear of robots.
+"""Body parts of a remote person that jumped or pushed too hard: they touch nothing until they are clear of robots.
 
 The kinematic parts give way to nothing, so one that a message puts into a robot, or moves faster than a person can,
 would throw the robot aside. Such a part passes through rigid bodies instead, and is solid again where it overlaps no
@@ -28,14 +28,14 @@ class PassingParts:
         self._obstacles = np.flatnonzero(m.geom_contype & ROBOTS)
         self._apply(m)
 
-    def update(self, m: mujoco.MjModel, d: mujoco.MjData, places: np.ndarray, jumped: np.ndarray) -> None:
-        """Parts that ``jumped`` [k] bool touch nothing from now on; others do again if they are clear of robots.
+    def update(self, m: mujoco.MjModel, d: mujoco.MjData, places: np.ndarray, released: np.ndarray) -> None:
+        """Parts that are ``released`` [k] bool touch nothing from now on; others do again if they are clear of robots.
 
         ``places`` [k, 3] m: origins of the parts at the end of this step.
         """
-        if not (self.is_passing.any() or jumped.any()):
+        if not (self.is_passing.any() or released.any()):
             return
-        passing = jumped | (self.is_passing & self._overlaps(m, d, places))
+        passing = released | (self.is_passing & self._overlaps(m, d, places))
         if (passing != self.is_passing).any():
             self.is_passing = passing
             self._apply(m)
