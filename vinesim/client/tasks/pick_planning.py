@@ -41,6 +41,8 @@ LANE_HALF_WIDTH = 0.36
 """[m] A base that drives straight needs this on either side of its centre."""
 OBSTACLE_RADIUS = 0.8
 """[m] Obstacles farther from a bunch than this cannot meet the hand."""
+OBSTACLE_SPACING = 0.04
+"""[m] Greatest distance of the spheres that stand for trellis and old wood."""
 MAX_CANDIDATES = 200
 """Number of the nearest bunches that are tried."""
 
@@ -56,7 +58,7 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
             f"no box of this scene has {BASE_CLEARANCE} m of room beside it for a robot; place one in an alley"
         )
     found = False
-    for bunch, side, base in _base_poses(model, near):
+    for bunch, side, base, _ in _base_poses(model, near, MIN_HAND_CLEARANCE):
         beside = [approach for approach in approaches if approach.side == side]
         for approach in sorted(beside, key=lambda approach: float(np.linalg.norm(approach.start - base[:2]))):
             points = find_path(model, base[:2], approach.start, BASE_CLEARANCE)
@@ -71,8 +73,22 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
         )
 
 
-def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarray]]:
-    """Bunch, side and pose [7] of the base for all reachable grasps, best first."""
+def freest_bases(model: Model, near: np.ndarray, distance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """The bunches within ``distance`` [m] of ``near`` [2] m that a hand reaches, however narrow it is about them.
+
+    Of each bunch its number, the side, the pose [7] of the base where the hand has most room, and that room [m]:
+    negative where the open hand would overlap wood or fruit, and no more than :data:`FULL_CLEARANCE`.
+    """
+    seen: set[int] = set()
+    middles = bunch_centres(model)
+    for bunch, side, base, clearance in _base_poses(model, near, -np.inf):
+        if bunch not in seen and np.linalg.norm(middles[bunch, :2] - near) < distance:
+            seen.add(bunch)
+            yield bunch, side, base, clearance
+
+
+def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """Bunch, side, pose [7] of the base and clearance of the hand [m] for all reachable grasps, best first."""
     points, radius, owner = _obstacles(model)
     body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
@@ -108,16 +124,17 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
         for j, clear in zip(
             looking.tolist(), (apart - radius[here]).min(-1, initial=FULL_CLEARANCE).tolist(), strict=True
         ):
-            for k in np.flatnonzero(roomy[i, j]).tolist() if clear >= MIN_HAND_CLEARANCE else ():
+            for k in np.flatnonzero(roomy[i, j]).tolist() if clear >= min_clearance else ():
                 score = clear - 0.01 * float(np.linalg.norm(base[i, j, k] - near))
                 pose = frames.pose(np.append(base[i, j, k], 0.0), turn[j])
-                found.append((-score, bunch, ("left", "right")[k], pose))
-    for _, bunch, side, pose in sorted(found, key=lambda entry: entry[:3]):
-        yield bunch, side, pose
+                found.append((-score, bunch, ("left", "right")[k], pose, clear))
+    for _, bunch, side, pose, clear in sorted(found, key=lambda entry: entry[:3]):
+        yield bunch, side, pose, clear
 
 
 def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spheres that fill wood and bunches at rest: centres [n, 3] m, radii [n] m, and the bunch of each [n] or -1."""
+    """Spheres that fill wood, trellis and bunches at rest: centres [n, 3] m, radii [n] m, and the bunch of each [n] or
+    -1."""
     body_q = model.forward_kinematics(model.joint_settled).astype(float)
     owner = model.bunch_of_body()
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
@@ -131,12 +148,23 @@ def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     bunch_axis = axis[model.bunch_body]
     fruit = middles + (0.5 * model.bunch_length[:, None] * depth)[..., None] * bunch_axis[:, None]
     plump = model.bunch_radius[:, None] * np.sqrt(1.0 - depth**2)
+    still, thick = _fixed_spheres(model)
     owners = np.repeat(owner[wood], len(share)), np.repeat(np.arange(len(model.bunch_body)), len(depth))
     return (
-        np.concatenate([points.reshape(-1, 3), fruit.reshape(-1, 3)]),
-        np.concatenate([radius.ravel(), plump.ravel()]),
-        np.concatenate(owners),
+        np.concatenate([points.reshape(-1, 3), fruit.reshape(-1, 3), still]),
+        np.concatenate([radius.ravel(), plump.ravel(), thick]),
+        np.concatenate([*owners, np.full(len(still), -1)]),
     )
+
+
+def _fixed_spheres(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Spheres along everything that stands still: centres [n, 3] m and radii [n] m."""
+    along = (model.fixed_end - model.fixed_start).astype(float)
+    count = np.ceil(np.linalg.norm(along, axis=1) / OBSTACLE_SPACING).astype(int) + 1
+    piece = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
+    share = number / np.maximum(count - 1, 1)[piece]
+    return model.fixed_start[piece] + share[:, None] * along[piece], model.fixed_radius[piece].max(1).astype(float)
 
 
 @dataclasses.dataclass(frozen=True)
