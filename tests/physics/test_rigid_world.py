@@ -78,9 +78,9 @@ def step(rigid: RigidWorld, ticks: int = 1) -> None:
         rigid.integrate()
 
 
-def test_only_poles_and_trunks_are_static_geoms():
-    names = [yard_geom.name for yard_geom in map(RigidWorld(yard()).mj_model.geom, range(2))]
-    assert names == ["ground", "fixed/0"]
+def test_everything_that_stands_still_is_a_static_geom():
+    names = [yard_geom.name for yard_geom in map(RigidWorld(yard()).mj_model.geom, range(3))]
+    assert names == ["ground", "fixed/0", "fixed/1"]
 
 
 def test_split_step_is_bitwise_mj_step():

@@ -14,7 +14,7 @@ DESCRIPTIONS = {
     "trees_slowed": "trees turned faster than max_joint_rate and were slowed below it, which takes energy from them",
     "robots_stopped": "robots or boxes moved by a number that is not finite and were put back",
     "contacts_dropped": "contacts were left out, as there were more than there is room for",
-    "geoms_skipped": "poles or trunks near a tree were left out, as there are more than max_static_geoms_per_tree",
+    "geoms_skipped": "static geoms near a tree were left out, as there are more than max_static_geoms_per_tree",
     "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",
     "couplings_refused": "forces of other actors on plants were refused, as too many bodies of plants were held",
     "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",

@@ -1,4 +1,4 @@
-"""Paths of a base on the ground, around posts, trunks and boxes: A* on a grid, then straightened."""
+"""Paths of a base on the ground, around posts, trunks, wires and boxes: A* on a grid, then straightened."""
 
 from __future__ import annotations
 

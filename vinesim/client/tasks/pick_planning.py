@@ -41,6 +41,8 @@ LANE_HALF_WIDTH = 0.36
 """[m] A base that drives straight needs this on either side of its centre."""
 OBSTACLE_RADIUS = 0.8
 """[m] Obstacles farther from a bunch than this cannot meet the hand."""
+OBSTACLE_SPACING = 0.04
+"""[m] Greatest distance of the spheres that stand for trellis and old wood."""
 MAX_CANDIDATES = 200
 """Number of the nearest bunches that are tried."""
 
@@ -117,7 +119,8 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
 
 
 def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spheres that fill wood and bunches at rest: centres [n, 3] m, radii [n] m, and the bunch of each [n] or -1."""
+    """Spheres that fill wood, trellis and bunches at rest: centres [n, 3] m, radii [n] m, and the bunch of each [n] or
+    -1."""
     body_q = model.forward_kinematics(model.joint_settled).astype(float)
     owner = model.bunch_of_body()
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
@@ -131,12 +134,23 @@ def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     bunch_axis = axis[model.bunch_body]
     fruit = middles + (0.5 * model.bunch_length[:, None] * depth)[..., None] * bunch_axis[:, None]
     plump = model.bunch_radius[:, None] * np.sqrt(1.0 - depth**2)
+    still, thick = _fixed_spheres(model)
     owners = np.repeat(owner[wood], len(share)), np.repeat(np.arange(len(model.bunch_body)), len(depth))
     return (
-        np.concatenate([points.reshape(-1, 3), fruit.reshape(-1, 3)]),
-        np.concatenate([radius.ravel(), plump.ravel()]),
-        np.concatenate(owners),
+        np.concatenate([points.reshape(-1, 3), fruit.reshape(-1, 3), still]),
+        np.concatenate([radius.ravel(), plump.ravel(), thick]),
+        np.concatenate([*owners, np.full(len(still), -1)]),
     )
+
+
+def _fixed_spheres(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Spheres along everything that stands still: centres [n, 3] m and radii [n] m."""
+    along = (model.fixed_end - model.fixed_start).astype(float)
+    count = np.ceil(np.linalg.norm(along, axis=1) / OBSTACLE_SPACING).astype(int) + 1
+    piece = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
+    share = number / np.maximum(count - 1, 1)[piece]
+    return model.fixed_start[piece] + share[:, None] * along[piece], model.fixed_radius[piece].max(1).astype(float)
 
 
 @dataclasses.dataclass(frozen=True)

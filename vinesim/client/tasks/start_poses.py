@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Spawn
 
@@ -22,6 +21,8 @@ BASE_CLEARANCE = 0.55
 
 QUEUE_SPACING = 1.5
 """[m] Between robots of one client that start behind one another. GUESSED"""
+OVERHEAD = 1.8
+"""[m] What stands still and is wholly above this does not stop a base with its arms tucked (it is 1.6 m high)."""
 MAX_CANDIDATES = 200
 """Number of the nearest bunches that are tried."""
 
@@ -95,15 +96,20 @@ def validate_bunch(model: Model, bunch: int | None) -> int | None:
 
 
 def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndarray:
-    """Distance on the ground from points [n, 2] m to the nearest post, trunk or box [n] m; infinite without any.
+    """Distance on the ground from points [n, 2] m to the nearest obstacle or box [n] m; infinite without any.
+
+    Obstacles are all poles, trunks, wires and arms. What is wholly above :data:`OVERHEAD` does not count.
 
     ``without``: number of a box that is left out.
     """
-    solid = np.isin(model.fixed_organ, (Organ.POLE, Organ.TRUNK))
+    solid = np.minimum(model.fixed_start[:, 2], model.fixed_end[:, 2]) < OVERHEAD
     clearance = np.full(len(points), np.inf)
     if solid.any():
-        middles, radii = model.fixed_start[solid, :2], model.fixed_radius[solid].max(1)
-        clearance = (np.linalg.norm(points[:, None] - middles, axis=-1) - radii).min(1)
+        start, radii = model.fixed_start[solid, :2], model.fixed_radius[solid].max(1)
+        along = model.fixed_end[solid, :2] - start
+        offset = points[:, None] - start
+        share = np.clip((offset * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-12), 0.0, 1.0)
+        clearance = (np.linalg.norm(offset - share[..., None] * along, axis=-1) - radii).min(1)
     for box, pose in enumerate(model.box_pose.astype(float)):
         if box != without:
             beside = np.pad(points - pose[:2], ((0, 0), (0, 1)))

@@ -48,7 +48,7 @@ def movable_geoms(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> Rigid
 
 
 def static_geoms(m: mujoco.MjModel) -> RigidGeoms:
-    """Ground, poles and trunks: MuJoCo's first geoms, independent of the actors that join and leave."""
+    """Ground, trellis and old wood: MuJoCo's first geoms, independent of the actors that join and leave."""
     ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
     return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
 

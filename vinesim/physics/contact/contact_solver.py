@@ -30,7 +30,7 @@ class ContactSolver:
     leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.integrate()``.
 
     Robots, people, boxes and free bunches wake the trees that they are near to, awake trees those that they touch.
-    Static geoms (ground, poles, trunks) only hold back what moves already. What overlaps in the scene as generated is
+    Static geoms (ground, trellis, wood) only hold back what moves already. What overlaps in the scene as generated is
     in contact only beyond that. All numbers come from ``rigid.parameters``; of more contacts than
     ``contact_capacity``, the deepest are kept, and ``dropped_contacts`` and ``overflow_message`` report it.
     """
