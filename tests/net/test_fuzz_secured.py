@@ -24,7 +24,8 @@ from vinesim.net.transport.zenoh_session import close_session, config, open_sess
 
 KEYS = (
     "{key}", "*/{key}", "vineyard/**", "vineyard/*/*/*/" + ATTACKER, "other/{key}", "vineyard", "vineyard/fact",
-    "vineyard/fact/*/*/" + ATTACKER, "vineyard/fact/0", "vineyard/own/0/0/ada", "vineyard/fact/0/0/ada", "vineyard/a/ada",
+    "vineyard/fact/*/*/" + ATTACKER, "vineyard/fact/0", "vineyard/own/0/0/ada", "vineyard/fact/0/0/ada",
+    "vineyard/a/ada",
     "vineyard/live/ada/1", "vineyard/join/ada/1", "vineyard/hello/ada", "vineyard/clock", "vineyard/snap/0/0",
     "vineyard/snap/*/x", "vineyard/" + "n/" * 500 + "n", "vineyard/" + "n" * 5000, "vineyard/fact/x/" + ATTACKER,
     "vineyard/force/ada/ada", "vineyard/voice/0/0/ada", "vineyard/mesh/0", "vineyard/offer/0",
