@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.codec.messages import RESTING, RetainedRecord, TreeStates, encode_trees
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
@@ -49,3 +50,36 @@ def test_a_box_in_a_box_is_moved_by_whoever_carries_the_lower_one(client) -> Non
     assert not client.objects._is_moved_remotely("box/1")
     client.objects.receive(Inbox(records=[at_rest(SECOND, "", "bob")]))
     assert client.objects._supporting_actor(FIRST) == "bob"
+
+
+def test_records_that_each_local_actor_receives_are_applied_once(client) -> None:
+    """All actors of a client receive the same records: more than there are trees, of a bunch twice, and late ones."""
+    objects, model = client.objects, client.model
+    trees = [tree_at_rest(client, tree, authority=2, turn=0.1) for tree in range(len(model.tree_first))]
+    late = tree_at_rest(client, 0, authority=1, turn=0.2)
+    bunch = object_id(ObjectKind.BUNCH, 0)
+    moving = RetainedRecord(bunch, 1, 2, "ada", (0.2, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0), moving=True), True
+    objects.receive(Inbox(records=[*trees, at_rest(bunch, "", "ada"), moving, *trees, late, at_rest(bunch, "", "ada")]))
+    here = model.bodies_of(0)
+    assert np.abs(client.physics.state.joint_q[here] - turned(client, 0, 0.1)).max() < 1e-3
+    assert bunch in client.physics.support_tracker, "it moves by its newest record"
+    assert 0 not in client.physics.dormant_bunches
+    client.tick()
+
+
+def tree_at_rest(client: Client, tree: int, *, authority: int, turn: float) -> tuple[RetainedRecord, bool]:
+    """A record of a tree that rests with every joint turned by ``turn`` [rad]."""
+    size = client.model.tree_size[tree]
+    q = turned(client, tree, turn)
+    states = TreeStates(
+        0.0, np.array([tree]), np.array([1]), np.array([authority]), np.array([RESTING]), np.array([size]), q,
+        np.zeros((size, 3)),
+    )  # fmt: skip
+    (payload,), _ = encode_trees(states)
+    return RetainedRecord(tree, 1, authority, "ada", trees=payload), True
+
+
+def turned(client: Client, tree: int, turn: float) -> np.ndarray:
+    """Joint rotations [n, 4] of a settled tree, each turned by ``turn`` [rad] about y."""
+    settled = client.model.joint_settled[client.model.bodies_of(tree)]
+    return frames.multiply(frames.exp(np.array([0.0, turn, 0.0])), settled)

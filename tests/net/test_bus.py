@@ -96,15 +96,15 @@ def test_reliable_samples_all_arrive_in_order_despite_loss():
     ada, bob = hub.bus("ada"), hub.bus("bob")
     bob.subscribe("own/**", KEEP_ALL)
     bob.subscribe("c/**", KEEP_LAST_64)
-    events, stream = ada.publisher("own/x", reliable=True), ada.publisher("c/x")
+    events, stream = ada.publisher("own/x/ada", reliable=True), ada.publisher("c/x/ada")
     for number in range(60):
         events.put(bytes([number]))
         stream.put(bytes([number]))
         hub.advance(0.001)
     hub.advance(1.0)
     received = bob.poll()
-    assert [p[0] for k, p in received if k == "own/x"] == list(range(60))
-    unreliable = [p[0] for k, p in received if k == "c/x"]
+    assert [p[0] for k, p in received if k == "own/x/ada"] == list(range(60))
+    unreliable = [p[0] for k, p in received if k == "c/x/ada"]
     assert 15 < len(unreliable) < 45
     assert unreliable != sorted(unreliable)
 

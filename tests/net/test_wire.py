@@ -162,10 +162,10 @@ def test_puts_without_subscribers_cost_nothing():
 
         cost(1, 0.5)
         few, many = cost(1_000), cost(30_000)
-        # keepalives and acknowledgements of an idle connection, more of them on a busy machine, which takes longer;
-        # a put that is sent costs at least 70 B, all of these 2 MB
-        assert few < 1500
-        assert abs(many - few) < 1500
+        # a put that is sent costs at least 70 B, so a hundredth of that is the upkeep of the connection, of which
+        # there is more on a busy machine, which takes longer
+        assert few < 0.1 * 1_000 * 70
+        assert many < 0.01 * 30_000 * 70
 
 
 def test_branch_touched_far_from_all_peers_costs_nothing(world):

@@ -215,7 +215,7 @@ class Crowd:
             owned=sum(client.replicator.owner(number) is not None for client in self.clients for number in moved),
             position=float(np.linalg.norm(spread, axis=-1).max()),
             angle=float((4.0 * np.arcsin(0.5 * chord)).max()),
-            tick=self.busy / (self.ticks * self.count),
+            tick=self.busy / (self.ticks * len(self.clients)),
             faults={name: fault_count for name, fault_count in faults.items() if fault_count},
         )
 

@@ -13,6 +13,7 @@ import numpy as np
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.replication import dead_reckoning
+from vinesim.net.replication.authority import wins
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
 from vinesim.physics.rigid.support_tracking import GROUND
@@ -74,10 +75,18 @@ class ObjectSync:
 
     def _apply_records(self, records: Iterable[tuple[RetainedRecord, bool]]) -> None:
         """Apply retained records, many at once after joining late; the pose in a record counts only if it ``holds``."""
-        dormant, trees = [], []
+        newest: dict[int, tuple[RetainedRecord, bool]] = {}  # several local actors receive the same records
         for record, holds in records:
             if is_tree(record.object):
-                trees += self._apply_tree_record(record, holds)
+                self._apply_cuts(record)
+            known = newest.get(record.object)
+            if known is None or (holds, known[0].claim) == (True, record.claim) or wins(record.claim, known[0].claim):
+                newest.pop(record.object, None)
+                newest[record.object] = record, holds
+        dormant, trees = [], []
+        for record, holds in newest.values():
+            if is_tree(record.object):
+                trees += self._apply_tree_record(record) if holds and record.trees else []
             elif self._apply_object_record(record, holds):
                 dormant.append(record)
         if trees:
@@ -110,13 +119,14 @@ class ObjectSync:
             self._place_on_support([number])
         return bodiless
 
-    def _apply_tree_record(self, record: RetainedRecord, holds: bool) -> list[TreeUpdate]:
-        """Cut off the bodies that a record names; the tree's state of rest if the record has one and ``holds``."""
+    def _apply_cuts(self, record: RetainedRecord) -> None:
+        """Cut off the bodies that the record of a tree names."""
         for body in record.cut:
             if self.physics.model.body_tree[body] == record.object and not self.physics.state.body_cut[body]:
                 self.apply_remote_cut(body)
-        if not (holds and record.trees):
-            return []
+
+    def _apply_tree_record(self, record: RetainedRecord) -> list[TreeUpdate]:
+        """Take over the state of a tree that a record has; that state if the tree rests in it."""
         self._changed_trees.add(record.object)
         (update,) = messages.decode_trees(record.trees, self.physics.model.tree_size).updates(record.author)
         self.blend_tree(update, 1.0)

@@ -208,6 +208,14 @@ def contact_ends(
     return ends
 
 
+@wp.func
+def clear_slots(row: int, count: int, candidates_out: Candidates):
+    """Mark the slots of a row beyond its candidates as empty."""
+    slots = candidates_out.feature.shape[1]
+    for k in range(wp.min(count, slots), slots):
+        candidates_out.feature[row, k] = -1
+
+
 @wp.kernel
 def find_rigid_contacts(
     # model
@@ -290,6 +298,4 @@ def find_rigid_contacts(
                                 count = count + 1
     candidates_out.is_impact[row] = is_impact
     candidates_out.count[row] = count
-    slots = candidates_out.feature.shape[1]
-    for k in range(wp.min(count, slots), slots):
-        candidates_out.feature[row, k] = -1
+    clear_slots(row, count, candidates_out)

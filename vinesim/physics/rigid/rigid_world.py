@@ -117,7 +117,11 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             for actor in added
             if isinstance(actor, RobotBody) and actor.spec.name in self._robots
         }
-        kept = [replaced.get(actor, actor) for actor in planned if actor in replaced or actor not in added]
+        kept: list[RobotBody | HumanBody] = [
+            replaced[actor] if isinstance(actor, RobotBody) and actor in replaced else actor
+            for actor in planned
+            if actor in replaced or actor not in added
+        ]
         stays = tuple(kept) == present
         if not stays or compiled.bunch_slots <= max(self._bunch_slot.values(), default=-1):
             return False
