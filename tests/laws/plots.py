@@ -16,10 +16,10 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from tests.laws import test_contact, test_integration, test_rod_in_space
+from tests.laws import test_integration, test_rod_in_space
 from tests.support import beam_theory
 from tests.support.contact_forces import force_on
-from tests.support.contact_scenes import bunch_scene, grasp, gripper
+from tests.support.contact_scenes import bunch_scene, grasp, gripper, held_point
 from vinesim.bench.mujoco_reference import MujocoScene
 from vinesim.physics.step import Physics
 
@@ -175,7 +175,7 @@ def grasped() -> Table:
             rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, pull]))
         ours.step()
         reference.step()
-        place[:, tick] = [test_contact.middle_of(q) for q in (ours.snapshot().body_q[body], reference.body_pose(body))]
+        place[:, tick] = [held_point(model, q, body) for q in (ours.snapshot().body_q[body], reference.body_pose(body))]
         force[:, tick] = abs(force_on(ours, "left")[1]), abs(reference.contact_force_on("left")[1])
     time = 0.01 * np.arange(800)
     figure, (position, press) = plt.subplots(2, 1, figsize=(8.5, 5.4), sharex=True, layout="constrained")

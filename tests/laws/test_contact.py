@@ -6,17 +6,13 @@ import numpy as np
 import pytest
 
 from tests.support.contact_forces import force_on, ramp
-from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
+from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, held_point, probe
 from vinesim import frames
 from vinesim.bench.mujoco_reference import MujocoScene
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 
 FINGERS = ("left", "right")
-
-
-def middle_of(pose: np.ndarray) -> np.ndarray:
-    return pose[:3] + frames.rotate(pose[3:].astype(float), np.array([0.085, 0.0, 0.0]))
 
 
 def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
@@ -32,10 +28,14 @@ def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
     return velocity
 
 
-@pytest.fixture(scope="module")
-def held():
+CLUSTERS = pytest.mark.parametrize("clusters", [False, True], ids=["plain", "clusters"])
+"""With a bunch of one body, and with one of berry clusters, as generated vines bear them."""
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "clusters"])
+def held(request):
     """Close, lift, move, pull, release: bunch, finger forces and efforts of vinesim and MuJoCo, tick by tick."""
-    model, body, middle = bunch_scene()
+    model, body, middle = bunch_scene(clusters=request.param)
     ours, reference = Physics(model), MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
     rows = {key: [] for key in ("ours", "reference", "force", "reference_force", "effort", "reference_effort")}
@@ -46,13 +46,16 @@ def held():
             rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, pull]))
         ours.step()
         reference.step()
-        rows["ours"].append(middle_of(ours.snapshot().body_q[body]))
-        rows["reference"].append(middle_of(reference.body_pose(body)))
+        rows["ours"].append(held_point(model, ours.snapshot().body_q[body], body))
+        rows["reference"].append(held_point(model, reference.body_pose(body), body))
         rows["force"].append([force_on(ours, finger) for finger in FINGERS])
         rows["reference_force"].append([reference.contact_force_on(finger) for finger in FINGERS])
         rows["effort"].append(ours.rigid.joint_measurements("grip")[2])
         rows["reference_effort"].append(reference.rigid.joint_measurements("grip")[2])
-    return {key: np.array(value) for key, value in rows.items()} | {"physics": ours, "body": body}
+        if 100 < tick < 640:  # also where the hand has carried it, and while nothing moves
+            assert (ours.contact_solver.near_trees == [0]).all()
+            assert ours.state.tree_fine[0] == request.param
+    return {key: np.array(value) for key, value in rows.items()} | {"physics": ours, "body": body, "middle": middle}
 
 
 def test_pose_of_a_held_bunch_is_mujocos(held):
@@ -80,16 +83,16 @@ def test_held_bunch_does_not_creep(held):
 
 def test_a_released_bunch_returns_to_rest(held):
     physics, body = held["physics"], held["body"]
-    _, _, middle = bunch_scene()
     physics.rigid.command("grip", np.zeros(4))
     for _ in range(2500):
         physics.step()
     assert physics.contact_solver.count == 0
-    assert np.linalg.norm(middle_of(physics.snapshot().body_q[body]) - middle) < 5e-3
+    assert np.linalg.norm(held_point(physics.model, physics.snapshot().body_q[body], body) - held["middle"]) < 5e-3
 
 
-def test_contact_effort_is_the_jacobian_transpose_of_the_forces_and_the_drives_balance_it():
-    model, _, middle = bunch_scene()
+@CLUSTERS
+def test_contact_effort_is_the_jacobian_transpose_of_the_forces_and_the_drives_balance_it(clusters):
+    model, _, middle = bunch_scene(clusters=clusters)
     physics = Physics(model)
     physics.add_robot(gripper(middle, effort=30.0))
     for _ in range(60):
@@ -108,8 +111,9 @@ def test_contact_effort_is_the_jacobian_transpose_of_the_forces_and_the_drives_b
     np.testing.assert_allclose(effort - unloaded, -contact, atol=0.02 * np.abs(contact).max())
 
 
-def test_predicted_velocities_are_realised_and_action_is_reaction():
-    model, _, middle = bunch_scene()
+@CLUSTERS
+def test_predicted_velocities_are_realised_and_action_is_reaction(clusters):
+    model, _, middle = bunch_scene(clusters=clusters)
     physics = Physics(model)
     physics.add_robot(gripper(middle))
     rigid, solver = physics.rigid, physics.contact_solver
@@ -218,9 +222,10 @@ def test_a_fast_sweep_agrees_with_mujoco_at_a_quarter_of_a_millisecond():
     assert peak[0] == pytest.approx(peak[1], rel=0.05)
 
 
+@CLUSTERS
 @pytest.mark.parametrize(("pull", "effort"), [(20.0, 40.0), (40.0, 40.0), (60.0, 60.0)])
-def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
-    model, body, middle = bunch_scene()
+def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort, clusters):
+    model, body, middle = bunch_scene(clusters=clusters)
     spec = gripper(middle, effort=effort)
     ours, reference = Physics(model, detachment=False), MujocoScene(model, [spec])
     ours.add_robot(spec)
@@ -233,11 +238,11 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
             rigid.apply_wrench("grip", "hand", np.array([0.0, 0.0, -pull * ramp(t, 2.5, 3.0)]))
         ours.step()
         reference.step()
-        vinesim = middle_of(ours.snapshot().body_q[body])
+        vinesim = held_point(model, ours.snapshot().body_q[body], body)
         held.append(vinesim - ours.rigid.link_pose("grip", "left")[:3])
         force.append([[world.contact_force_on(f) if world is reference else force_on(ours, f) for f in FINGERS]
                       for world in (ours, reference)])  # fmt: skip
-        error = max(error, float(np.linalg.norm(vinesim - middle_of(reference.body_pose(body)))))
+        error = max(error, float(np.linalg.norm(vinesim - held_point(model, reference.body_pose(body), body))))
     held, force = np.array(held), np.array(force)
     assert np.linalg.norm(held[440:].mean(0) - held[240:250].mean(0)) < 5e-5
     assert error < 1e-3
@@ -250,8 +255,9 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort):
     )
 
 
-def test_a_mimicking_finger_presses_like_the_driven_one():
-    model, body, middle = bunch_scene()
+@CLUSTERS
+def test_a_mimicking_finger_presses_like_the_driven_one(clusters):
+    model, body, middle = bunch_scene(clusters=clusters)
     spec = gripper(middle, mimic=True)
     ours, reference = Physics(model), MujocoScene(model, [spec])
     ours.add_robot(spec)
@@ -265,7 +271,13 @@ def test_a_mimicking_finger_presses_like_the_driven_one():
         reference.step()
         force.append([[force_on(ours, f)[1], reference.contact_force_on(f)[1]] for f in FINGERS])
         error = max(
-            error, float(np.linalg.norm(middle_of(ours.snapshot().body_q[body]) - middle_of(reference.body_pose(body))))
+            error,
+            float(
+                np.linalg.norm(
+                    held_point(model, ours.snapshot().body_q[body], body)
+                    - held_point(model, reference.body_pose(body), body)
+                )
+            ),
         )
     force = np.array(force)
     for phase in (slice(150, 240), slice(400, 450)):
@@ -335,9 +347,10 @@ def test_friction_along_a_cane_is_mujocos():
     assert np.sqrt((roughness[:, 0] ** 2).mean()) < np.sqrt((roughness[:, 1] ** 2).mean())
 
 
-def test_two_runs_are_bitwise_equal():
+@CLUSTERS
+def test_two_runs_are_bitwise_equal(clusters):
     def run() -> bytes:
-        model, _, middle = bunch_scene()
+        model, _, middle = bunch_scene(clusters=clusters)
         physics = Physics(model)
         physics.add_robot(gripper(middle))
         history = b""

@@ -20,8 +20,6 @@ BRANCH_FREQUENCY, BRANCH_SPREAD = 11.8, 4.54
 """[Hz] Mean and standard deviation of blackcurrant branches, modal tests: Transactions of the CSAE 2011."""
 BRANCH_DAMPING = 0.0708
 """Damping ratio of the same branches."""
-BRANCH_MASS, BRANCH_STIFFNESS = 0.0686, 394.8
-"""[kg], [N/m] Modal mass and stiffness of the same branches."""
 BARE_DAMPING = (0.01, 0.08)
 """Damping ratio of debranched trees: Moore and Maguire 2004, Trees 18:195 (internal damping alone: below 0.05)."""
 
@@ -33,22 +31,8 @@ def test_a_cane_of_published_wood_swings_within_the_published_band_of_branches()
     beam = Beam(**(vars(beam) | {"beta": BRANCH_DAMPING / (np.pi * f)}))
     plants = beam_theory.standing([beam.tree()])
     swing = beam_theory.run(plants, 200, watch=beam_theory.last_bodies(plants))[:, 0, 2]
-    measured, zeta = beam_theory.fitted_swing(np.arange(200) * plants.dt, swing, f)
+    measured, _ = beam_theory.fitted_swing(np.arange(200) * plants.dt, swing, f)
     assert abs(measured - BRANCH_FREQUENCY) < 2 * BRANCH_SPREAD
-    assert abs(zeta - BRANCH_DAMPING) < 0.01  # the branches' damping was prescribed
-
-
-def test_a_branch_of_the_published_modal_mass_and_stiffness() -> None:
-    """A light rod with 3EI/L^3 and a tip mass as published swings at 12.07 Hz, which is how the two were measured."""
-    beam = Beam(
-        density=8.0, tip=BRANCH_MASS, length=0.5, modulus=BRANCH_STIFFNESS * 0.5**3 / 3 / (np.pi * 0.004**4 / 4)
-    )
-    plants = beam_theory.standing([beam.tree()], phi=0.5, dt=0.001)
-    plants.state.joint_qd[0, 2] = 0.3
-    swing = beam_theory.run(plants, 2000, watch=beam_theory.last_bodies(plants))[:, 0, 1]
-    measured, _ = beam_theory.fitted_swing(np.arange(2000) * plants.dt, swing, 12.07)
-    assert abs(measured - np.sqrt(BRANCH_STIFFNESS / BRANCH_MASS) / (2 * np.pi)) < 0.15
-    assert abs(measured - BRANCH_FREQUENCY) < BRANCH_SPREAD
 
 
 def test_shoots_of_the_shipped_vineyard_damp_within_the_published_bands() -> None:

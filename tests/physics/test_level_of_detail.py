@@ -74,7 +74,9 @@ def moving(physics: Physics) -> np.ndarray:
 
 
 def test_switches_of_detail_keep_pose_and_momentum():
-    """At both switches poses are bitwise equal and momenta within 1e-6; bent joints stay bent."""
+    """At both switches poses are bitwise equal; refining changes no momentum by 1e-6, coarsening none by 1e-4 of the
+    largest of the motion (what it changes goes through the springs into the foot of the tree); bent joints stay bent.
+    """
     model = loaded_canes()
     physics = Physics(model)
     detail, switches = physics.level_of_detail, []
@@ -91,7 +93,7 @@ def test_switches_of_detail_keep_pose_and_momentum():
     physics.plants.refine = lambda trees: checked(refine, trees)
     physics.plants.coarsen = lambda trees: checked(coarsen, trees)
     first_touch = left_at = None
-    max_bend = 0.0
+    max_bend = largest = 0.0
     for tick in push(physics, bunch_centre(model)):
         if first_touch is None and any(c.actor == "bar" for c in physics.contacts):
             first_touch = tick
@@ -100,16 +102,18 @@ def test_switches_of_detail_keep_pose_and_momentum():
         turn = frames.log(frames.multiply(
             frames.conjugate(model.joint_settled[clusters(model)]), physics.state.joint_q[clusters(model)]
         ))  # fmt: skip
+        physics.plants.forward_kinematics(np.array([0]))
+        largest = max(largest, float(np.linalg.norm(momentum(physics, moving(physics)))))
         max_bend = max(max_bend, float(np.linalg.norm(turn, axis=1).max()))
         if left_at is not None and not physics.state.tree_fine[0]:
             break
-    (refined, name, jump, _), (coarsened, other, drop, before) = switches
+    (refined, name, jump, _), (coarsened, other, drop, _) = switches
     assert (name, other) == ("refine", "coarsen")
     assert refined <= first_touch  # never late
     assert coarsened - left_at > DETAIL_STEPS
     assert max_bend > 0.05
     assert np.abs(jump).max() < 1e-6
-    assert np.linalg.norm(drop) < 1e-6 + 0.02 * np.linalg.norm(before)
+    assert np.linalg.norm(drop) < 1e-4 * largest
     assert len(detail.fine_trees) == 0
 
 
@@ -133,7 +137,6 @@ def test_the_level_of_detail_does_not_change_the_branch():
         assert (fine > 100) == is_fine
         paths.append(np.array(at))
     moved = np.abs(paths[0] - model.forward_kinematics(model.joint_settled)[9, :3]).max()
-    print("tip", np.abs(paths[0] - paths[1]).max(), moved, fine)
     assert moved > 5e-3
     assert np.abs(paths[0] - paths[1]).max() < 1e-3
 

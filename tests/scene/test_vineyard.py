@@ -332,25 +332,13 @@ def modes(model, tree):
     return square.real[order], shape.real[:, order], inertia
 
 
-def test_shoots_are_stable_and_bunches_swing_in_the_chosen_band(vineyard):
-    """Every equilibrium is stable, and a bunch swings at 0.9-1.6 Hz, for which ``peduncle.modulus`` was chosen.
-
-    The band is a GUESSED target: no measurement of swinging grape bunches is at hand.
-    """
+def test_shoots_are_stable(vineyard):
+    """Every equilibrium is stable, of shoots with none, one and two bunches."""
     model = vineyard[1]
     bunch_count = np.bincount(model.body_tree[model.bunch_body], minlength=len(model.tree_first))
-    swings = []
     for count in (0, 1, 2):
         for tree in np.flatnonzero(bunch_count == count)[:: 9 if count == 0 else 1][:6]:
-            square, shape, inertia = modes(model, tree)
-            assert square[0] > 0.0, f"tree {tree} with {count} bunches is unstable"
-            if count == 1:
-                stalk = slice(3 * int(model.tree_core[tree] - 3), None)  # two pieces of stalk and the bunch
-                bunch_share = np.array([abs(v[stalk] @ (inertia @ v)[stalk]) / abs(v @ inertia @ v) for v in shape.T])
-                swings.append(
-                    math.sqrt(square[np.argmax(np.where(square < 200.0, bunch_share, 0.0))]) / (2.0 * math.pi)
-                )
-    assert 0.9 < np.median(swings) < 1.6, swings
+            assert modes(model, tree)[0][0] > 0.0, f"tree {tree} with {count} bunches is unstable"
 
 
 def test_two_robots_of_the_demo_reach_one_bunch():

@@ -5,20 +5,22 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble, segment_bunches
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.plant_parameters import load_plant
 from vinesim.scene.values import Drive, RobotSpec
 
 DOWN = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
 
 
 def cane(
-    at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0, pieces: int = 16
-) -> TreeBuilder:
+    at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0, pieces: int = 16,
+    clusters: bool = False,
+) -> TreeBuilder:  # fmt: skip
     """A cane of 1 m in pieces (16 if it has a bunch), level when drawn.
 
-    ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm.
+    ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm, as one body or with ``clusters`` that move near an actor.
     """
     tree = TreeBuilder(frames.pose(np.array(at, float), frames.from_yaw(heading)))
     wood = RodMaterial(
@@ -35,14 +37,43 @@ def cane(
                 inertia=(0.5 * mass * 0.002**2, across, across), stiffness=np.full(3, stiffness),
                 damping=np.full(3, 0.01 * stiffness + 1e-3),
             )  # fmt: skip
-        last = tree.add_body(
-            last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=bunch, com=(0.085, 0, 0), length=0.17,
-            radius=(0.04, 0.04), inertia=(bunch * 0.00064, bunch * 0.00174, bunch * 0.00174),
-            stiffness=np.full(3, stiffness), damping=np.full(3, 0.01 * stiffness + 2e-3),
-        )  # fmt: skip
-        tree.bunches.append({"body": last, "length": 0.17, "radius": 0.045, "berries": 80})
+        _hang_bunch(tree, last, bunch, stiffness, clusters)
     tree.solve_rest_pose()
     return tree
+
+
+def _hang_bunch(tree: TreeBuilder, parent: int, mass: float, stiffness: float, clusters: bool) -> None:
+    """A bunch of 17 cm on a joint of ``stiffness`` [N m/rad]: one body, or a head and five clusters.
+
+    The clusters' springs are isotropic, as MuJoCo's ball joint wants them.
+    """
+    fields: dict = {"mass": mass, "com": (0.085, 0, 0), "inertia": mass * np.array([0.00064, 0.00174, 0.00174])}
+    bunch: dict = {"length": 0.17, "radius": 0.045, "berries": 80}
+    if clusters:
+        vine = load_plant("vine")
+        one = segment_bunches(
+            np.array([mass]), np.array([0.17]), np.array([0.045]), np.array([80]), np.array([0]), vine.rachis,
+            vine.bunch.stem_share.value,
+        )  # fmt: skip
+        whole, com, inertia = (value[0] for value in one.compound())
+        fields = {"mass": whole, "com": com, "inertia": inertia}
+        bunch |= {
+            "clusters": int(one.count[0]) - 1, "head_mass": one.mass[0, 0], "head_com": one.com[0, 0],
+            "head_inertia": one.inertia[0, 0],
+        }  # fmt: skip
+    body = tree.add_body(
+        parent, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), length=0.17, radius=(0.04, 0.04),
+        stiffness=np.full(3, stiffness), damping=np.full(3, 0.01 * stiffness + 2e-3), **fields,
+    )  # fmt: skip
+    tree.bunches.append({"body": body} | bunch)
+    for i in range(1, bunch.get("clusters", 0) + 1):
+        bends = float(one.stiffness[0, i, 1])
+        tree.clusters.append({
+            "parent": None if i > 1 else body, "offset": np.array([one.length[0], 0.0, 0.0]), "rest": frames.IDENTITY,
+            "organ": int(Organ.BUNCH), "mass": one.mass[0, i], "com": one.com[0, i], "inertia": one.inertia[0, i],
+            "length": one.length[0], "radius": one.radius[0, i], "stiffness": np.full(3, bends),
+            "damping": np.full(3, vine.rachis.damping.value * bends),
+        })  # fmt: skip
 
 
 def _inertial(mass: float) -> str:
@@ -118,12 +149,20 @@ def probe(at, name: str = "probe", mass: float = 3.0, drives: tuple[Drive, ...] 
     return RobotSpec(name, 2, urdf, "base_footprint", frames.pose(np.array(at, float)), drives, np.zeros(2))
 
 
-def bunch_scene(mass: float = 0.5) -> tuple[Model, int, np.ndarray]:
-    """A model with one hanging bunch, the bunch's body, and the world position of its centre."""
-    model = assemble([cane((0.0, 0.0, 2.0), bunch=mass)])
-    body = int(model.bunch_body[0])
-    pose = model.forward_kinematics(model.joint_settled)[body]
-    return model, body, pose[:3] + frames.rotate(pose[3:], np.array([0.085, 0.0, 0.0]))
+def bunch_scene(mass: float = 0.5, *, clusters: bool = False) -> tuple[Model, int, np.ndarray]:
+    """A model with one hanging bunch, the body that a hand holds, and the world position of the bunch's centre.
+
+    That body is the bunch, or with ``clusters`` the cluster that begins at its centre, see :func:`held_point`.
+    """
+    model = assemble([cane((0.0, 0.0, 2.0), bunch=mass, clusters=clusters)])
+    body = int(model.bunch_cluster[0]) + 2 if clusters else int(model.bunch_body[0])
+    return model, body, held_point(model, model.forward_kinematics(model.joint_settled)[body], body)
+
+
+def held_point(model: Model, pose: np.ndarray, body: int) -> np.ndarray:
+    """The point [3] m of a bunch that a hand holds: the middle of it, or where the cluster ``body`` begins."""
+    arm = 0.085 if body == model.bunch_body[0] else 0.0
+    return pose[:3] + frames.rotate(pose[3:].astype(float), np.array([arm, 0.0, 0.0]))
 
 
 def grasp(t: float) -> tuple[np.ndarray, float]:

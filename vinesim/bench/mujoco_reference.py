@@ -38,16 +38,24 @@ def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None
 
 
 def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[mujoco.MjsBody]:
-    """Add all trees to a world; ``damping`` [body] N m s/rad. Returns MuJoCo's bodies, without geoms."""
+    """Add all trees to a world; ``damping`` [body] N m s/rad. Returns MuJoCo's bodies, without geoms.
+
+    Berry clusters are bodies of their own, and the body of their bunch is its head.
+    """
     made: list[mujoco.MjsBody] = []
+    mass, com, inertia = model.body_mass.copy(), model.body_com.copy(), model.body_inertia.copy()
+    clustered = model.bunch_clusters > 0
+    heads = model.bunch_body[clustered]
+    mass[heads], com[heads] = model.bunch_head_mass[clustered], model.bunch_head_com[clustered]
+    inertia[heads] = model.bunch_head_inertia[clustered]
     for body in range(len(model.body_mass)):
         parent = int(model.body_parent[body])
         pose = frames.pose(model.body_offset[body], model.body_rest[body])
         if parent < 0:
             pose = frames.compose(model.tree_pose[model.body_tree[body]].astype(float), pose)
         child = (spec.worldbody if parent < 0 else made[parent]).add_body(
-            name=f"plant/{body}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[body]),
-            ipos=model.body_com[body], inertia=model.body_inertia[body], explicitinertial=True,
+            name=f"plant/{body}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(mass[body]),
+            ipos=com[body], inertia=inertia[body], explicitinertial=True,
         )  # fmt: skip
         child.add_joint(
             name=f"plant/{body}", type=mujoco.mjtJoint.mjJNT_BALL, stiffness=float(model.joint_stiffness[body, 1]),
@@ -59,6 +67,8 @@ def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[
 
 class MujocoScene:
     """A scene of plants and robots wholly in MuJoCo: one world, ball joints, a capsule or spheres for every body.
+
+    Bunches that have berry clusters are always fine: each cluster is a body with its own capsule.
 
     Robots touch plants; plants do not touch each other (in ours they may, so MuJoCo has less to compute). Commands are
     given to ``rigid``, as to that of a :class:`vinesim.physics.step.Physics`. The scheme of ``discrete`` adds dt K of
@@ -81,7 +91,9 @@ class MujocoScene:
             RobotBody(robot, code, mine.parameters).add_to(spec)
         made = _add_plants(spec, model, np.maximum(model.joint_damping - dt * model.joint_stiffness, 0.0)[:, 1])
         shapes = plant_capsules(model)
-        for body, start, end, radius in zip(shapes.body, shapes.start, shapes.end, shapes.radius, strict=True):
+        fine = np.flatnonzero(shapes.level != 1)
+        columns = shapes.body[fine], shapes.start[fine], shapes.end[fine], shapes.radius[fine]
+        for body, start, end, radius in zip(*columns, strict=True):
             kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}
             if (start != end).any():
                 kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}

@@ -50,6 +50,12 @@ def _start() -> Iterator[Measurement]:
     return start_measurements()
 
 
+def _picking() -> Iterator[Measurement]:
+    from vinesim.bench.picking import picking
+
+    return picking()
+
+
 def _camera() -> Iterator[Measurement]:
     from vinesim.bench.camera import camera
 
@@ -144,6 +150,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "tick": _tick,
     "asleep": _asleep,
     "start": _start,
+    "picking": _picking,
     "camera": _camera,
     "lidar": _lidar,
     "sensors": _sensors,

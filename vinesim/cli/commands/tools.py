@@ -26,7 +26,8 @@ def bench(
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
 
-    What a user waits for: start. Of physics: plants, contact, tick, asleep. Of sensors: camera and lidar (speed),
+    What a user waits for: start. Of physics: plants, contact, tick, asleep. Of jobs: picking (every bunch in reach, in
+    simulated time). Of sensors: camera and lidar (speed),
     sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
     beside budgets). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links;
     needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz

@@ -58,7 +58,7 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
             f"no box of this scene has {BASE_CLEARANCE} m of room beside it for a robot; place one in an alley"
         )
     found = False
-    for bunch, side, base in _base_poses(model, near):
+    for bunch, side, base, _ in _base_poses(model, near, MIN_HAND_CLEARANCE):
         beside = [approach for approach in approaches if approach.side == side]
         for approach in sorted(beside, key=lambda approach: float(np.linalg.norm(approach.start - base[:2]))):
             points = find_path(model, base[:2], approach.start, BASE_CLEARANCE)
@@ -73,8 +73,22 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
         )
 
 
-def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.ndarray]]:
-    """Bunch, side and pose [7] of the base for all reachable grasps, best first."""
+def freest_bases(model: Model, near: np.ndarray, distance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """The bunches within ``distance`` [m] of ``near`` [2] m that a hand reaches, however narrow it is about them.
+
+    Of each bunch its number, the side, the pose [7] of the base where the hand has most room, and that room [m]:
+    negative where the open hand would overlap wood or fruit, and no more than :data:`FULL_CLEARANCE`.
+    """
+    seen: set[int] = set()
+    middles = bunch_centres(model)
+    for bunch, side, base, clearance in _base_poses(model, near, -np.inf):
+        if bunch not in seen and np.linalg.norm(middles[bunch, :2] - near) < distance:
+            seen.add(bunch)
+            yield bunch, side, base, clearance
+
+
+def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """Bunch, side, pose [7] of the base and clearance of the hand [m] for all reachable grasps, best first."""
     points, radius, owner = _obstacles(model)
     body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
@@ -110,12 +124,12 @@ def _base_poses(model: Model, near: np.ndarray) -> Iterator[tuple[int, str, np.n
         for j, clear in zip(
             looking.tolist(), (apart - radius[here]).min(-1, initial=FULL_CLEARANCE).tolist(), strict=True
         ):
-            for k in np.flatnonzero(roomy[i, j]).tolist() if clear >= MIN_HAND_CLEARANCE else ():
+            for k in np.flatnonzero(roomy[i, j]).tolist() if clear >= min_clearance else ():
                 score = clear - 0.01 * float(np.linalg.norm(base[i, j, k] - near))
                 pose = frames.pose(np.append(base[i, j, k], 0.0), turn[j])
-                found.append((-score, bunch, ("left", "right")[k], pose))
-    for _, bunch, side, pose in sorted(found, key=lambda entry: entry[:3]):
-        yield bunch, side, pose
+                found.append((-score, bunch, ("left", "right")[k], pose, clear))
+    for _, bunch, side, pose, clear in sorted(found, key=lambda entry: entry[:3]):
+        yield bunch, side, pose, clear
 
 
 def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -21,6 +21,8 @@ MIN_COPLANAR_COSINE = wp.constant(wp.float64(0.999))
 """[1] Least cosine between the normals at both ends of the part of a segment that lies along one face. TUNED."""
 SLOPE_BISECTIONS = wp.constant(30)
 """Halvings of the segment in the search for its closest point: to 1e-9 of its length."""
+ELLIPSOID_NEWTON_STEPS = wp.constant(12)
+"""Newton steps to the closest point of an ellipsoid: to 1e-9 m wherever the point is."""
 FACE_BISECTIONS = wp.constant(12)
 """Halvings in the search for the ends of what lies along a face: to 1/4096 of the segment's length."""
 
@@ -71,10 +73,47 @@ def box_distance(size: wp.vec3d, p: wp.vec3d):
 
 
 @wp.func
+def ellipsoid_distance(size: wp.vec3d, p: wp.vec3d):
+    """Outward normal (0 to 2) and signed distance (3) [m] of a point from an ellipsoid, in its frame.
+
+    Outside, the closest point is q_i = a_i^2 p_i / (a_i^2 + m), where m solves sum (q_i / a_i)^2 = 1 (Eberly,
+    Distance from a Point to an Ellipsoid, 2013). The sum falls with m and is
+    convex, so Newton's method rises to its root from below. Inside, the distance is of first order about the surface.
+    """
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    a = wp.cw_div(p, size)
+    b = wp.cw_div(a, size)
+    level = wp.length(a)
+    gradient = wp.length(b)
+    if gradient < wp.float64(1.0e-12):
+        return wp.vec4d(zero, zero, one, -size[2])
+    if level <= one:
+        n = b / gradient
+        return wp.vec4d(n[0], n[1], n[2], level * (level - one) / gradient)
+    square = wp.cw_mul(size, size)
+    multiplier = wp.float64(0.0)
+    for i in range(3):  # no term of the sum exceeds 1
+        multiplier = wp.max(multiplier, size[i] * wp.abs(p[i]) - square[i])
+    for i in range(ELLIPSOID_NEWTON_STEPS):
+        shifted = wp.vec3d(square[0] + multiplier, square[1] + multiplier, square[2] + multiplier)
+        c = wp.cw_div(wp.cw_mul(size, p), shifted)
+        excess = wp.dot(c, c) - one
+        slope = wp.float64(2.0) * wp.dot(c, wp.cw_div(c, shifted))
+        if excess > wp.float64(1.0e-14):
+            multiplier += excess / slope
+    shifted = wp.vec3d(square[0] + multiplier, square[1] + multiplier, square[2] + multiplier)
+    # the normal at the closest point q, and p - q = multiplier times q_i / a_i^2
+    out = wp.cw_div(p, shifted)
+    n = wp.normalize(out)
+    return wp.vec4d(n[0], n[1], n[2], multiplier * wp.length(out))
+
+
+@wp.func
 def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
     """Outward normal (0 to 2) and signed distance (3) [m] of a point from a primitive, in the primitive's frame.
 
-    ``size`` is MuJoCo's ``geom_size``. The distance to an ellipsoid is of first order: exact on its surface only.
+    ``size`` is MuJoCo's ``geom_size``. Inside of an ellipsoid the distance is of first order, all else is exact.
     """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
@@ -89,14 +128,7 @@ def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
             n = q / length
         return wp.vec4d(n[0], n[1], n[2], length - size[0])
     if kind == ELLIPSOID:
-        a = wp.cw_div(p, size)
-        b = wp.cw_div(a, size)
-        level = wp.length(a)
-        gradient = wp.length(b)
-        if gradient < tiny:
-            return wp.vec4d(zero, zero, one, -size[2])
-        n = b / gradient
-        return wp.vec4d(n[0], n[1], n[2], level * (level - one) / gradient)
+        return ellipsoid_distance(size, p)
     if kind == CYLINDER:
         return cylinder_distance(size, p)
     return box_distance(size, p)

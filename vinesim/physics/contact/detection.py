@@ -54,6 +54,9 @@ class ContactDetection:
         self._wood_boxes = SharedArrays.zeros(structs.Aabbs, trees)
         blocks = -(-trees // AABB_BLOCK)
         self._blocks, self._block_boxes = np.zeros(blocks, np.int32), SharedArrays.zeros(structs.Aabbs, blocks)
+        self._listed: np.ndarray | None = None
+        self._awake_blocks = np.zeros(0, np.int32)
+        """Blocks of the trees that :meth:`list_awake` was called with last."""
         self.slots = np.arange(parameters.max_contacts_per_tree)
         self._room = 0
 
@@ -86,7 +89,10 @@ class ContactDetection:
         self.arrays.trees.awake[: len(trees)] = trees
         self._launch_over_trees(len(trees), self._tree_aabbs)
         self.compare_anew()
-        blocks = np.unique(trees // AABB_BLOCK)
+        self._update_blocks(np.unique(trees // AABB_BLOCK))
+
+    def _update_blocks(self, blocks: np.ndarray) -> None:
+        """Bring the boxes of some blocks [k] up to those of their trees."""
         self._blocks[: len(blocks)] = blocks
         self._block_aabbs(len(blocks))
 
@@ -123,6 +129,9 @@ class ContactDetection:
         self.arrays.trees.awake[: len(awake)] = awake
         self.counters[structs.AWAKE_TREES] = len(awake)
         self._launch_over_trees(len(awake), self._tree_aabbs)
+        if awake is not self._listed:
+            self._listed, self._awake_blocks = awake, np.unique(awake // AABB_BLOCK)
+        self._update_blocks(self._awake_blocks)  # or a tree that was dragged out of its block would have no actor near
 
     def find_reached_trees(self) -> np.ndarray:
         """Sleeping trees [k] with which one of the listed awake ones is in contact, or will be before the step ends."""

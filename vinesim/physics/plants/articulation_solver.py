@@ -115,7 +115,8 @@ class ArticulationSolver:
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
-        self._clusters = BerryClusters(self)
+        self.berry_clusters = BerryClusters(self)
+        """Locks and unlocks berry clusters; for what leaves the tree, see :class:`DetachmentMonitor`."""
 
     @property
     def dt(self) -> float:
@@ -247,7 +248,7 @@ class ArticulationSolver:
         Pose, velocity and momentum go on. Nothing happens to trees that are fine or have no clusters; none wakes.
         :class:`ValueError` if there is no such tree.
         """
-        self._clusters.refine(trees)
+        self.berry_clusters.refine(trees)
 
     def coarsen(self, trees: np.ndarray | int) -> None:
         """Lock the clusters of these trees' bunches where they are: each bunch becomes one compound.
@@ -257,7 +258,7 @@ class ArticulationSolver:
         against springs as in any step (free of them, a light peduncle would be flung about). A floating tree keeps all
         momentum. Kinetic energy does not grow, as the scheme counts it: with the rates squared times the metric.
         """
-        self._clusters.coarsen(trees)
+        self.berry_clusters.coarsen(trees)
 
     def cut(self, body: int) -> None:
         """Cut a body off its parent: it and what grows on it fall, from where they are and as fast as they are.
@@ -298,7 +299,7 @@ class ArticulationSolver:
         """
         if not 0.0 < mass < math.inf:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
-        self._clusters.set_mass(body, mass)
+        self.berry_clusters.set_mass(body, mass)
 
     # ------------------------------------------------------------------ one step
 

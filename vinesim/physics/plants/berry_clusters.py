@@ -130,6 +130,29 @@ class BerryClusters:
         solver.body_product[parts] *= share
         solver.launches.changed = True
 
+    def fuse(self, bunch: int) -> np.ndarray:
+        """Give one bunch's body the mass of the compound that head and clusters are now, and return the velocity [6]
+        m/s, rad/s of its frame, in world axes, with which that compound has the momentum of its parts.
+
+        The state stays as it is: it is for a bunch that leaves its tree, see :meth:`release`. Its poses and
+        velocities must be current.
+        """
+        solver, body = self._solver, int(self._solver.model.bunch_body[bunch])
+        pose, velocity = solver.state.body_q[body].astype(float), solver.state.body_qd[body].astype(float)
+        if not solver.state.tree_fine[solver.model.body_tree[body]] or solver.model.bunch_clusters[bunch] == 0:
+            return velocity
+        momentum = self.lock(np.array([bunch]))[0]
+        mass, com = float(solver.body_mass[body]), solver.body_com[body].astype(float)
+        x, y, z = solver.body_product[body].astype(float)
+        tensor = np.diag(solver.body_inertia[body].astype(float)) + np.array([[0, z, y], [z, 0, x], [y, x, 0]])
+        spin = np.linalg.solve(tensor, momentum[3:] - np.cross(com, momentum[:3]))
+        change = np.stack([momentum[:3] / mass - np.cross(spin, com), spin])
+        return velocity + frames.rotate(pose[3:], change).ravel()
+
+    def release(self, bunch: int) -> None:
+        """Let the clusters of one bunch of a fine tree move again after :meth:`fuse`."""
+        self.unlock(np.array([bunch] if self._solver.model.bunch_clusters[bunch] else [], np.int64))
+
     def unlock(self, bunches: np.ndarray) -> None:
         """Leave to each bunch's body its head only."""
         solver, model = self._solver, self._solver.model

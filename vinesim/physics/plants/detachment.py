@@ -181,7 +181,7 @@ class DetachmentMonitor:
         # as touched so far, its clusters where they are: what holds it must not feel the difference
         here = (shapes.bunch == bunch) & (shapes.level != (1 if state.tree_fine[tree] else 2))
         of = np.flatnonzero(here & (model.body_organ[shapes.body] == int(Organ.BUNCH)))
-        plants.coarsen(tree)
+        velocity = plants.berry_clusters.fuse(bunch)  # first cut, then fused: its vine and its neighbours feel nothing
         local = frames.compose(frames.inverse(state.body_q[body].astype(float)), state.body_q[shapes.body[of]])
         start, end = (
             local[:, :3] + frames.rotate(local[:, 3:], at[of].astype(float)) for at in (shapes.start, shapes.end)
@@ -191,10 +191,12 @@ class DetachmentMonitor:
             inertia=plants.body_inertia[body].astype(float), product=plants.body_product[body].astype(float),
             start=start, end=end, radius=shapes.radius[of].astype(float),
         )  # fmt: skip
-        self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], plants.state.body_qd[body])
+        self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], velocity)
         plants.state.bunch_attached[bunch] = False
         self._overloaded_steps[bunch] = 0
         plants.set_mass(body, STUB_MASS)
+        if state.tree_fine[tree]:
+            plants.berry_clusters.release(bunch)
         plants.body_drag[body] = 0.0
         self._record(body, bunch, cause, actor, carried)
 
