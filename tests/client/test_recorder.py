@@ -78,8 +78,14 @@ def test_all_messages_are_recorded(tmp_path):
     world.run(0.5)
     recorded = world.recorded()
     assert recorded.damage == ""
-    assert families(recorded) == {"a", "c", "own", "hello", "live", "snap"}
-    about = {"scene": "rows", "seed": "5", "digest": vineyard().digest(), "world": "memory", "protocol": "1"}
+    assert families(recorded) == {"a", "tree", "near", "own", "hello", "live", "snap"}
+    about = {
+        "scene": "rows",
+        "seed": "5",
+        "digest": vineyard().digest(),
+        "world": "memory",
+        "protocol": str(messages.PROTOCOL),
+    }
     assert recorded.metadata.items() >= about.items()
     assert [(e.key, bool(e.payload)) for e in recorded.messages if e.key.startswith("live")] == [
         ("live/ada", True), ("live/bob", True), ("live/bob", False),
@@ -124,7 +130,7 @@ def test_a_recorder_does_not_change_traffic(tmp_path):
                 assert world.ada.environment() > 5_000
             if path is not None:
                 recorded = world.recorded()
-                assert ("c" in families(recorded)) == (distance < INTEREST_RADIUS)
+                assert (not families(recorded).isdisjoint({"tree", "near"})) == (distance < INTEREST_RADIUS)
                 fast = sum(entry.key in ("a/ada", "a/ada/near", "a/ada/mid") for entry in recorded.messages)
                 assert (fast > 100) == (distance < INTEREST_RADIUS)
     assert sent[2.0, True] == sent[2.0, False]
@@ -153,9 +159,9 @@ def test_an_observer_records_an_actor_that_is_alone(tmp_path):
     world.run(2.0)
     world.touch()
     recorded = world.recorded()
-    assert families(recorded) == {"a", "c", "own", "hello", "live", "snap"}
+    assert families(recorded) == {"a", "tree", "own", "hello", "live", "snap"}  # nothing is within 3 m of the tree
     assert sum(entry.key.startswith("a/ada") for entry in recorded.messages) > 150
-    assert sum(entry.key in ("tree/0/0/ada", "near/0/0/ada") for entry in recorded.messages) > 90
+    assert sum(entry.key == "tree/0/0/ada" for entry in recorded.messages) > 50
     assert not any("recorder" in entry.key for entry in recorded.messages)
 
 
@@ -177,7 +183,8 @@ def test_only_selected_families_are_recorded(tmp_path, only):
     world.run(0.5)
     world.touch()
     expected = {
-        "poses": {"a"}, "trees": {"c"}, "things": set(), "events": {"own"}, "facts": {"snap"}, "forces": set(),
+        "poses": {"a"}, "trees": {"tree", "near"}, "things": set(), "events": {"own"},
+        "facts": {"snap"}, "forces": set(),
     }  # fmt: skip
     assert families(world.recorded()) == {"live", "hello"} | expected[only]
 

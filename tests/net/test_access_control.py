@@ -69,6 +69,8 @@ WRITTEN = [
     "a/{}/mid",
     "a/{}/near",
     "c/0/-1/{}",
+    "tree/0/-1/{}",
+    "near/0/-1/{}",
     "own/0/0/{}",
     "fact/3/4/{}",
     "force/bob/{}",

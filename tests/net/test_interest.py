@@ -109,3 +109,8 @@ def test_an_error_of_a_tree_is_seen_at_no_larger_angle_from_farther_away():
     assert layers[0].tolerance == 1.0
     for near, far in itertools.pairwise(layers):
         assert far.tolerance <= near.distance
+
+
+def test_a_cell_of_events_consists_of_whole_cells_of_trees():
+    """So the claims of the trees of one cell share a message."""
+    assert interest.CELL_SIZE % interest.TREE_CELL_SIZE == 0.0

@@ -188,7 +188,7 @@ def test_truncated_messages_are_refused(cut):
 
 def test_errors_name_other_versions_kinds_and_programs():
     payload = messages.encode_robot(robot(np.random.default_rng(0)))
-    with pytest.raises(WrongVersion, match=r"version 9.*speaks 1"):
+    with pytest.raises(WrongVersion, match=rf"version 9.*speaks {messages.PROTOCOL}\b"):
         messages.decode_robot(payload[:2] + b"\x09" + payload[3:], "tiago")
     with pytest.raises(MessageError, match="not from vinesim"):
         messages.decode_robot(b"GET / HTTP/1.1", "tiago")
@@ -226,8 +226,9 @@ def test_a_hello_is_decoded_and_invalid_ones_are_refused():
     for name in ("", "a/b", "a*", "ä", "x" * 49):
         with pytest.raises(MessageError, match="actor name"):
             messages.encode_hello(Hello(name))
-    with pytest.raises(WrongVersion, match="version 2"):
-        messages.decode_hello(messages.encode_hello(Hello("a", protocol=2)))
+    other = messages.PROTOCOL + 1
+    with pytest.raises(WrongVersion, match=f"version {other}"):
+        messages.decode_hello(messages.encode_hello(Hello("a", protocol=other)))
     with pytest.raises(MessageError, match="too long"):
         messages.encode_hello(Hello("a", urdf="x" * messages.MAX_MESSAGE))
 

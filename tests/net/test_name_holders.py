@@ -23,7 +23,10 @@ from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.net.transport.zenoh_session import close_session, config, open_session
 from vinesim.scene.ids import ObjectKind, object_id
 
-KEYS = ("a/ada", "a/ada/far", "c/0/-1/ada", "own/0/0/ada", "fact/3/4/ada", "force/bob/ada", "voice/0/0/ada")
+KEYS = (
+    "a/ada", "a/ada/far", "c/0/-1/ada", "tree/0/-1/ada", "near/0/-1/ada", "own/0/0/ada", "fact/3/4/ada",
+    "force/bob/ada", "voice/0/0/ada",
+)  # fmt: skip
 
 
 def hello(name: str, kind: str = "robot") -> bytes:

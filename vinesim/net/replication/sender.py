@@ -137,8 +137,8 @@ class Sender:
                 if publisher is None or not publisher.matching:
                     continue
                 here = [(active[row], entries[row]) for row in rows]
-                for tree, entry in here:
-                    self._announce(state.cells.event_publisher(stream.cell[tree]), [(tree, entry)])
+                # a cell of events consists of whole cells of trees
+                self._announce(state.cells.event_publisher(stream.cell[here[0][0]]), here)
                 for payload in stream.encode(rows, _columns(here), step.time, layer):
                     put_counted(publisher, payload, state.counters.environment)
                 for row in rows:
@@ -155,10 +155,13 @@ class Sender:
         wrong, or a listener, claim or contact is new."""
         stream, (all_, near) = self._state.tree_stream, listeners
         silence = step.time - np.array([(entry.published_to_all_at, entry.published_at) for entry in entries]).T
+        errors = [stream.prediction_error(number, silence[number]) for number in range(len(TREE_LAYERS))]
         wrong = [
-            dead_reckoning.needs_update(*stream.prediction_error(number, silence[number]), silence[number], tolerance)
-            for number, (_, _, tolerance) in enumerate(TREE_LAYERS)
+            dead_reckoning.needs_update(*error, since, layer.tolerance)
+            for error, since, layer in zip(errors, silence, TREE_LAYERS, strict=True)
         ]
+        # some who are farther away hear the second layer too: it ends when all near have left, their copies do not
+        wrong[0] |= (near == 0) & dead_reckoning.needs_update(*errors[1], silence[1], TREE_LAYERS[0].tolerance)
         for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
             wrong[0][row] |= all_[row] > entry.listener_count or entry.touching != touching
             wrong[1][row] |= near[row] > entry.near_listener_count

@@ -17,7 +17,7 @@ from vinesim.net.keys import sender_of
 MAX_FORMER_SESSIONS = 8
 """Sessions of one name that have left and are still remembered."""
 
-BOUND_FAMILIES = frozenset(("a", "c", "own", "fact", "force", "voice", "hello"))
+BOUND_FAMILIES = frozenset(("a", "c", "tree", "near", "own", "fact", "force", "voice", "hello"))
 """First chunks of the keys that belong to one actor."""
 
 
