@@ -268,7 +268,9 @@ def test_a_disk_that_is_full_from_the_start_leaves_no_file_and_the_same_command_
     assert read_recording(path).messages == []
 
 
-@pytest.mark.parametrize("key", ["live", "hello", "a", "own", "fact", "snap", "c", "tree", "near", "", "/", "fact/x/y/ada", "c/1/2"])
+@pytest.mark.parametrize(
+    "key", ["live", "hello", "a", "own", "fact", "snap", "c", "tree", "near", "", "/", "fact/x/y/ada", "c/1/2"]
+)
 def test_a_key_that_lacks_parts_is_recorded_like_any_other(tmp_path, key):
     path = tmp_path / "run.mcap"
     with RecordingWriter(path) as file:
