@@ -33,7 +33,7 @@ def test_a_rollout_equals_the_solver(fine: bool) -> None:
     if fine:
         plants.refine(np.arange(2))
     else:
-        rates[plants._clusters.clusters_of(np.arange(2))] = 0.0
+        rates[plants.berry_clusters.clusters_of(np.arange(2))] = 0.0
     plants.state.joint_qd[:] = rates
     plants.body_load[:] = load
     rollout = Rollout(model, 17, checkpoint=7, fine=fine)
@@ -47,7 +47,7 @@ def test_a_rollout_equals_the_solver(fine: bool) -> None:
     plants.forward_kinematics()
     np.testing.assert_array_equal(track.body_q[-1], plants.state.body_q[rollout.watched])
     assert len(rollout.watched) == (
-        len(rates) if fine else len(rates) - len(plants._clusters.clusters_of(np.arange(2)))
+        len(rates) if fine else len(rates) - len(plants.berry_clusters.clusters_of(np.arange(2)))
     )
 
 

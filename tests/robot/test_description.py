@@ -334,15 +334,6 @@ FAULTS = {
         robot(links="<link name='s'><visual><geometry><mesh filename='gone.stl'/></geometry></visual></link>"),
         "'gone.stl' is missing",
     ),
-    "mimic of a mimic": (
-        robot(
-            links="<link name='a'/><link name='b'/>",
-            joints="<joint name='j' type='revolute'><parent link='arm'/><child link='a'/><mimic joint='k'/></joint>"
-            "<joint name='k' type='revolute'><parent link='a'/><child link='b'/>"
-            "<mimic joint='shoulder_joint'/></joint>",
-        ),
-        "mimics 'k'",
-    ),
 }
 
 

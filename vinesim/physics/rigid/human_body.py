@@ -6,8 +6,8 @@ that its force follows from how far it is held back: 100 N/m up to 100 N by defa
 holds rigid objects by a weld; what is lifted hangs from the same spring. Gravity does not act on a hand itself.
 
 Head, trunk and legs are kinematic: exactly where the tracked points put them, whatever pushes them
-(``docs/decisions/hands.md``). Those of a remote person push with a bounded force, and pass through rigid bodies while
-its messages let them jump or push with more.
+(``docs/decisions/hands.md``). Those of a remote person stop a robot, but push with a bounded force while they move, and
+pass through rigid bodies while its messages let them jump or push with more.
 """
 
 from __future__ import annotations
@@ -22,21 +22,16 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_posture import PostureSolver
 from vinesim.physics.rigid.human_shapes import BODY_PARTS, SIDES, body_shapes, hand_shapes
-from vinesim.physics.rigid.passing_parts import PassingParts
+from vinesim.physics.rigid.passing_parts import HEAVY_PART_MASS, PassingParts
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROBOTS, contact_friction
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
 
-KINEMATIC_MASS = 1e4
+KINEMATIC_MASS = HEAVY_PART_MASS
 """[kg, kg m^2] Mass and inertia of the kinematic parts. They are free bodies with a velocity, not bodies without
-joints:
-those have no velocity in MuJoCo, and a leg would sink centimetres into what it kicks. No force changes the motion of a
-body as heavy as this within a step, and each step starts from the prescribed poses."""
-REMOTE_PART_MASS = 0.3
-"""[kg] Mass of the same parts of a remote person, with the same inertia. A contact can slow such a part down within a
-step, but not move it: so it pushes a robot with a force that its speed and its depth bound, m (v 2/tau + depth/tau^2)
-with MuJoCo's time constant tau of contacts (20 ms), however heavy the robot is. DERIVED: two legs that walk at 1.5 m/s
-push with 80 N, half of :data:`MAX_REMOTE_FORCE`."""
+joints: those have no velocity in MuJoCo, and a leg would sink centimetres into what it kicks. No force changes the
+motion of a body as heavy as this within a step, and each step starts from the prescribed poses. Those of a remote
+person weigh less while they move: see :mod:`vinesim.physics.rigid.passing_parts`."""
 MAX_REMOTE_FORCE = 150.0
 """[N] A remote person's parts that push with more together pass through from the next step on. READ: ISO/TS 15066,
 table A.2, allows 110 to 160 N between robots and trunk, arms and hands for contacts that last, twice that for
@@ -81,6 +76,7 @@ class HumanBody:
         """[part, 6] MuJoCo's degrees of freedom of the same."""
         self._part_q = self._hand_q = np.zeros((0, 7), int)
         self._passing = PassingParts(len(BODY_PARTS))
+        self._part_force = np.full(len(BODY_PARTS), np.inf)  # not known before the first step
         self._pushes_too_hard = np.zeros(len(BODY_PARTS), bool)
         self._posture = PostureSolver(spec.height)
         self.set_pose(spec.pose)
@@ -139,11 +135,10 @@ class HumanBody:
         """Add the person's bodies to a world."""
         name, me, p = self.spec.name, self.code, self.parameters
         meets = ALL_BITS & ~me & ~REMOTE_HAND if self.is_remote else ALL_BITS & ~me
-        mass = REMOTE_PART_MASS if self.is_remote else KINEMATIC_MASS
         never = mujoco.mjtSleepPolicy.mjSLEEP_NEVER
         for part, shape, pose in zip(BODY_PARTS, body_shapes(self.spec.height), self.part_poses, strict=True):
             body = spec.worldbody.add_body(
-                name=f"{name}/{part}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=mass,
+                name=f"{name}/{part}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=KINEMATIC_MASS,
                 ipos=np.zeros(3), inertia=[KINEMATIC_MASS] * 3, explicitinertial=True, gravcomp=1.0, sleep=never,
             )  # fmt: skip
             body.add_freejoint(name=f"{name}/{part}")
@@ -171,7 +166,8 @@ class HumanBody:
         self._part_q = m.jnt_qposadr[joints].astype(int)[:, None] + np.arange(7)
         self.part_dofs = m.jnt_dofadr[joints].astype(int)[:, None] + np.arange(6)
         self.bodies = dict(zip(BODY_PARTS, self.part_bodies.tolist(), strict=True))
-        self._passing.find_indices(m, self.part_bodies)
+        if self.is_remote:
+            self._passing.find_indices(m, self.part_bodies)
         for hand in self.hands:
             hand.find_indices(m, names, name)
             self.bodies[hand.link] = hand.body
@@ -202,7 +198,9 @@ class HumanBody:
         speed = np.sqrt((velocity * velocity).sum(1, keepdims=True))
         if self.is_remote:
             jumped = (speed[:, 0] > p.max_body_speed) | has_teleported
-            self._passing.update(m, d, self._poses[:parts, :3], jumped | self._pushes_too_hard)
+            self._passing.update(
+                m, d, self._poses[:parts, :3], speed[:, 0], self._part_force, jumped | self._pushes_too_hard
+            )
         self._place_parts(d, start)
         d.qvel[self.part_dofs[:, :3]] = velocity * np.minimum(
             1.0, p.max_body_speed / np.maximum(speed, p.max_body_speed)
@@ -217,8 +215,8 @@ class HumanBody:
         self._last_poses = self._poses
         if self.is_remote:
             force = d.qfrc_constraint[self.part_dofs[:, :3]]
-            force = np.sqrt((force * force).sum(1))
-            self._pushes_too_hard = (force > 0.0) & (force.sum() > MAX_REMOTE_FORCE)
+            self._part_force = force = np.sqrt((force * force).sum(1))
+            self._pushes_too_hard = (force > 0.0) & self._passing.is_light & (force.sum() > MAX_REMOTE_FORCE)
         self._place_parts(d, self.part_poses)
         for hand in self.hands:
             hand.measure(d)
