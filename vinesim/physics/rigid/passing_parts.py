@@ -13,7 +13,6 @@ import numpy as np
 
 from vinesim.physics.rigid.static_world import ROBOTS
 
-
 HEAVY_PART_MASS = 1e4
 """[kg] No force changes the motion of a body as heavy as this within a step."""
 LIGHT_PART_MASS = 0.3
@@ -51,8 +50,8 @@ class PassingParts:
     ) -> None:
         """Parts that are ``released`` [k] bool touch nothing from now on; others do again if they are clear of robots.
 
-        ``places`` [k, 3] m: origins of the parts at the end of this step; ``speed`` [k] m/s of the parts; ``force`` [k] N
-        on them in the last step.
+        ``places`` [k, 3] m: origins of the parts at the end of this step; ``speed`` [k] m/s of the parts;
+        ``force`` [k] N on them in the last step.
         """
         passing = released | self.is_passing
         if passing.any():
