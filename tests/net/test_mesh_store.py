@@ -93,7 +93,7 @@ def test_bounds_in_bytes_and_number_of_one_actor_and_of_all() -> None:
     assert not upload(store, BERT, mesh(20, seed=5)).refused
     carl = ("vineyard", "carl")
     assert "no room" in upload(store, carl, mesh(10, seed=6)).refused
-    store.release(BERT)  # what nobody offers any more makes room
+    store.release(BERT)  # what no actor offers any more makes room
     assert not upload(store, carl, mesh(10, seed=6)).refused
     assert store.part(digest_of(mesh(20, seed=5)), 0).size == 0
     assert store.part(digest_of(mesh(20)), 0).size == 20 * FACE_BYTES
