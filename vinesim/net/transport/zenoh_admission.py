@@ -87,6 +87,7 @@ class ServerAdmission:
                 time.sleep(RETRY_PERIOD)
                 self._submit(lambda: self._join_again(querier, hello))
             return
+        self.is_served = True  # whatever order Zenoh's threads report in that one server went and another came
         self.rejection = welcomes[0].refused
         self.count += not self.rejection
         if self.rejection:
