@@ -161,11 +161,15 @@ def test_puts_without_subscribers_cost_nothing():
             return net.counts("ada")[0].bytes - before
 
         cost(1, 0.5)
-        few, many = cost(1_000), cost(30_000)
-        # a put that is sent costs at least 70 B, so a hundredth of that is the upkeep of the connection, of which
-        # there is more on a busy machine, which takes longer
-        assert few < 0.1 * 1_000 * 70
-        assert many < 0.01 * 30_000 * 70
+        # keepalives and acknowledgements of an idle connection, more of them on a busy machine, which takes longer:
+        # then the next pair is judged. A put that is sent costs at least 70 B, all of these 2 MB, in every pair
+        pairs = []
+        while len(pairs) < 6 and not any(few < 1500 and abs(many - few) < 1500 for few, many in pairs):
+            pairs.append((cost(1_000), cost(30_000)))
+        few, many = pairs[-1]
+        assert few < 1500, pairs
+        assert abs(many - few) < 1500, pairs
+        assert max(map(max, pairs)) < 0.01 * 30_000 * 70, "none of the pairs has the cost of puts that are sent"
 
 
 def test_branch_touched_far_from_all_peers_costs_nothing(world):
