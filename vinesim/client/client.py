@@ -34,7 +34,6 @@ from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
-from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
@@ -46,6 +45,7 @@ from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 from vinesim.scene.values import Coupling, HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.wind import wind_of
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +56,12 @@ def label_index(name: str) -> int:
     With 64 actors the chance that two have the same is 0.2 %.
     """
     return zlib.crc32(name.encode()) % LABEL_STRIDE
+
+
+WIND_TIME_SLEW = 0.1
+"""Seconds by which the time of the wind approaches network time in each second."""
+WIND_TIME_JUMP = 1.0
+"""[s] Further off, as at the start, it is set to it."""
 
 
 class Client:
@@ -90,9 +96,7 @@ class Client:
         """
         self.name, self.model, self.scene = name, model, scene
         self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking)
-        if any(scene.wind.mean) or scene.wind.gusts > 0.0:
-            wind = scene.wind
-            self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
+        self.physics.wind = wind_of(scene)
         self.robots: dict[str, Robot] = {}
         """Robots that this client simulates, by name; the first is :attr:`robot`."""
         self.humans: dict[str, LocalHuman] = {}
@@ -183,12 +187,22 @@ class Client:
         """Simulate one step of ``physics.dt``."""
         now = self._clock()
         self.receive(now)
+        self._set_wind_time(now)
         self.control()
         self.physics.step()
         self.sense()
         self.send(now)
         for callback in self.wake_readers:
             callback()
+
+    def _set_wind_time(self, now: float) -> None:
+        """Let the wind follow network time, so that all clients see the same gusts at the same time."""
+        physics = self.physics
+        late = now + self.replicator.offset - physics.time - physics.wind_time_offset
+        if abs(late) > WIND_TIME_JUMP:
+            physics.wind_time_offset += late
+        else:
+            physics.wind_time_offset += float(np.clip(late, -WIND_TIME_SLEW * physics.dt, WIND_TIME_SLEW * physics.dt))
 
     # ------------------------------------------------------------------ the parts of a tick
 

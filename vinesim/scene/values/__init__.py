@@ -11,7 +11,7 @@ from vinesim.scene.values.rigid import Mesh, RigidVisual, Shape
 from vinesim.scene.values.robot import Drive, ElasticSample, Imu, JointSample, RobotSample, RobotSpec, Wrench
 from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
 from vinesim.scene.values.status import ComponentStatus
-from vinesim.scene.values.world import Contact, Detachment, Snapshot
+from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
 __all__ = [
     "POINT_NAMES",
@@ -42,5 +42,6 @@ __all__ = [
     "Shape",
     "Snapshot",
     "TreeUpdate",
+    "WindState",
     "Wrench",
 ]
