@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.support.shared_vineyard import World
+from tests.support.shared_vineyard import World, vineyard
 from vinesim.physics.plants.sway import Sway
 from vinesim.scene.wind import Wind
 
@@ -11,7 +11,9 @@ from vinesim.scene.wind import Wind
 def test_clients_that_joined_at_different_times_draw_the_same_trees(tmp_path, monkeypatch) -> None:
     """One second after the other one is told of the wind, without a message about it."""
     monkeypatch.setenv("VINESIM_CACHE", str(tmp_path))
-    world = World()
+    model = vineyard()
+    model.body_drag[:] = 0.003  # leaves
+    world = World(model)
     ada = world.join("ada", -30.0, 0.0)
     ada.physics.wind = wind = Wind([2.0, 1.0, 0.0], gusts=1.0, seed=3)
     world.run(1.0)
@@ -23,8 +25,8 @@ def test_clients_that_joined_at_different_times_draw_the_same_trees(tmp_path, mo
     assert views[0].wind is not None
     assert views[0].wind.wind is wind
     asleep = (views[0].wind.tree_drawn == 1.0) & (views[1].wind.tree_drawn == 1.0)
-    assert asleep.sum() > 10
+    assert asleep.any()
     bodies = asleep[world.model.body_tree]
     still = ada.physics.snapshot().body_q
-    assert np.abs(views[0].body_q - still)[bodies, :3].max() > 1e-3
+    assert np.abs(views[0].body_q - still)[bodies, :3].max() > 1e-4
     np.testing.assert_allclose(views[0].body_q[bodies], views[1].body_q[bodies], atol=1e-6)
