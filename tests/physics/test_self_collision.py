@@ -1,4 +1,4 @@
-"""Robots collide with themselves and with the ground: where an arm stops, with what effort, and which links never touch."""
+"""Robots collide with themselves and with the ground: where an arm stops, and which links never touch."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int) -> Non
 
 
 def disabled_pairs(urdf: str) -> list[tuple[str, str]]:
-    """Pairs of links of the elements ``disable_collisions`` of a URDF; a robot's loader puts those of its SRDF there."""
+    """Pairs of links in the elements ``disable_collisions`` of a URDF, where loading puts those of an SRDF."""
     root = ElementTree.fromstring(urdf)
     return [(pair.get("link1", ""), pair.get("link2", "")) for pair in root.findall("disable_collisions")]
 

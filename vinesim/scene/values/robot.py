@@ -60,8 +60,8 @@ class RobotSpec:
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Corners [face, 3, 3] m of meshes that are in no file, by the file name that the URDF gives them."""
     is_copy: bool = False
-    """Whether another client simulates the robot. A copy follows the states received, in which contacts of its links with
-    each other and with the ground are counted already; boxes that stand for its meshes would touch where those do not."""
+    """Whether another client simulates the robot. A copy follows received states, in which contacts of its links with
+    each other and the ground are counted already; boxes that stand for its meshes would touch where those do not."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
