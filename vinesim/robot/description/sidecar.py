@@ -107,6 +107,9 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
     cutters: tuple[Cutter, ...] = ()
+    srdf: str = ""
+    """SRDF file whose pairs of ``disable_collisions`` never touch, by its path from the TOML file; unless given, the
+    file of the URDF's name that ends with ``.srdf``, if there is one."""
 
 
 def read_sidecar(file: pathlib.Path) -> Sidecar:
