@@ -6,6 +6,7 @@ Every message is built and sent by the thread that passes its values, in order.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from xml.etree import ElementTree
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -33,9 +34,10 @@ OWN_MESSAGES = ("tf2_msgs", "control_msgs")
 class RobotNode(Node):
     """One robot's topics but those of its cameras and lidars (:mod:`vinesim.ros.sensor_node`).
 
-    ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` names of sensors,
-    ``bunch_of_body`` [body] the bunch that a plant's body belongs to, -1 for none. All topics but /clock stand under the namespace, tf too (as Nav2 does with several robots); a second
-    robot of a ROS domain should be made with ``clock=False``.
+    ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
+    sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none. All topics but /clock
+    stand under the namespace, tf too (as Nav2 does with several robots); a second robot of a ROS domain should be made
+    with ``clock=False``.
     """
 
     def __init__(
@@ -71,7 +73,9 @@ class RobotNode(Node):
         self._diagnostics = self._advertise(DiagnosticArray, "diagnostics", RELIABLE)
         self._proprioception = ProprioceptionPublisher(self._advertise, self._imus, self._wrenches)
         self._control = ControlPublisher(self._advertise, self._controllers)
-        self._contacts = ContactPublisher(self._advertise, self._bunch_of_body)
+        links = ElementTree.fromstring(self._urdf).iterfind("link")
+        numbers = {link.get("name", ""): number for number, link in enumerate(links)}
+        self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers)
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
         CommandSubscriptions(self._node, self._controllers, self._commands)
 

@@ -59,9 +59,9 @@ class RosCommandHandler:
         for result in self.controllers.take_results():
             self._finish(_goal_result(result))
 
-    def cancel_all(self) -> None:
+    def cancel_all(self, time: float) -> None:
         """Cancel all goals, as the process that serves them is gone."""
-        self.controllers.cancel_all(self.robot.rigid.time)
+        self.controllers.cancel_all(time)
         self.controllers.take_results()
 
     def _apply(self, command: Command, time: float) -> None:
@@ -76,9 +76,7 @@ class RosCommandHandler:
             case ElasticCommand():
                 controllers.command_motor(command.controller, command.joint, command.position)
             case GripperGoal():
-                controllers.start_gripper(
-                    command.controller, command.position, command.max_effort, time, command.goal
-                )
+                controllers.start_gripper(command.controller, command.position, command.max_effort, time, command.goal)
             case CancelGoal():
                 controllers.cancel(command.goal, time)
             case JointTrajectory() if len(command.times) == 0:

@@ -47,7 +47,7 @@ class Blade:
     """[N] Cutting force of the strongest piece that was in its mouth then, cut or not; 0 if there was none."""
 
     def close(self, force: float = np.inf) -> None:
-        """Shut with at most ``force`` [N], and open again: what is in the mouth at the end of the coming step is cut."""
+        """Shut with at most ``force`` [N], and open again: cuts what is in the mouth at the end of the coming step."""
         self.closing, self.force = True, force
 
 

@@ -174,7 +174,9 @@ class ControllerManager:
         """Hold the motor of a series elastic joint at ``position`` [rad or m]."""
         spec = self._spec(name, ControllerKind.SERIES_ELASTIC)
         if joint not in spec.joints:
-            raise CommandError(f"{name} of {self.robot.name} does not move {joint!r}; it moves {', '.join(spec.joints)}")
+            raise CommandError(
+                f"{name} of {self.robot.name} does not move {joint!r}; it moves {', '.join(spec.joints)}"
+            )
         self.robot.command_motor_position([position], [joint])
         self._claim(name, self.robot.joint_indices([joint]))
 
@@ -208,7 +210,7 @@ class ControllerManager:
     def _pass_on(self, spec: ControllerSpec, values: np.ndarray, command: Callable[..., None]) -> None:
         if len(values) != len(spec.joints):
             raise CommandError(
-                f"{self.robot.name}: {len(values)} values for {spec.name}; give one for each of {', '.join(spec.joints)}"
+                f"{self.robot.name}: {len(values)} values for {spec.name}; give one each for {', '.join(spec.joints)}"
             )
         given = ~np.isnan(values)
         joints = self._indices[spec.name][given]

@@ -51,6 +51,8 @@ class RobotDescription:
     """What was changed or derived at loading, one line each."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Corners [face, 3, 3] m of meshes that came over the network, by the file name that ``urdf`` gives them."""
+    is_remote: bool = False
+    """Whether its text came over the network: another client simulates the robot."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -98,5 +100,5 @@ class RobotDescription:
         pose = frames.pose([0.0, 0.0, 0.0]) if pose is None else np.asarray(pose, float)
         return RobotSpec(
             name, index, self.urdf, self.base, pose, self.drives, self.home.copy(), self.base_limits.effort,
-            self.meshes,
+            self.meshes, self.is_remote,
         )  # fmt: skip

@@ -122,6 +122,9 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cutters: tuple[Cutter, ...] = ()
     controllers: dict[str, Controller] | None = None
     """By name; None: those that :mod:`vinesim.robot.description.controllers` derives from the groups."""
+    srdf: str = ""
+    """SRDF file whose pairs of ``disable_collisions`` never touch, by its path from the TOML file; unless given, the
+    file of the URDF's name that ends with ``.srdf``, if there is one."""
 
 
 def read_sidecar(file: pathlib.Path) -> Sidecar:

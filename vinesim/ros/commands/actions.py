@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 import rclpy.node
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
-from trajectory_msgs.msg import JointTrajectoryPoint
 
 from vinesim.ros.commands import convert
 from vinesim.ros.commands.subscriptions import CommandQueue
 from vinesim.ros.commands.types import CancelGoal, GoalResult, GoalStatus, GripperGoal, JointTrajectory
-from vinesim.ros.messages.convert import stamp
+from vinesim.ros.messages.convert import reference_points, stamp
 from vinesim.scene.values import ControllerKind, ControllerSpec, RobotSample
 
 log = logging.getLogger(__name__)
@@ -74,7 +73,7 @@ class ControllerActions:
 
     # ------------------------------------------------------------------ in the receiving thread
 
-    def _judge(self, take: Callable[..., Command], request: Any) -> GoalResponse:
+    def _judge(self, take: Callable[..., object], request: Any) -> GoalResponse:
         try:
             take(request, goal=b"")
             if len(self._goals) >= MAX_GOALS:
@@ -131,18 +130,6 @@ class ControllerActions:
                 message.position, message.effort = gripper.position, gripper.effort
                 message.stalled, message.reached_goal = gripper.stalled, gripper.reached_goal
         goal.server.notify_execute(goal.handle, partial(_end, result.status, message))
-
-
-def reference_points(sample: RobotSample, joints: np.ndarray) -> dict[str, JointTrajectoryPoint]:
-    """Desired and actual state of ``joints`` [k], and the difference, as control_msgs have them."""
-    assert sample.reference is not None
-    wanted = np.stack([sample.reference.position[joints], sample.reference.velocity[joints]])
-    found = np.stack([sample.joints.position[joints], sample.joints.velocity[joints]])
-    states = {"desired": wanted, "actual": found, "error": wanted - found}
-    return {
-        name: JointTrajectoryPoint(positions=position.tolist(), velocities=velocity.tolist())
-        for name, (position, velocity) in states.items()
-    }
 
 
 def _end(status: GoalStatus, result: Any, handle: ServerGoalHandle) -> Any:

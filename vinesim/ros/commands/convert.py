@@ -77,7 +77,7 @@ def joint_trajectory(
     unknown = [joint for joint in joints if joint not in known]
     if unknown or len(set(joints)) < len(joints) or (message.points and not joints):
         raise CommandError(
-            f"{controller}: a trajectory for {', '.join(joints) or 'no joints'}; it moves each of {', '.join(known)} once"
+            f"{controller}: a trajectory for {', '.join(joints) or 'nothing'}; it moves each of {', '.join(known)} once"
         )
     for i, point in enumerate(message.points):
         if len(point.positions) != len(joints) or len(point.velocities) not in (0, len(joints)):
@@ -94,9 +94,7 @@ def joint_trajectory(
     velocities = np.array([p.velocities for p in message.points], float) if with_velocity else None
     if not np.isfinite(positions).all() or (velocities is not None and not np.isfinite(velocities).all()):
         raise CommandError(f"{controller}: the trajectory is not finite")
-    return JointTrajectory(
-        controller, seconds(message.header.stamp), joints, times, positions, velocities, goal=goal
-    )
+    return JointTrajectory(controller, seconds(message.header.stamp), joints, times, positions, velocities, goal=goal)
 
 
 def trajectory_goal(request: Any, controller: str, known: Sequence[str], goal: bytes) -> JointTrajectory:

@@ -105,9 +105,7 @@ class CancelGoal:
     goal: bytes
 
 
-Command = (
-    BaseVelocity | ForwardCommand | ImpedanceCommand | ElasticCommand | JointTrajectory | GripperGoal | CancelGoal
-)
+Command = BaseVelocity | ForwardCommand | ImpedanceCommand | ElasticCommand | JointTrajectory | GripperGoal | CancelGoal
 
 
 class GoalStatus(enum.StrEnum):

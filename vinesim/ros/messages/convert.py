@@ -24,6 +24,7 @@ from sensor_msgs.msg import CameraInfo as CameraInfoMessage
 from sensor_msgs.msg import CompressedImage, Image, JointState, PointCloud2, PointField
 from sensor_msgs.msg import Imu as ImuMessage
 from std_msgs.msg import Header, String
+from trajectory_msgs.msg import JointTrajectoryPoint
 
 from vinesim import frames
 from vinesim.ros.messages.transforms import split_time
@@ -70,7 +71,13 @@ DUAL_LIDAR_POINT = np.dtype(
 )
 """The same of a lidar that reports two returns of a shot; return_type: 1 the strongest, 2 the other."""
 
-_FIELD_TYPES = {"f4": PointField.FLOAT32, "i4": PointField.INT32, "u1": PointField.UINT8, "u2": PointField.UINT16, "u4": PointField.FLOAT32}
+_FIELD_TYPES = {
+    "f4": PointField.FLOAT32,
+    "i4": PointField.INT32,
+    "u1": PointField.UINT8,
+    "u2": PointField.UINT16,
+    "u4": PointField.FLOAT32,
+}
 
 
 def stamp(time: float) -> Time:
@@ -140,6 +147,18 @@ def elastic_state(sample: ElasticSample, joint: int) -> JointState:
         header=header(sample.time, ""), name=[sample.names[joint]], position=[float(sample.motor[joint])],
         effort=[float(sample.torque[joint])],
     )  # fmt: skip
+
+
+def reference_points(sample: RobotSample, joints: np.ndarray) -> dict[str, JointTrajectoryPoint]:
+    """Desired and actual state of ``joints`` [k], and the difference, as control_msgs have them."""
+    assert sample.reference is not None
+    wanted = np.stack([sample.reference.position[joints], sample.reference.velocity[joints]])
+    found = np.stack([sample.joints.position[joints], sample.joints.velocity[joints]])
+    states = {"desired": wanted, "actual": found, "error": wanted - found}
+    return {
+        name: JointTrajectoryPoint(positions=position.tolist(), velocities=velocity.tolist())
+        for name, (position, velocity) in states.items()
+    }
 
 
 CONTACT_POINT = np.dtype(

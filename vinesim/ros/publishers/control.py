@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from sensor_msgs.msg import JointState
 
-from vinesim.ros.commands.actions import reference_points
 from vinesim.ros.messages import convert
 from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
 from vinesim.scene.values import ControllerKind, ControllerSpec, RobotSample
@@ -50,7 +49,7 @@ class ControlPublisher:
                 yield topic, partial(convert.elastic_state, sample.elements, places[joint])
 
     def _state(self, sample: RobotSample, joints: tuple[str, ...], places: np.ndarray) -> Any:
-        points = reference_points(sample, places)
+        points = convert.reference_points(sample, places)
         return self._state_type(
             header=convert.header(sample.joints.time, ""), joint_names=list(joints), reference=points["desired"],
             feedback=points["actual"], error=points["error"],

@@ -60,6 +60,9 @@ class RobotSpec:
     """Largest force [N] and moment [N m] with which the tracks hold or drive the base."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Corners [face, 3, 3] m of meshes that are in no file, by the file name that the URDF gives them."""
+    is_copy: bool = False
+    """Whether another client simulates the robot. A copy follows received states, in which contacts of its links with
+    each other and the ground are counted already; boxes that stand for its meshes would touch where those do not."""
 
 
 class ControllerKind(enum.StrEnum):
