@@ -175,7 +175,7 @@ def test_a_record_holds_a_sample_exactly(robot):
         for i, link in enumerate((*list(client.robot.description.link_anchors)[:3], "unknown"))
     ]
     sample = client.robot.sample(client.physics.time, contacts)
-    records = StepRecords("robot", client.robot.description)
+    records = StepRecords("robot", client.robot.description, client.robot.series_stiffness)
     row = np.zeros(1, records.dtype)[0]
     assert records.write(row, client.physics.time, sample) == 0
     copy = records.read(row)
@@ -186,5 +186,9 @@ def test_a_record_holds_a_sample_exactly(robot):
     assert (copy.actor, copy.transforms, copy.joints.names) == (sample.actor, sample.transforms, sample.joints.names)
     assert [c.link for c in copy.contacts] == [*[c.link for c in contacts[:3]], ""]
     assert [c.force.tolist() for c in copy.contacts] == [c.force.tolist() for c in contacts]
+    np.testing.assert_allclose(copy.elements.motor, sample.elements.motor, rtol=1e-12)
+    np.testing.assert_allclose(copy.elements.torque, sample.elements.torque, rtol=1e-12)
+    assert [(w.name, w.force.tolist()) for w in copy.wrenches] == [(w.name, w.force.tolist()) for w in sample.wrenches]
+    assert [u.linear_acceleration.tolist() for u in copy.imus] == [u.linear_acceleration.tolist() for u in sample.imus]
     many = client.robot.sample(client.physics.time, contacts[:1] * (MAX_CONTACTS + 5))
     assert records.write(row, client.physics.time, many) == 5

@@ -14,7 +14,7 @@ from vinesim.scene.values import RobotSample
 
 
 class ProprioceptionPublisher:
-    """``<imu>`` and ``<sensor>/wrench`` after every step."""
+    """``<imu>`` and ``<sensor>/wrench`` after every step, of the sensors that are named."""
 
     def __init__(self, advertise: Advertise, imus: Sequence[str], wrenches: Sequence[str]) -> None:
         self._imus = {name: advertise(Imu, name, SENSOR_DATA) for name in imus}
@@ -23,6 +23,8 @@ class ProprioceptionPublisher:
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """All messages of one step."""
         for imu in sample.imus:
-            yield self._imus[imu.name], partial(convert.imu, imu)
+            if imu.name in self._imus:
+                yield self._imus[imu.name], partial(convert.imu, imu)
         for wrench in sample.wrenches:
-            yield self._wrenches[wrench.name], partial(convert.wrench, wrench)
+            if wrench.name in self._wrenches:
+                yield self._wrenches[wrench.name], partial(convert.wrench, wrench)
