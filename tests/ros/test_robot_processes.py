@@ -49,10 +49,10 @@ class Robot:
         self.loop = RateLoop(self.client.physics.dt)
         self.status = Status(self.client, self.loop, self.processes.sent_messages, sensors=self.processes.status)
 
-    def subscribe(self, message: type, topic: str) -> list:
-        """Messages from now on, received with the default QoS of rclpy."""
+    def subscribe(self, message: type, topic: str, queue: int = 10) -> list:
+        """Messages from now on, received with the default QoS of rclpy and a queue of so many messages."""
         received: list = []
-        self.peer.node.create_subscription(message, topic, received.append, 10)
+        self.peer.node.create_subscription(message, topic, received.append, queue)
         return received
 
     def step(self) -> None:
@@ -87,12 +87,12 @@ def nanoseconds(message: Clock) -> int:
 
 def test_every_step_is_published_once_and_in_order_or_counted_as_lost(robot):
     """Exactly by the counts of the process. A stock reader receives all within one of a few windows of 3 s: without
-    a processor for 0.1 s it loses messages of its own queue of ten, which no publisher can count."""
+    a processor for a second it loses messages, as the publisher keeps no more than a hundred."""
     wanted = []
     robot.client.post_step.append(
         lambda _: wanted.append(robot.processes.ros.worker.current().shared.wanted["steps"][0])
     )
-    clocks, joints = robot.subscribe(Clock, "/clock"), robot.subscribe(JointState, "/joint_states")
+    clocks, joints = robot.subscribe(Clock, "/clock", 1000), robot.subscribe(JointState, "/joint_states")
     robot.run_until(lambda: len(clocks) >= 20 and joints)
     missing = []
     while 0 not in missing and len(missing) < 5:

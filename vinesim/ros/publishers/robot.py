@@ -13,7 +13,7 @@ from std_msgs.msg import String
 from vinesim import frames
 from vinesim.ros.messages import convert
 from vinesim.ros.messages.transforms import SerializedTransforms
-from vinesim.ros.topic import RELIABLE, TRANSFORMS, TRANSIENT_LOCAL, Advertise, PendingMessage
+from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values import RobotSample
 
 MAP_FRAME, ODOM_FRAME = "map", "odom"
@@ -35,7 +35,7 @@ class RobotPublisher:
         self._transforms = SerializedTransforms([])
 
         self._joints = advertise(JointState, "joint_states", RELIABLE)
-        self._tf = advertise(tf_message, "tf", TRANSFORMS)
+        self._tf = advertise(tf_message, "tf", RELIABLE)
         self._odometry = advertise(Odometry, "mobile_base_controller/odom", RELIABLE)
 
         advertise(String, "robot_description", TRANSIENT_LOCAL).send(String(data=urdf))
