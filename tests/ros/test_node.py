@@ -26,7 +26,7 @@ if middleware.unavailable_reason() is not None:
 import rclpy
 from geometry_msgs.msg import TwistStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import Image, JointState, PointCloud2
+from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
@@ -369,8 +369,6 @@ def test_frames_lead_from_the_map_to_the_fingers():
 
 def test_contacts_are_one_cloud_a_step():
     """Each contact as a point with its force on the robot, the plant's body, its bunch, and the number of the link."""
-    from sensor_msgs_py import point_cloud2
-
     contact = Contact("vinebot", "vinebot/tip", 5, np.array([1.0, 3.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.0)
     nowhere = Contact("vinebot", "vinebot/unknown", 2, np.array([1.0, 0.0, 0.0]), np.array([0.0, 4.0, 0.0]), 0.0)
     urdf = "<robot name='vinebot'><link name='base_footprint'/><link name='tip'/></robot>"
@@ -381,7 +379,10 @@ def test_contacts_are_one_cloud_a_step():
         sample = robot_sample(1.0, contacts=(contact, nowhere))
         wait_until(lambda: heard, lambda: (node.publish_robot_state(sample), peer.spin()))
         assert heard[0].header.frame_id == "map"
-        first, second = point_cloud2.read_points(heard[0])
+        kinds = {PointField.FLOAT32: "f4", PointField.INT32: "i4"}
+        point = np.dtype([(field.name, kinds[field.datatype]) for field in heard[0].fields])
+        assert [point.fields[field.name][1] for field in heard[0].fields] == [field.offset for field in heard[0].fields]
+        first, second = np.frombuffer(bytes(heard[0].data), point)
         assert first.tolist() == (1.0, 3.0, 0.0, 0.0, 0.0, 5.0, 5, 1, 1)
         assert second.tolist() == (1.0, 0.0, 0.0, 0.0, 4.0, 0.0, 2, -1, -1)
         heard.clear()
