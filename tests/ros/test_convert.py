@@ -260,7 +260,9 @@ def test_wrench_and_imu_keep_their_frames():
     message = over_the_wire(convert.wrench(read))
     assert (message.header.frame_id, message.header.stamp.nanosec) == ("wrist_link", 500_000_000)
     assert (message.wrench.force.z, message.wrench.torque.x) == (3.0, 0.1)
-    unit = Imu(2.0, "imu", "imu_link", np.array([0.0, 0.0, 0.6, 0.8]), np.array([0.0, 0.0, 0.5]), np.array([0, 0, 9.81]))
+    unit = Imu(
+        2.0, "imu", "imu_link", np.array([0.0, 0.0, 0.6, 0.8]), np.array([0.0, 0.0, 0.5]), np.array([0, 0, 9.81])
+    )
     message = over_the_wire(convert.imu(unit))
     assert (message.orientation.z, message.orientation.w, message.angular_velocity.z) == (0.6, 0.8, 0.5)
     assert message.linear_acceleration.z == 9.81
