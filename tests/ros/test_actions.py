@@ -1,4 +1,4 @@
-"""Actions as MoveIt and a person at a shell send them: a stock client in ROS, the real controllers in the simulation."""
+"""Actions as MoveIt and a person at a shell send them: a stock client in ROS, the real controllers simulated."""
 
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
