@@ -22,7 +22,7 @@ from vinesim.bench.support.fake_client import FakeClient
 from vinesim.client.client import Client
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import encode_pose
-from vinesim.net.codec.messages import Hello, MessageError
+from vinesim.net.codec.messages import Hello, MessageError, MessageKind
 from vinesim.net.replication.model_check import check_record
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.server.admission import AdmissionControl, SceneId
@@ -34,8 +34,8 @@ from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.sidecar import encode_sidecar
-from vinesim.scene.ids import OBJECT_STRIDE
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.ids import OBJECT_STRIDE
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanPose, HumanUpdate, RobotUpdate
@@ -159,6 +159,20 @@ class FuzzWorld:
                 self.publishers.clear()
             self.publishers[key] = self.bus.publisher(key, reliable=True)
         self.publishers[key].put(payload)
+
+    def offer(self, payload: bytes) -> None:
+        """Offer the server a part of a mesh, or ask for one."""
+        if len(payload) < 4 or payload[3] not in (MessageKind.MESH_PART, MessageKind.MESH_REQUEST):
+            return
+        try:
+            if payload[3] == MessageKind.MESH_PART:
+                part = messages.decode_part(payload)
+                messages.encode_wanted(self.meshes.offer((WORLD, ATTACKER), part))
+                messages.encode_part(self.meshes.part(part.digest, part.offset))
+            else:
+                messages.decode_request(payload)
+        except MessageError:
+            pass
 
     @property
     def name(self) -> str:

@@ -1,7 +1,7 @@
 """Well-formed lies: messages of every kind that the encoders make, whose content the model forbids or that contradict.
 
-Strategies of Hypothesis. A lie that carries a time is encoded for time zero plus an error, and moved to the present when
-it is told.
+Strategies of Hypothesis. A lie that carries a time is encoded for time zero plus an error, and moved to the present
+when it is told.
 """
 
 from __future__ import annotations
@@ -52,20 +52,7 @@ class Lie:
         elif self.kind == "join":
             world.admission.decide(WORLD, ATTACKER, "another", self.payload, world.now)
         else:
-            offer(world, self.payload)
-
-
-def offer(world: FuzzWorld, payload: bytes) -> None:
-    """Offer the server a part of a mesh, or ask for one."""
-    try:
-        if payload[3] == messages.MessageKind.MESH_PART:
-            part = messages.decode_part(payload)
-            world.meshes.offer((WORLD, ATTACKER), part)
-            messages.encode_part(world.meshes.part(part.digest, part.offset))
-        else:
-            messages.decode_request(payload)
-    except MessageError:
-        pass
+            world.offer(self.payload)
 
 
 class Liar:
@@ -206,10 +193,10 @@ def _about_objects(draw: Draw, model: Model) -> Lie:
 
 def _about_owners(draw: Draw, model: Model) -> Lie:
     """Claims for others, for objects that there are not, and of all sequences."""
-    claims = [
-        (_object(draw, model, tuple(ObjectKind)), Claim(draw(SEQUENCE), draw(SEQUENCE), draw(OWNERS)), draw(st.booleans()))
-        for _ in range(draw(st.integers(1, 4)))
-    ]  # fmt: skip
+    claims = []
+    for _ in range(draw(st.integers(1, 4))):
+        claim = Claim(draw(SEQUENCE), draw(SEQUENCE), draw(OWNERS))
+        claims.append((_object(draw, model, tuple(ObjectKind)), claim, draw(st.booleans())))
     return Lie("put", messages.encode_claims(claims), f"own/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
 
@@ -271,13 +258,15 @@ def _human_pose(draw: Draw, _: Model) -> Lie:
 
 def _wrenches(draw: Draw, _: Model) -> Lie:
     """Forces beyond all limits, on links out of reach, of other robots, or that there are not."""
-    links = draw(st.sets(st.sampled_from(("base_link", "arm_left_7_link", "torso_lift_link", "no link", "")), max_size=3))
+    links = draw(
+        st.sets(st.sampled_from(("base_link", "arm_left_7_link", "torso_lift_link", "no link", "")), max_size=3)
+    )
     wrenches = {link: _vectors(draw, st.floats(-2000.0, 2000.0, width=32), 6) for link in sorted(links)}
     return Lie("put", encode_wrenches(WrenchMessage(draw(TIME_ERROR), wrenches)), f"force/ada/{ATTACKER}")
 
 
 def _couplings(draw: Draw, model: Model) -> Lie:
-    """Springs to bodies that nobody owns, that cannot be held, or that there are not, from far away."""
+    """Springs to bodies without an owner, that cannot be held, or that there are not, from far away."""
     bodies = sorted(draw(st.sets(st.integers(0, len(model.body_tree)), max_size=8)))
     couplings = tuple(
         Coupling(body, _vectors(draw, st.floats(-10.0, 10.0, width=32), 3), _vectors(draw, FAR, 3)) for body in bodies
@@ -285,18 +274,39 @@ def _couplings(draw: Draw, model: Model) -> Lie:
     return Lie("put", encode_couplings(CouplingMessage(draw(TIME_ERROR), couplings)), f"force/ada/{ATTACKER}")
 
 
+def _urdf(links: str) -> str:
+    return f"<robot name='x'>{links}</robot>"
+
+
+_TWO_LINKS = "<link name='a'/><link name='b'/>"
+
 URDFS = (
-    None, "", "<robot/>", "<robot name='x'><link name='base_link'/></robot>", "<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>",
-    "<robot name='x'><link name='a'/><link name='b'/><joint name='j' type='revolute'><parent link='a'/><child link='b'/>"
-    "<axis xyz='0 0 0'/><limit effort='1e300' velocity='1e300' lower='-1e300' upper='1e300'/></joint></robot>",
-    "<robot name='x'><link name='a'><inertial><mass value='1e30'/><inertia ixx='1e30' iyy='1e30' izz='1e30' ixy='0' ixz='0'"
-    " iyz='0'/></inertial><collision><geometry><box size='1e6 1e6 1e6'/></geometry></collision></link></robot>",
-    "<robot name='x'><link name='a'><visual><geometry><mesh filename='/etc/passwd'/></geometry></visual></link></robot>",
-    "<robot name='x'><link name='a'><visual><geometry><mesh filename='m.stl' size='1e9 1 1' digest='" + "0" * 40
-    + "' triangles='4'/></geometry></visual></link></robot>",
-    "<robot name='x'><link name='a'/><link name='b'/><joint name='j' type='fixed'><parent link='b'/><child link='a'/></joint>"
-    "<joint name='k' type='fixed'><parent link='a'/><child link='b'/></joint></robot>",
-)  # fmt: skip
+    None,
+    "",
+    "<robot/>",
+    _urdf("<link name='base_link'/>"),
+    "<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>",
+    _urdf(
+        f"{_TWO_LINKS}<joint name='j' type='revolute'><parent link='a'/><child link='b'/><axis xyz='0 0 0'/>"
+        "<limit effort='1e300' velocity='1e300' lower='-1e300' upper='1e300'/></joint>"
+    ),
+    _urdf(
+        "<link name='a'><inertial><mass value='1e30'/>"
+        "<inertia ixx='1e30' iyy='1e30' izz='1e30' ixy='0' ixz='0' iyz='0'/></inertial>"
+        "<collision><geometry><box size='1e6 1e6 1e6'/></geometry></collision></link>"
+    ),
+    _urdf("<link name='a'><visual><geometry><mesh filename='/etc/passwd'/></geometry></visual></link>"),
+    _urdf(
+        "<link name='a'><visual><geometry><mesh filename='m.stl' size='1e9 1 1' triangles='4' "
+        f"digest='{'0' * 40}'/></geometry></visual></link>"
+    ),
+    _urdf(
+        f"{_TWO_LINKS}<joint name='j' type='fixed'><parent link='b'/><child link='a'/></joint>"
+        "<joint name='k' type='fixed'><parent link='a'/><child link='b'/></joint>"
+    ),
+)
+"""Robots that cannot be; None: one that can."""
+
 SIDECARS = (None, "", "{}", "[]", "null", '{"groups": 3}', '{"base_limits": [1e999, -1]}', "\x00", '{"a": ' * 50)
 
 
@@ -305,7 +315,8 @@ def _greeting(draw: Draw, model: Model) -> Lie:
     robot = load_description("vinebot")
     urdf, sidecar = draw(st.sampled_from(URDFS)), draw(st.sampled_from(SIDECARS))
     hello = Hello(
-        draw(st.sampled_from((ATTACKER, ATTACKER, "ada", "bob"))), draw(st.sampled_from(("robot", "human", "spectator"))),
+        draw(st.sampled_from((ATTACKER, ATTACKER, "ada", "bob"))),
+        draw(st.sampled_from(("robot", "human", "spectator"))),
         draw(st.sampled_from(("vinebot", "logistic", "../../etc/passwd", "", "x" * 1000))),
         robot.urdf if urdf is None else urdf,
         encode_sidecar(robot.base_limits, robot.groups) if sidecar is None else sidecar, "demo",
@@ -337,4 +348,3 @@ def _control(draw: Draw, model: Model) -> Lie:
     )))  # fmt: skip
     family = draw(st.sampled_from(("own", "fact", "c", "tree", "near")))
     return Lie("put", payload, f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
-

@@ -37,7 +37,10 @@ class MessageKind(enum.IntEnum):
     MESH_WANTED = 21
 
 
-_RARE = (MessageKind.CLAIMS, MessageKind.RETAINED, MessageKind.HELLO, MessageKind.CLOCK, MessageKind.WELCOME)
+_RARE = (
+    MessageKind.CLAIMS, MessageKind.RETAINED, MessageKind.HELLO, MessageKind.CLOCK, MessageKind.WELCOME,
+    MessageKind.MESH_PART, MessageKind.MESH_REQUEST, MessageKind.MESH_WANTED,
+)  # fmt: skip
 
 TIMESTAMPED = frozenset(MessageKind).difference(_RARE)
 """Kinds whose header holds the network time [s] at which the content was sampled."""

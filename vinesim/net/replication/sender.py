@@ -277,9 +277,7 @@ class Sender:
         state.ownership[object_id].announced = True
         state.retained.publish(
             state.object_stream.cells((object_id,))[0],
-            RetainedRecord(
-                object_id, claim.ownership, claim.authority, state.hello.name, _within_range(pose), parent
-            ),
+            RetainedRecord(object_id, claim.ownership, claim.authority, state.hello.name, _within_range(pose), parent),
         )
 
     def _publish_detachment(self, object_id: int, step: LocalStep) -> None:

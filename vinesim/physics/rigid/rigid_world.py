@@ -213,7 +213,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             np.add(force, 0.0, out=d.qfrc_applied)  # turns -0 into +0: -0 would keep sleeping boxes awake
         mujoco.mj_step2(m, d)
         self._link_sensors.measure(m, d)
-        if not (-MAX_RATE < d.qvel.min() and d.qvel.max() < MAX_RATE and np.isfinite(d.qpos).all()):
+        if not (d.qvel.min() > -MAX_RATE and d.qvel.max() < MAX_RATE and np.isfinite(d.qpos).all()):
             self._stop_faulty_trees()
             force = None
         self.contact_force[:] = 0.0 if force is None else force
