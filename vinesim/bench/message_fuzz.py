@@ -392,4 +392,4 @@ def fuzz(count: int = MESSAGE_COUNT, lies: int = 0) -> Iterator[Measurement]:
         from vinesim.bench.support.lies import tell_lies  # needs hypothesis
 
         told = tell_lies(lies // 2, kind=kind)
-        yield Measurement("fuzz", f"a {kind} that lies: well-formed lies told, no law broken", float(told))
+        yield Measurement("fuzz", f"a {kind} that lies: well-formed lies told, no law broken", float(told), "")

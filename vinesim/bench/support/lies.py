@@ -89,6 +89,14 @@ class Liar:
             self.world = None
 
 
+_HEALTH_CHECKS = (
+    hypothesis.HealthCheck.too_slow,
+    hypothesis.HealthCheck.data_too_large,
+    hypothesis.HealthCheck.filter_too_much,
+    hypothesis.HealthCheck.large_base_example,
+)
+
+
 def tell_lies(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
     """Tell that many series of up to eight lies, found by Hypothesis; the number of lies.
 
@@ -99,7 +107,7 @@ def tell_lies(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
     @hypothesis.seed(seed)
     @hypothesis.settings(
         max_examples=examples, deadline=None, database=None, print_blob=False,
-        suppress_health_check=list(hypothesis.HealthCheck),
+        suppress_health_check=_HEALTH_CHECKS,
     )  # fmt: skip
     @hypothesis.given(st.lists(lies(small_vineyard()), min_size=1, max_size=8))
     def tell(series: list[Lie]) -> None:
@@ -167,9 +175,10 @@ def _about_trees(draw: Draw, model: Model) -> Lie:
     sizes = np.array([int(model.tree_size[tree]) + draw(st.sampled_from((0, 0, 0, 0, 1))) for tree in trees])
     roots = [sorted(draw(st.sets(st.integers(0, int(size) - 1), max_size=3))) for size in sizes]
     total, cut = int(sizes.sum()), sum(map(len, roots))
-    columns = [np.array([draw(SEQUENCE) for _ in trees]) for _ in range(2)]
+    ownership, authority = (np.array([draw(SEQUENCE) for _ in trees]) for _ in range(2))
+    flags = np.array([draw(st.integers(0, 3)) for _ in trees])
     states = TreeStates(
-        draw(TIME_ERROR), np.array(trees), *columns, np.array([draw(st.integers(0, 3)) for _ in trees]), sizes,
+        draw(TIME_ERROR), np.array(trees), ownership, authority, flags, sizes,
         _quaternions(draw, total), _vectors(draw, UNIT, total, 3, scale=83.0),
         np.array([len(one) for one in roots]), np.array([body for one in roots for body in one], np.int64),
         _vectors(draw, FAR, cut, 3), _vectors(draw, UNIT, cut, 3, scale=32.7),
@@ -183,9 +192,10 @@ def _about_objects(draw: Draw, model: Model) -> Lie:
     numbers = sorted({_object(draw, model, (ObjectKind.BUNCH, ObjectKind.BOX)) for _ in range(draw(st.integers(1, 3)))})
     count, cell = len(numbers), (draw(CELL), draw(CELL))
     pose = np.concatenate([_vectors(draw, NEAR, count, 3), _quaternions(draw, count)], 1)
+    ownership, authority = (np.array([draw(SEQUENCE) for _ in numbers]) for _ in range(2))
     velocity = _vectors(draw, st.one_of(UNIT, st.floats(-4000.0, 4000.0, width=32)), count, 6)
     states = ObjectStates(
-        draw(TIME_ERROR), np.array(numbers), *(np.array([draw(SEQUENCE) for _ in numbers]) for _ in range(2)),
+        draw(TIME_ERROR), np.array(numbers), ownership, authority,
         np.array([draw(st.integers(0, 3)) for _ in numbers]), pose, velocity,
     )  # fmt: skip
     return Lie("put", messages.encode_objects(states, cell)[0][0], f"c/{cell[0]}/{cell[1]}/{ATTACKER}")
