@@ -209,6 +209,7 @@ def test_beyond_the_radius_there_is_no_simulated_wind() -> None:
         blown.update(wind, 0.01 * tick, (np.array([[0.0, 10.0, 0.0], [0.0, 40.0, 0.0]]), 2.5))
     assert plants.awake.tolist() == [8, 9, 10, 11, 12, 38, 39, 40, 41, 42]
     assert not plants.tree_air[90].any()
+    assert blown.state is not None
     drawn = blown.state.tree_drawn
     assert (np.delete(drawn, plants.awake) == 1.0).all()  # sensors draw all others in it
 

@@ -29,6 +29,7 @@ from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
 from vinesim.client.remote.plant_couplings import PlantCouplings
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
+from vinesim.client.world_time import WorldTime
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
@@ -58,10 +59,8 @@ def label_index(name: str) -> int:
     return zlib.crc32(name.encode()) % LABEL_STRIDE
 
 
-WIND_TIME_SLEW = 0.1
-"""Seconds by which the time of the wind approaches network time in each second."""
-WIND_TIME_JUMP = 1.0
-"""[s] Further off, as at the start, it is set to it."""
+CLOCK_POLL_PERIOD = 0.005
+"""Time between two looks for the server's first reply [s]."""
 
 
 class Client:
@@ -123,6 +122,8 @@ class Client:
         self.trace: Trace | None = None
         """If set, force on and displacement of one bunch are recorded in it."""
         self.interest_audit = InterestAudit()
+        self.world_time = WorldTime(self.physics.dt)
+        """Time of the world, in which ROS messages are stamped."""
         self._clock = clock
         self._remote_trees: dict[int, TreeUpdate] = {}
         self.spawner = RemoteSpawner(self.physics.rigid, description, executor, self.meshes)
@@ -187,7 +188,9 @@ class Client:
         """Simulate one step of ``physics.dt``."""
         now = self._clock()
         self.receive(now)
-        self._set_wind_time(now)
+        if self.replicator.has_clock:
+            self.world_time.follow(self.physics.time, now + self.replicator.offset)
+        self.physics.wind_time_offset = self.world_time.offset
         self.control()
         self.physics.step()
         self.sense()
@@ -195,14 +198,12 @@ class Client:
         for callback in self.wake_readers:
             callback()
 
-    def _set_wind_time(self, now: float) -> None:
-        """Let the wind follow network time, so that all clients see the same gusts at the same time."""
-        physics = self.physics
-        late = now + self.replicator.offset - physics.time - physics.wind_time_offset
-        if abs(late) > WIND_TIME_JUMP:
-            physics.wind_time_offset += late
-        else:
-            physics.wind_time_offset += float(np.clip(late, -WIND_TIME_SLEW * physics.dt, WIND_TIME_SLEW * physics.dt))
+    def wait_for_clock(self, timeout: float) -> None:
+        """Before the first step: wait up to ``timeout`` [s] for the server's clock, so that no stamp jumps later."""
+        until = self._clock() + timeout
+        while not self.replicator.has_clock and self._clock() < until:
+            self.receive(self._clock())
+            time.sleep(CLOCK_POLL_PERIOD)
 
     # ------------------------------------------------------------------ the parts of a tick
 
@@ -409,9 +410,9 @@ class InterestAudit:
             self._seen = sent
             return
         rigid = client.physics.rigid
-        here = [rigid.actor_position(name)[:2] for name in client.replicators]
-        there = [rigid.actor_position(name)[:2] for name in client.remote_actors]
-        distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
+        here = np.array([rigid.actor_position(name)[:2] for name in client.replicators])
+        there = np.array([rigid.actor_position(name)[:2] for name in client.remote_actors])
+        distance = float(np.linalg.norm(here[:, None] - there, axis=-1).min())
         if distance > client.replicator.interest_radius + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching

@@ -10,6 +10,7 @@ and a few canopy heights long (Raupach, Finnigan and Brunet, Boundary-Layer Mete
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from vinesim import frames
 from vinesim.scene.spec import Scene
@@ -29,7 +30,7 @@ class Wind:
         seed: of the pattern.
     """
 
-    def __init__(self, mean: np.ndarray, *, gusts: float = 0.0, scale: float = 4.0, seed: int = 0) -> None:
+    def __init__(self, mean: npt.ArrayLike, *, gusts: float = 0.0, scale: float = 4.0, seed: int = 0) -> None:
         self.mean = np.asarray(mean, float)
         if self.mean.shape != (3,) or not np.isfinite(self.mean).all():
             raise ValueError(f"mean wind {mean}: give three finite numbers, m/s")

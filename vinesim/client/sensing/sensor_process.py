@@ -143,6 +143,7 @@ class SensorProcess:
                 shared["wind_time"][0] = wind.time
                 shared["tree_air"][:], shared["tree_drawn"][:] = wind.tree_air, wind.tree_drawn
             shared["time"][0], shared["tick"][0] = physics.time, physics.tick
+            shared["world_offset"][0] = client.world_time.offset
             shared["frame_score"][0] = client.frame_score()
             visual_q = physics.visual_q()
             self._visuals.memory["visual_q"][: len(visual_q)] = visual_q

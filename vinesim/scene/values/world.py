@@ -16,7 +16,7 @@ class WindState:
 
     wind: Wind
     time: float
-    """[s] Of the wind: network time where there is one."""
+    """[s] Of the wind: that of the world."""
     strength: float
     """[1] From 0 when a wind begins to 1, and back to 0 when it ends."""
     tree_air: np.ndarray
