@@ -83,7 +83,7 @@ class SensorProcess:
         self._frames = tuple(config.sensor_frames.values())
         self.worker = WorkerProcess(
             f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
-            lambda context: SensorChannel(config, context), self._receive,
+            lambda context: SensorChannel(config, context), self._receive, stands_by=True,
         )  # fmt: skip
         self._run: Run[SensorChannel] | None = None
         """The run of the process that snapshots were last written for."""
