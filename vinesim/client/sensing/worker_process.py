@@ -30,10 +30,8 @@ EXIT_TIMEOUT = 1.2
 STABLE_TIME = 10.0
 """A process that ran this long before it failed is started again at once [s]; else there is a pause before. A start
 takes two seconds of one core."""
-STANDBY_DELAY = 5.0
+STANDBY_DELAY = 2.0
 """A process has been ready for so long before another one stands by [s]."""
-STANDBY_NICENESS = 10
-"""By how much nicer than the client that one imports."""
 HANG_TIMEOUT = 15
 """A process that was ready and then sends nothing for this long hangs, and is started again [s]. It reports to the
 client five times a second, unless it renders a picture or writes files."""
@@ -140,13 +138,14 @@ class WorkerProcess(Generic[S]):
     ``share(context)`` makes what is shared with one run. ``receive(kind, value)`` takes all other messages, and
     ("restarted", None) before those of a further run, in a thread.
 
-    With ``stands_by``, another process imports ``modules`` while one is ready, and takes its place if it fails.
+    With a ``rehearsal``, another process stands by while one is ready, and takes its place if it fails; see
+    :class:`SpawnedProcess`.
     """
 
     def __init__(
         self, title: str, modules: Sequence[str], target: Callable[..., None], config: Any,
         share: Callable[[BaseContext], S], receive: Callable[[str, Any], None],
-        *, stands_by: bool = False,
+        *, rehearsal: str = "",
     ) -> None:  # fmt: skip
         self.title = title
         self.restarts = 0
@@ -154,7 +153,7 @@ class WorkerProcess(Generic[S]):
         self.restart_time = 0.0
         """From the start of the last further run until it was ready [s]."""
         self._modules, self._target, self._config = modules, target, config
-        self._share, self._receive, self._stands_by = share, receive, stands_by
+        self._share, self._receive, self._rehearsal = share, receive, rehearsal
         self._standby: SpawnedProcess | None = None
         self._standby_due = 0.0
         """When another process may stand by, at the earliest [s]."""
@@ -184,8 +183,9 @@ class WorkerProcess(Generic[S]):
 
     @property
     def standby_pid(self) -> int | None:
-        """Process id of the one that stands by, or is about to; None if there is none."""
-        return None if self._standby is None else self._standby.process.pid
+        """Process id of the one that stands by; None if there is none."""
+        standby = self._standby
+        return standby.process.pid if standby is not None and standby.stands_by else None
 
     @property
     def is_ready(self) -> bool:
@@ -228,7 +228,8 @@ class WorkerProcess(Generic[S]):
         shared, standby = self._share(CONTEXT), self._standby
         self._standby = None
         if standby is not None:
-            if standby.has_imported():
+            standby.look()
+            if standby.stands_by:
                 with contextlib.suppress(OSError):  # it has ended just now
                     return Run(standby, self._target, self._config, shared)
             standby.end()
@@ -236,14 +237,14 @@ class WorkerProcess(Generic[S]):
 
     def _keep_standby(self, run: Run[S]) -> None:
         """Start a process that stands by when that is due, and again if it has ended."""
-        if not self._stands_by or run.ready_since is None:
+        if not self._rehearsal or run.ready_since is None:
             return
         now = time.monotonic()
-        if self._standby is not None and not self._standby.process.is_alive():
+        if self._standby is not None and not self._standby.look():
             self._standby.end()
             self._standby, self._standby_due = None, now + LONGEST_PAUSE
         if self._standby is None and now > max(run.ready_since + STANDBY_DELAY, self._standby_due):
-            self._standby = SpawnedProcess(self.title, self._modules, STANDBY_NICENESS)
+            self._standby = SpawnedProcess(self.title, self._modules, self._rehearsal)
 
     def _supervise(self) -> None:
         try:
