@@ -441,7 +441,7 @@ def test_closing_leaves_nothing_behind():
     [
         ({"name": "vine bot"}, "vine bot"),
         ({"name": "vinebot", "namespace": "robot-1"}, "robot-1"),
-        ({"name": "vinebot", "controllers": ["left arm"]}, "left arm"),
+        ({"name": "vinebot", "controllers": [ControllerSpec("left arm", ControllerKind.GRIPPER, ())]}, "left arm"),
     ],
 )
 def test_names_that_ros_refuses_are_said_in_one_line(arguments, words):

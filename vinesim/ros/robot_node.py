@@ -16,7 +16,7 @@ from vinesim.ros.commands.subscriptions import CommandQueue, CommandSubscription
 from vinesim.ros.commands.types import Command, GoalResult
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.node import Node
-from vinesim.ros.publishers.clock import ClockPublisher
+from vinesim.ros.publishers.clock import CLOCK, ClockPublisher
 from vinesim.ros.publishers.contacts import ContactPublisher
 from vinesim.ros.publishers.control import ControlPublisher
 from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
@@ -36,8 +36,8 @@ class RobotNode(Node):
 
     ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
     sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none. All topics but /clock
-    stand under the namespace, tf too (as Nav2 does with several robots); a second robot of a ROS domain should be made
-    with ``clock=False``.
+    stand under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether this node may publish it,
+    which one node of a ROS domain does.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class RobotNode(Node):
     def _open(self) -> None:
         from tf2_msgs.msg import TFMessage
 
-        self._clock = ClockPublisher(self._advertise) if self._has_clock else None
+        self._clock = ClockPublisher(self._node, self._advertise, self._withdraw) if self._has_clock else None
         self._robot = RobotPublisher(self._advertise, TFMessage, self._urdf, self._static_transforms, self._base)
         self._ground_truth = GroundTruthPublisher(self._advertise, TFMessage)
         self._diagnostics = self._advertise(DiagnosticArray, "diagnostics", RELIABLE)
@@ -79,8 +79,20 @@ class RobotNode(Node):
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
         CommandSubscriptions(self._node, self._controllers, self._commands)
 
+    def has_subscribers(self, family: str) -> bool:
+        return self.has_clock_subscribers if family == CLOCK else super().has_subscribers(family)
+
+    @property
+    def has_clock_subscribers(self) -> bool:
+        """Whether this node publishes /clock, and has subscribers to it."""
+        return self._clock is not None and self._clock.has_subscribers
+
+    def _look_around(self) -> None:
+        if self._clock is not None:
+            self._clock.update()
+
     def publish_clock(self, time: float) -> None:
-        """Publish /clock at simulation time ``time`` [s], if this node has it; for every step."""
+        """Publish /clock at ``time`` [s], if this node is the one that does; for every step."""
         if self._clock is not None:
             self._send(self._clock.pending(time))
 

@@ -34,7 +34,8 @@ class RobotProcesses:
         ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
         renderer: str = "warp", device: str = "cpu",
     ) -> None:  # fmt: skip
-        """``clock``: publish /clock; a ROS domain has one. For the others see :class:`SensorProcess`."""
+        """``clock``: may publish /clock, as one node of a ROS domain does. For the others see
+        :class:`SensorProcess`."""
         if ros and (reason := middleware.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
@@ -104,7 +105,7 @@ class RobotProcesses:
             return
         report, awaited = self.report(), self.sensors.awaited()
         self.ros.publish_diagnostics(
-            status["time"],
+            status["world_time"],
             [
                 loop_status(status),
                 ComponentStatus(

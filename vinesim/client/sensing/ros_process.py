@@ -37,7 +37,7 @@ class RosProcess:
     def __init__(
         self, name: str, model: Model, description: RobotDescription, *, namespace: str = "", clock: bool = True
     ) -> None:
-        """Starts the process; :meth:`attach` connects it with a client. ``clock``: publish /clock."""
+        """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock."""
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
         self._sent: dict[str, int] = {}
@@ -77,7 +77,7 @@ class RosProcess:
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
         self.handler = RosCommandHandler(
-            self.robot, self._take_commands, lambda result: self.worker.send("finish", result)
+            self.robot, self._take_commands, lambda result: self.worker.send("finish", result), client.world_time
         )
         client.pre_step.insert(0, self._control)
 
@@ -107,14 +107,15 @@ class RosProcess:
                 if record is None:
                     self._lost += wanted
                 else:
-                    self._contacts_left_out += self._records.write(record, physics.time, sample)
+                    now = physics.time + client.world_time.offset
+                    self._contacts_left_out += self._records.write(record, now, sample)
         if physics.tick % TRUTH_PERIOD == 0 and channel.wanted["truth"][0]:
             physics.update_kinematics()
             with channel.truth.writing() as truth:
                 if truth is None:
                     self._missed_truth += 1
                 else:
-                    truth["time"][0] = physics.time
+                    truth["time"][0] = physics.time + client.world_time.offset
                     truth["attached"][:] = physics.state.bunch_attached
                     truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
 

@@ -45,7 +45,7 @@ class RosConfig:
     namespace: str
     """Prefix of its topics."""
     clock: bool
-    """Whether the node publishes /clock."""
+    """Whether the node may publish /clock; one of a ROS domain does."""
     static_transforms: tuple[tuple[str, str, np.ndarray], ...]
     poles: np.ndarray
     """Poses [pole, 7] m, 1."""
@@ -109,7 +109,6 @@ class RosWorker:
         )  # fmt: skip
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
-        self._step_topics = [name if config.clock or name != "/clock" else None for name in config.step_topics]
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
         self._attached_names = self._bunch_names
         self._next_statistics = 0.0
@@ -154,7 +153,7 @@ class RosWorker:
     def _report(self) -> None:
         """Tell the client what is subscribed to, and now and then what was sent."""
         wanted = self.channel.wanted
-        wanted["steps"][:] = [name is not None and self.node.has_subscribers(name) for name in self._step_topics]
+        wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
         wanted["goals"][0] = self.node.has_goals
         wanted["truth"][0] = self.node.has_subscribers(TRUTH_TOPIC)
         now = time.monotonic()

@@ -138,6 +138,7 @@ class SensorProcess:
             shared["tree_number"][trees] = shared["number"][0] = self._snapshot_count
             shared["bunch_attached"][:] = physics.state.bunch_attached
             shared["time"][0], shared["tick"][0] = physics.time, physics.tick
+            shared["world_offset"][0] = client.world_time.offset
             shared["frame_score"][0] = client.frame_score()
             visual_q = physics.visual_q()
             self._visuals.memory["visual_q"][: len(visual_q)] = visual_q

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable
 
+from vinesim.client.world_time import WorldTime
 from vinesim.robot.control import controller_manager
 from vinesim.robot.control.controller_manager import ControllerManager
 from vinesim.robot.control.trajectory_controller import Outcome, Tolerance, Trajectory
@@ -38,13 +39,17 @@ class RosCommandHandler:
         robot: Robot,
         commands: Callable[[], Iterable[Command]],
         finish: Callable[[GoalResult], None] = lambda _: None,
+        world_time: WorldTime | None = None,
     ) -> None:
-        """``commands`` returns the commands that have arrived since the last call; ``finish`` takes ended goals."""
+        """``commands`` returns the commands that have arrived since the last call; ``finish`` takes ended goals.
+
+        ``world_time``: in which commands are stamped; without it they are stamped in simulated time.
+        """
         self.robot = robot
         self.controllers = ControllerManager(robot)
         self.rejected_count = 0
         """Commands that this robot cannot take."""
-        self._commands, self._finish = commands, finish
+        self._commands, self._finish, self._world_time = commands, finish, world_time
 
     def __call__(self, time: float) -> None:
         """Apply the new commands in the step that starts at ``time`` [s], and advance the controllers."""
@@ -82,15 +87,20 @@ class RosCommandHandler:
             case JointTrajectory() if len(command.times) == 0:
                 controllers.stop_trajectory(command.controller)
             case JointTrajectory():
-                controllers.start_trajectory(command.controller, _trajectory(command), time, command.goal)
+                offset = 0.0 if self._world_time is None else self._world_time.offset
+                trajectory = _trajectory(command, offset)
+                controllers.start_trajectory(command.controller, trajectory, time, command.goal)
 
 
-def _trajectory(command: JointTrajectory) -> Trajectory:
+def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
+    """A trajectory with its start in simulated time; ``offset`` [s]: of the world's time against that."""
+
     def tolerance(given: JointTolerances | None) -> Tolerance | None:
         return None if given is None else Tolerance(given.position, given.velocity)
 
     return Trajectory(
-        command.joints, command.times, command.positions, command.velocities, start_time=command.time,
+        command.joints, command.times, command.positions, command.velocities,
+        start_time=max(command.time - offset, 1e-9) if command.time > 0.0 else 0.0,
         path_tolerance=tolerance(command.path_tolerance), goal_tolerance=tolerance(command.goal_tolerance),
         goal_time_tolerance=command.goal_time_tolerance,
     )  # fmt: skip
