@@ -127,7 +127,8 @@ def test_the_process_that_stands_by_takes_the_place_of_a_killed_one(robot, monke
     robot.run_for_pictures(1)
     wait(lambda: worker.standby_pid, "a process that stands by")
     other = worker.standby_pid
-    assert other is not None and other != worker.pid
+    assert other is not None
+    assert other != worker.pid
     assert os.getpriority(os.PRIO_PROCESS, other) == os.getpriority(os.PRIO_PROCESS, 0)
     robot.kill_sensors()
     robot.run_until(lambda: worker.pid == other, "a restart")

@@ -100,19 +100,22 @@ def test_no_tick_waits_for_a_robot_that_leaves(vinebot):
         physics.step()
     copy = RemoteRobot(waiting.rigid, vinebot, "guest", 7, pose, is_in_world=True)
     spawner.remove("guest", copy)
-    assert spawner.spawn({}) == {} and spawner.removed() == []
+    assert spawner.spawn({}) == {}
+    assert spawner.removed() == []
     for physics in (waiting, at_once):
         physics.step()
     assert waiting.rigid.robots == ("host", "guest")
     deferred.work()
-    assert spawner.spawn({}) == {} and spawner.removed() == ["guest"]
+    assert spawner.spawn({}) == {}
+    assert spawner.removed() == ["guest"]
     at_once.rigid.remove_robot("guest")
     for physics in (waiting, at_once):
         for _ in range(3):
             physics.step()
         assert physics.rigid.robots == ("host",)
     assert waiting.rigid.mj_data.qpos.tobytes() == at_once.rigid.mj_data.qpos.tobytes()
-    assert spawner.spawn({}) == {} and not deferred.waiting
+    assert spawner.spawn({}) == {}
+    assert not deferred.waiting
 
 
 def test_a_robot_that_comes_back_before_its_copy_was_removed_is_placed_anew(vinebot):
@@ -126,7 +129,8 @@ def test_a_robot_that_comes_back_before_its_copy_was_removed_is_placed_anew(vine
     assert spawner.spawn(updates) == {}
     deferred.work()
     guest = spawner.spawn(updates)["guest"]
-    assert spawner.removed() == ["guest"] and physics.rigid.robots == ("host", "guest")
+    assert spawner.removed() == ["guest"]
+    assert physics.rigid.robots == ("host", "guest")
     assert np.allclose(physics.rigid.base_state("guest")[0][:3], (1.0, 0.0, 0.0))
     physics.step()
     guest.remove()

@@ -1,4 +1,4 @@
-"""Adds and removes the robots and humans of other clients: an executor loads and compiles them, and no step waits for it."""
+"""Adds and removes robots and humans of other clients: an executor loads and compiles, and no step waits for it."""
 
 from __future__ import annotations
 

@@ -78,7 +78,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         self, *specs: RobotSpec | HumanSpec, is_remote: bool = False, replaces: bool = False,
         without: Collection[str] = (),
     ) -> CompiledWorld:  # fmt: skip
-        """Compile the world with more actors, ``without`` those of some names, and a full pool of spare bodies for free bunches, for :meth:`adopt`.
+        """Compile the world with more actors, ``without`` those of some names, and with a full pool of spare bodies for
+        free bunches, for :meth:`adopt`.
 
         Any thread may call this while steps go on. Raises :class:`RobotError` if a URDF does not compile, of several
         robots without saying which. ``is_remote``: see :meth:`add_human`. ``replaces``: the robots
@@ -108,8 +109,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             raise build_error(added[-1], error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
-        """Use a world that was compiled with more or fewer actors, with other shapes of robots, or with more room for free
-        bunches; between steps.
+        """Use a world that was compiled with more or fewer actors, with other shapes of robots, or with more room for
+        free bunches; between steps.
 
         False, and nothing is changed, if other actors joined or left meanwhile: compile it anew.
         """
