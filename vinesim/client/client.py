@@ -411,9 +411,9 @@ class InterestAudit:
             self._seen = sent
             return
         rigid = client.physics.rigid
-        here = [rigid.actor_position(name)[:2] for name in client.replicators]
-        there = [rigid.actor_position(name)[:2] for name in client.remote_actors]
-        distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
+        here = np.array([rigid.actor_position(name)[:2] for name in client.replicators])
+        there = np.array([rigid.actor_position(name)[:2] for name in client.remote_actors])
+        distance = float(np.linalg.norm(here[:, None] - there, axis=-1).min())
         if distance > client.replicator.interest_radius + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching

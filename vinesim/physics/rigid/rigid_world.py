@@ -33,6 +33,9 @@ from vinesim.scene.values import HumanSpec, RobotSpec
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 _HIPS = BODY_PARTS.index("hips")
 
+MAX_RATE = 1e4
+"""[m/s, rad/s] No body moves as fast, unless the simulation has become unstable."""
+
 
 class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
     """Robots, people, crates, free bunches and static geoms in one MuJoCo world, and their step."""
@@ -217,7 +220,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             np.add(force, 0.0, out=d.qfrc_applied)  # turns -0 into +0: -0 would keep sleeping boxes awake
         mujoco.mj_step2(m, d)
         self._link_sensors.measure(m, d)
-        if not np.isfinite(d.qvel).all() or not np.isfinite(d.qpos).all():
+        if not (d.qvel.min() > -MAX_RATE and d.qvel.max() < MAX_RATE and np.isfinite(d.qpos).all()):
             self._stop_faulty_trees()
             force = None
         self.contact_force[:] = 0.0 if force is None else force
@@ -243,13 +246,14 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         self._link_sensors.find_indices(mj_model, self._robots)
 
     def _stop_faulty_trees(self) -> None:
-        """Stop the kinematic trees with a number that is not finite where the step began; the others go on."""
+        """Stop the kinematic trees with a number that is not finite, or a rate beyond :data:`MAX_RATE`, where the step
+        began; the others go on."""
         m, d = self.mj_model, self.mj_data
         joint_tree = m.dof_treeid[m.jnt_dofadr]
         width = np.where(m.jnt_type == mujoco.mjtJoint.mjJNT_FREE, 7, 1)
         tree = np.repeat(joint_tree, width)  # of each entry of qpos
         faulty = np.zeros(m.ntree, bool)
-        faulty[m.dof_treeid[~np.isfinite(d.qvel)]] = True
+        faulty[m.dof_treeid[~(np.abs(d.qvel) < MAX_RATE)]] = True
         faulty[tree[~np.isfinite(d.qpos)]] = True
         valid = np.where(np.isfinite(self._valid_qpos), self._valid_qpos, m.qpos0)
         d.qpos[faulty[tree]] = valid[faulty[tree]]
@@ -262,7 +266,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
                 robot.feedforward[:] = 0.0
         stopped = [m.body(m.tree_bodyadr[tree]).name for tree in np.flatnonzero(faulty)]
         self.faults += len(stopped)
-        self.last_fault = f"t = {d.time:.2f} s: {', '.join(stopped)} moved by a number that is not finite; stopped"
+        names = ", ".join(stopped)
+        self.last_fault = f"t = {d.time:.2f} s: {names} moved by a number that is not finite or too fast; stopped"
 
 
 def _free_code(
