@@ -218,12 +218,12 @@ class Client:
             self.spawner.cancel(name)
             self.meshes.forget(name)
             if (other := self.remote_actors.pop(name, None)) is not None:
-                other.remove()
-                self.physics.contact_solver.remote_actors.discard(name)
+                self.spawner.remove(name, other)
                 log.info("%s left", name)
         updates: dict[str, RobotUpdate | HumanUpdate] = {**inbox.robots, **inbox.people}
         spawned = self.spawner.spawn(updates)
         self.remote_actors.update(spawned)
+        self.physics.contact_solver.remote_actors.difference_update(self.spawner.removed())
         self.physics.contact_solver.remote_actors.update(spawned)
         for name, update in updates.items():
             match self.remote_actors.get(name), update:

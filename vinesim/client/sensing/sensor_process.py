@@ -17,7 +17,7 @@ import numpy as np
 from vinesim.client.client import Client
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.sensor_worker import POSE_HISTORY, SensorChannel, SensorConfig, run_sensor_worker
-from vinesim.client.sensing.spawned_process import sensor_modules
+from vinesim.client.sensing.spawned_process import SENSOR_REHEARSAL, sensor_modules
 from vinesim.client.sensing.worker_process import Run, WorkerProcess
 from vinesim.errors import WriteError
 from vinesim.robot.description.description import RobotDescription
@@ -84,7 +84,7 @@ class SensorProcess:
         self._frames = tuple(config.sensor_frames.values())
         self.worker = WorkerProcess(
             f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
-            lambda context: SensorChannel(config, context), self._receive,
+            lambda context: SensorChannel(config, context), self._receive, rehearsal=SENSOR_REHEARSAL,
         )  # fmt: skip
         self._run: Run[SensorChannel] | None = None
         """The run of the process that snapshots were last written for."""

@@ -12,7 +12,7 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
@@ -78,15 +78,20 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         self._recompile()
 
     def compile_with(
-        self, *specs: RobotSpec | HumanSpec, is_remote: bool = False, replaces: bool = False
-    ) -> CompiledWorld:
-        """Compile the world with more actors and a full pool of spare bodies for free bunches, for :meth:`adopt`.
+        self, *specs: RobotSpec | HumanSpec, is_remote: bool = False, replaces: bool = False,
+        without: Collection[str] = (),
+    ) -> CompiledWorld:  # fmt: skip
+        """Compile the world with more actors, ``without`` those of some names, and with a full pool of spare bodies for
+        free bunches, for :meth:`adopt`.
 
         Any thread may call this while steps go on. Raises :class:`RobotError` if a URDF does not compile, of several
         robots without saying which. ``is_remote``: see :meth:`add_human`. ``replaces``: the robots
         are here and keep their states; only their shapes are others.
         """
         robots, humans = list(self._robots.values()), list(self._humans.values())
+        removed = tuple(actor for actor in (*robots, *humans) if actor.spec.name in without)
+        robots = [robot for robot in robots if robot not in removed]
+        humans = [human for human in humans if human not in removed]
         for spec in specs:
             if isinstance(spec, HumanSpec):
                 code = _free_code(spec.name, "human", static_world.HUMAN_CODES, humans, robots, HumanError)
@@ -99,7 +104,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
                 code = _free_code(spec.name, "robot", static_world.ROBOT_CODES, robots, humans, RobotError)
                 robots.append(RobotBody(spec, code, self.parameters))
         try:
-            return self._compile_world(tuple(robots), tuple(humans))
+            return dataclasses.replace(self._compile_world(tuple(robots), tuple(humans)), removed=removed)
         except ValueError as error:
             added = [spec for spec in specs if isinstance(spec, RobotSpec)]
             if not added:
@@ -107,18 +112,20 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             raise build_error(added[-1], error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
-        """Use a world that was compiled with more actors, with other shapes of robots, or with more room for free
-        bunches; between steps.
+        """Use a world that was compiled with more or fewer actors, with other shapes of robots, or with more room for
+        free bunches; between steps.
 
         False, and nothing is changed, if other actors joined or left meanwhile: compile it anew.
         """
-        present = (*self._robots.values(), *self._humans.values())
+        present = tuple(
+            actor for actor in (*self._robots.values(), *self._humans.values()) if actor not in compiled.removed
+        )
         planned = (*compiled.robots, *compiled.humans)
         added = [actor for actor in planned if actor not in present]
         replaced = {
             actor: self._robots[actor.spec.name]
             for actor in added
-            if isinstance(actor, RobotBody) and actor.spec.name in self._robots
+            if isinstance(actor, RobotBody) and self._robots.get(actor.spec.name) in present
         }
         kept: list[RobotBody | HumanBody] = [
             replaced[actor] if isinstance(actor, RobotBody) and actor in replaced else actor
