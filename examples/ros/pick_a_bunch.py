@@ -161,7 +161,9 @@ class Arm:
         shares = np.linspace(0.0, 1.0, max(3, round(duration / 0.25)) + 1)[1:]
         path = [q]
         for share in shares:
-            pose = np.r_[start[:3] + share * (position - start[:3]), frames.multiply(frames.exp(share * away), start[3:])]
+            pose = np.r_[
+                start[:3] + share * (position - start[:3]), frames.multiply(frames.exp(share * away), start[3:])
+            ]
             path.append(self.solve(pose, path[-1]))
         steps = np.diff(path, axis=0)
         limits = np.array([d.velocity for d in self.robot.description.drives])[self.index]
