@@ -35,7 +35,6 @@ from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
-from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
@@ -47,6 +46,7 @@ from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 from vinesim.scene.values import Coupling, HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.wind import wind_of
 
 log = logging.getLogger(__name__)
 
@@ -95,9 +95,7 @@ class Client:
         """
         self.name, self.model, self.scene = name, model, scene
         self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking)
-        if any(scene.wind.mean) or scene.wind.gusts > 0.0:
-            wind = scene.wind
-            self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
+        self.physics.wind = wind_of(scene)
         self.robots: dict[str, Robot] = {}
         """Robots that this client simulates, by name; the first is :attr:`robot`."""
         self.humans: dict[str, LocalHuman] = {}
@@ -192,6 +190,7 @@ class Client:
         self.receive(now)
         if self.replicator.has_clock:
             self.world_time.follow(self.physics.time, now + self.replicator.offset)
+        self.physics.wind_time_offset = self.world_time.offset
         self.control()
         self.physics.step()
         self.sense()
@@ -219,12 +218,12 @@ class Client:
             self.spawner.cancel(name)
             self.meshes.forget(name)
             if (other := self.remote_actors.pop(name, None)) is not None:
-                other.remove()
-                self.physics.contact_solver.remote_actors.discard(name)
+                self.spawner.remove(name, other)
                 log.info("%s left", name)
         updates: dict[str, RobotUpdate | HumanUpdate] = {**inbox.robots, **inbox.people}
         spawned = self.spawner.spawn(updates)
         self.remote_actors.update(spawned)
+        self.physics.contact_solver.remote_actors.difference_update(self.spawner.removed())
         self.physics.contact_solver.remote_actors.update(spawned)
         for name, update in updates.items():
             match self.remote_actors.get(name), update:
@@ -411,9 +410,9 @@ class InterestAudit:
             self._seen = sent
             return
         rigid = client.physics.rigid
-        here = [rigid.actor_position(name)[:2] for name in client.replicators]
-        there = [rigid.actor_position(name)[:2] for name in client.remote_actors]
-        distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
+        here = np.array([rigid.actor_position(name)[:2] for name in client.replicators])
+        there = np.array([rigid.actor_position(name)[:2] for name in client.remote_actors])
+        distance = float(np.linalg.norm(here[:, None] - there, axis=-1).min())
         if distance > client.replicator.interest_radius + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching

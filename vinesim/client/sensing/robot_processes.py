@@ -79,6 +79,8 @@ class RobotProcesses:
         """Whether the sensors are ready, what was lost so far, and process ids; for the status of a client."""
         report, awaited = self.sensors.report(), self.awaited()
         pids = {f"sensors of {self.sensors.name}": self.sensors.worker.pid}
+        if (standby := self.sensors.worker.standby_pid) is not None:
+            pids[f"standby of {self.sensors.name}"] = standby
         if self.ros is not None:
             pids[f"ROS node of {self.sensors.name}"] = self.ros.worker.pid
         return {
