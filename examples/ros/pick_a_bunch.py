@@ -37,7 +37,7 @@ AHEAD, ASIDE = 0.88, 0.28  # m from the base to the bunch at the pick
 ALLEY = (1.36, 1.75, 0.8, 6.7)  # m: y and x in which the base may stand and turn
 LANE = 1.06  # m: y of the base beside a box
 DRAWN_IN = (0.45, 0.12, 1.20)  # m: the left hand while the base drives, in the base's frame
-UP, DOWN = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0])
+UP = np.array([0.0, 0.0, 1.0])
 
 
 class Robot:
@@ -130,7 +130,7 @@ class Arm:
         return self.robot.description.link_poses(every)[self.tool]
 
     def solve(self, goal: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Joint positions that bring the hand to a pose [7] in the base, from ``q``; near home where there is a choice."""
+        """Joint positions that bring the hand to a pose [7] in the base, from ``q``; near home if it may choose."""
         for count in range(60):
             here = self.hand(q)
             off = np.r_[goal[:3] - here[:3], frames.log(frames.multiply(goal[3:], frames.conjugate(here[3:])))]
@@ -295,8 +295,8 @@ def put_into_box(robot: Robot, side: str) -> None:
     drive(robot, lane, heading)
     arm = Arm(robot, side)
     level, down = np.array([0.0, 0.0, 0.0, 1.0]), frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
-    middle = frames.compose(frames.inverse(robot.base()), box)[:3] + [0.02, 0.0, 0.0]
-    over, low = middle + [0.0, 0.0, 0.80], middle + [0.0, 0.0, 0.22]
+    middle = frames.compose(frames.inverse(robot.base()), box)[:3] + np.array([0.02, 0.0, 0.0])
+    over, low = middle + 0.80 * UP, middle + 0.22 * UP
     arm.move(over, level)
     arm.move(over, down)
     arm.move(low, down, speed=0.15)
