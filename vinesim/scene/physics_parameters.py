@@ -91,6 +91,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     # ------------------------------------------------------------------ detachment
     detachment_duration: Positive = 0.03
     """[s] A peduncle breaks when it has been overloaded for so long. GUESSED: the peak of one step is no pull."""
+    cutting_strength: Positive = 13.16e6
+    """[Pa] Force of a blade over the cross-section that it cuts. READ: canes of Okuzgozu, JKSUS 2024 36:103034."""
 
     # ------------------------------------------------------------------ contacts with plants
     contact_stiffness: Positive = 2e4

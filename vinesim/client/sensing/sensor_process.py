@@ -17,7 +17,7 @@ import numpy as np
 from vinesim.client.client import Client
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.sensor_worker import POSE_HISTORY, SensorChannel, SensorConfig, run_sensor_worker
-from vinesim.client.sensing.spawned_process import sensor_modules
+from vinesim.client.sensing.spawned_process import SENSOR_REHEARSAL, sensor_modules
 from vinesim.client.sensing.worker_process import Run, WorkerProcess
 from vinesim.errors import WriteError
 from vinesim.robot.description.description import RobotDescription
@@ -83,7 +83,7 @@ class SensorProcess:
         self._frames = tuple(config.sensor_frames.values())
         self.worker = WorkerProcess(
             f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
-            lambda context: SensorChannel(config, context), self._receive,
+            lambda context: SensorChannel(config, context), self._receive, rehearsal=SENSOR_REHEARSAL,
         )  # fmt: skip
         self._run: Run[SensorChannel] | None = None
         """The run of the process that snapshots were last written for."""
@@ -138,6 +138,7 @@ class SensorProcess:
             shared["tree_number"][trees] = shared["number"][0] = self._snapshot_count
             shared["bunch_attached"][:] = physics.state.bunch_attached
             shared["time"][0], shared["tick"][0] = physics.time, physics.tick
+            shared["world_offset"][0] = client.world_time.offset
             shared["frame_score"][0] = client.frame_score()
             visual_q = physics.visual_q()
             self._visuals.memory["visual_q"][: len(visual_q)] = visual_q

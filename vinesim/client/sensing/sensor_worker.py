@@ -82,7 +82,7 @@ class SensorChannel:
         bodies, trees, bunches = len(model.body_mass), len(model.tree_first), len(model.bunch_body)
         self.snapshot = SharedSnapshot(
             {
-                "time": ((1,), "f8"), "frame_score": ((1,), "f8"),
+                "time": ((1,), "f8"), "world_offset": ((1,), "f8"), "frame_score": ((1,), "f8"),
                 "tick": ((1,), "i8"), "number": ((1,), "i8"),  # counts snapshots from 1
                 "visuals_version": ((1,), "i8"), "visual_count": ((1,), "i8"),
                 "body_q": ((bodies, 7), "f4"), "bunch_attached": ((bunches,), "?"),
@@ -126,6 +126,8 @@ class SensorWorker:
         self._visuals = VisualListReceiver()
         self._missing_version: int | None = None
         """Version of the list of bodies that the newest snapshot belongs to, if that has not arrived."""
+        self._world_offset = 0.0
+        """World's time minus simulated time [s]."""
         self._last_number = 0
         self._pose_count = 0
         self._best_frame: CameraFrame | None = None
@@ -214,10 +216,10 @@ class SensorWorker:
                 else:
                     for name in self.scheduler.warm_up(snapshot, poses):
                         self._awaits(name)
-                    allocator.release_free_memory()
                     is_ready = True
                     self._awaits()
                     report_ready(self.pipe, NICENESS)
+                    allocator.release_free_memory()  # takes 0.1 s, which nothing has to wait for
             self.channel.wanted["renders"][0] = any(sensor.wanted() for sensor in self.scheduler.sensors)
             if time.monotonic() >= self._next_statistics:
                 self._next_statistics = time.monotonic() + STATISTICS_PERIOD
@@ -263,6 +265,7 @@ class SensorWorker:
             self._state.bunch_attached[:] = shared["bunch_attached"]
             self._frame_score = float(shared["frame_score"][0])
             time, tick = float(shared["time"][0]), int(shared["tick"][0])
+            self._world_offset = float(shared["world_offset"][0])
             count = int(shared["pose_count"][0])
             rows = np.arange(max(self._pose_count, count - POSE_HISTORY), count) % POSE_HISTORY
             times, poses = shared["pose_time"][rows], shared["pose"][rows]
@@ -288,7 +291,7 @@ class SensorWorker:
     def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
         assert isinstance(frame, CameraFrame)
         if self.node is not None:
-            self.node.publish_camera(frame)
+            self.node.publish_camera(dataclasses.replace(frame, time=frame.time + self._world_offset))
         is_kept = self.config.keep_pictures and frame.name == self.scheduler.sensors[0].name
         if is_kept and self._frame_score >= self._best_score:
             self._best_score, self._best_frame = self._frame_score, frame
@@ -296,7 +299,7 @@ class SensorWorker:
     def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
         assert isinstance(scan, LidarScan)
         if self.node is not None:
-            self.node.publish_lidar(scan)
+            self.node.publish_lidar(dataclasses.replace(scan, time=scan.time + self._world_offset))
 
     def _save_best_frame(self, folder: pathlib.Path) -> None:
         failure = ""

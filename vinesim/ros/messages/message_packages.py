@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import concurrent.futures
+import functools
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -173,6 +174,7 @@ class _PackageBuild:
     def generate(self) -> dict[str, list[pathlib.Path]]:
         """All C and C++ sources by the library they belong to; ``"python"`` is the extension."""
         import rosidl_generator_c
+        import rosidl_parser.parser
         import rosidl_typesupport_c
         import rosidl_typesupport_fastrtps_c
         import rosidl_typesupport_introspection_c
@@ -180,6 +182,8 @@ class _PackageBuild:
         from rosidl_generator_py import generate_py
         from rosidl_generator_type_description import generate_type_hash
 
+        # Every generator parses every definition again, a fifth of the time of all.
+        rosidl_parser.parser.get_ast_from_idl_string = functools.cache(rosidl_parser.parser.get_ast_from_idl_string)
         files = [file.relative_to(DEFINITIONS / self.package) for file in _definitions(self.package)]
         idl = self.output("idl")
         for file in files:
@@ -250,7 +254,7 @@ class _PackageBuild:
         def compile_one(source: pathlib.Path) -> str:
             target = f"{source}.o"
             dialect = ["-x", "c++", "-std=c++17"] if source.suffix == ".cpp" else ["-x", "c", "-std=gnu11"]
-            _run(["g++", *dialect, "-O1", "-fPIC", "-w", *includes, "-c", str(source), "-o", target])
+            _run(["g++", *dialect, "-O0", "-fPIC", "-w", *includes, "-c", str(source), "-o", target])
             return target
 
         with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
