@@ -1,4 +1,4 @@
-"""Wires give: string law, reciprocity, modes and energy of shoots on one wire; whom a push wakes, and where all rest."""
+"""Wires give: string law, reciprocity, modes, energy of shoots on one wire; whom a push wakes, and where all rest."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def row_of_shoots(
     for x in (*along, *np.linspace(0.2, 1.8, others)):
         tree = TreeBuilder(frames.pose(np.array([x, 0.0, 1.0]), frames.from_yaw(np.pi / 2)))
         tree.add_body(
-            -1, mass=MASS, com=(ARM / 2, 0, 0), length=ARM, radius=(0.004, 0.004), inertia=np.full(3, MASS * ARM**2 / 12),
-            stiffness=np.full(3, spring), damping=np.full(3, beta * spring),
+            -1, mass=MASS, com=(ARM / 2, 0, 0), length=ARM, radius=(0.004, 0.004),
+            inertia=np.full(3, MASS * ARM**2 / 12), stiffness=np.full(3, spring), damping=np.full(3, beta * spring),
         )  # fmt: skip
         trees.append(tree)
     count = len(trees)
     beyond = 0.1 + ARM  # the shoots do not touch the wire that they are tied to
     return assemble(
         trees, tie_body=np.arange(count), tie_point=np.tile([ARM, 0.0, 0.0], (count, 1)),
-        tie_anchor=[[*tree.pose[:2] + [0.0, ARM], 1.0] for tree in trees], tie_stiffness=np.full(count, tie),
+        tie_anchor=[[tree.pose[0], tree.pose[1] + ARM, 1.0] for tree in trees], tie_stiffness=np.full(count, tie),
         tie_damping=np.full(count, 0.5 * beta * tie), tie_wire=np.repeat([0, 1], [len(along), others]),
         fixed_start=[[0.0, beyond, 1.0]] * 2, fixed_end=[[LENGTH, beyond, 1.0]] * 2,
         fixed_radius=np.full((2, 2), 0.0014), fixed_organ=[int(Organ.WIRE)] * 2, fixed_index=[0, 1],
@@ -99,7 +99,7 @@ def test_a_wire_gives_by_the_string_law(at: float) -> None:
 
 
 def test_shoots_of_one_wire_move_each_other_as_a_dense_solve_says() -> None:
-    """Tips by the inverse of joints, ties and wire [4, 4]; what i does to j, j does to i. A wire gives not along itself."""
+    """Tips by the inverse of joints, ties and wire [4, 4]; what i does to j, j does to i. Not along the wire."""
     whole = np.linalg.inv(stiffness_of_ties(ALONG) + np.eye(4) * SPRING / ARM**2)
     moved = np.zeros((4, 4))
     for shoot in range(4):
@@ -122,8 +122,8 @@ def test_shoots_of_one_wire_move_each_other_as_a_dense_solve_says() -> None:
 @pytest.mark.parametrize(("tie", "tension"), [(2000.0, 900.0), (10_000.0, 100.0), (500.0, 1e5)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_modes_of_two_shoots_on_a_wire(tie: float, tension: float, sign: float) -> None:
-    """In step and against each other two equal shoots swing as joint, ties and wire say, beside what the trapezoidal rule
-    does to any oscillator: tan(w dt / 2) = dt/2 sqrt(K / M). M has (dt/2)^2 (k - S) beside the shoots' own mass."""
+    """In step and against each other two equal shoots swing as joint, ties and wire say, beside what the trapezoidal
+    rule does to any oscillator: tan(w dt / 2) = dt/2 sqrt(K / M). M has (dt/2)^2 (k - S) beside the shoots' own."""
     along, dt = (0.8, 1.2), 0.01
     physics = world(row_of_shoots(along, tie=tie, tension=tension, beta=0.0), phi=0.5)
     set_turning(physics, [-0.05, -0.05 * sign])
@@ -141,8 +141,8 @@ def test_modes_of_two_shoots_on_a_wire(tie: float, tension: float, sign: float) 
 
 
 def test_a_slow_mode_is_right_within_two_percent() -> None:
-    """At the shipped stiffness of ties, dt and phi, of a shoot that nothing but its tie holds: the rule's own 0.6 % and the
-    mass that wires add."""
+    """At the shipped stiffness of ties, dt and phi, of a shoot that nothing but its tie holds: the rule's own 0.6 % and
+    the mass that wires add."""
     model = row_of_shoots((1.0,), beta=0.0, spring=0.1)
     model.body_mass[:] *= 80.0
     model.body_inertia[:] *= 80.0

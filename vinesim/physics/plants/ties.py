@@ -41,8 +41,8 @@ class TieTable:
         self.axis = np.zeros_like(self.anchor)
         """Direction of the wire that a tie is bound to [tie, 3], 0 for none."""
         self.softening = np.zeros(len(self.anchor), np.float32)
-        """How much less stiff than the tie alone tie and wire are across the wire [tie] N/m, when all awake trees of the
-        wire move as one. Only the sleep of trees asks for it."""
+        """How much less stiff than the tie alone tie and wire are across the wire [tie] N/m, when all awake trees of it
+        move as one. Only the sleep of trees asks for it."""
         self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
         """[tie] N/m; a tie of zero does nothing."""
         self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))

@@ -18,8 +18,8 @@ from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.berry_clusters import spans
 
 WAKE_SHARE = 0.25
-"""[1] A sleeping tree wakes when a wire has moved one of its ties by this share of ``sleep_distance``. TUNED: twenty shoots
-on a wire that sleep hold it with 2 N until then."""
+"""[1] A sleeping tree wakes when a wire has moved one of its ties by this share of ``sleep_distance``. TUNED: twenty
+shoots that sleep on a wire hold it with 2 N until then."""
 
 _NO_TREES = np.zeros(0, np.int32)
 
