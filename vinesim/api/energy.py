@@ -40,8 +40,8 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     """Energy of some trees [k] (all unless given); ``gravity`` [m/s^2]. Poses and velocities must be up to date.
 
     Kinetic: sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic: k theta^2 / 2 about each joint axis, where
-    theta is the rotation vector of the joint, and k d^2 / 2 of each tie; k d (d + u) / 2 with its share of the wire that
-    it deflects by u.
+    theta is the rotation vector of the joint, and k d^2 / 2 of each tie; k d (d + u) / 2 with its share of the wire
+    that it deflects by u.
     """
     model, state = plants.model, plants.state
     bodies = _moving_bodies(plants, trees)
