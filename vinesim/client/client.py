@@ -35,7 +35,6 @@ from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
-from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
@@ -47,6 +46,7 @@ from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 from vinesim.scene.values import Coupling, HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.wind import wind_of
 
 log = logging.getLogger(__name__)
 
@@ -95,9 +95,7 @@ class Client:
         """
         self.name, self.model, self.scene = name, model, scene
         self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking)
-        if any(scene.wind.mean) or scene.wind.gusts > 0.0:
-            wind = scene.wind
-            self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
+        self.physics.wind = wind_of(scene)
         self.robots: dict[str, Robot] = {}
         """Robots that this client simulates, by name; the first is :attr:`robot`."""
         self.humans: dict[str, LocalHuman] = {}
@@ -192,6 +190,7 @@ class Client:
         self.receive(now)
         if self.replicator.has_clock:
             self.world_time.follow(self.physics.time, now + self.replicator.offset)
+        self.physics.wind_time_offset = self.world_time.offset
         self.control()
         self.physics.step()
         self.sense()

@@ -25,6 +25,7 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.ros import middleware
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
+from vinesim.scene.wind import wind_of
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +79,7 @@ class SensorProcess:
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
             name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer,
-            device,
+            device, wind=wind_of(scene),
         )  # fmt: skip
         self._frames = tuple(config.sensor_frames.values())
         self.worker = WorkerProcess(
@@ -137,6 +138,10 @@ class SensorProcess:
             shared["body_q"][bodies] = physics.state.body_q[bodies]
             shared["tree_number"][trees] = shared["number"][0] = self._snapshot_count
             shared["bunch_attached"][:] = physics.state.bunch_attached
+            shared["wind_strength"][0] = 0.0 if (wind := physics.wind_on_plants.state) is None else wind.strength
+            if wind is not None:
+                shared["wind_time"][0] = wind.time
+                shared["tree_air"][:], shared["tree_drawn"][:] = wind.tree_air, wind.tree_drawn
             shared["time"][0], shared["tick"][0] = physics.time, physics.tick
             shared["world_offset"][0] = client.world_time.offset
             shared["frame_score"][0] = client.frame_score()

@@ -25,7 +25,8 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot, WindState
+from vinesim.scene.wind import Wind
 
 if TYPE_CHECKING:
     from vinesim.ros.sensor_node import SensorNode
@@ -67,6 +68,8 @@ class SensorConfig:
     renderer: str = "warp"
     device: str = "cpu"
     """Where they compute; the CPU from the next start on if a GPU fails."""
+    wind: Wind | None = None
+    """That of the scene."""
 
     @property
     def sensor_frames(self) -> dict[str, str]:
@@ -87,6 +90,8 @@ class SensorChannel:
                 "visuals_version": ((1,), "i8"), "visual_count": ((1,), "i8"),
                 "body_q": ((bodies, 7), "f4"), "bunch_attached": ((bunches,), "?"),
                 "tree_number": ((trees,), "i8"),  # the snapshot in which each tree moved last
+                "wind_time": ((1,), "f8"), "wind_strength": ((1,), "f8"),  # 0: calm
+                "tree_air": ((trees, 3), "f4"), "tree_drawn": ((trees,), "f4"),
                 "pose_count": ((1,), "i8"), "pose_time": ((POSE_HISTORY,), "f8"),  # a ring of sensor poses
                 "pose": ((POSE_HISTORY, sensors, 7), "f8"),
             },
@@ -262,6 +267,12 @@ class SensorWorker:
             bodies = np.flatnonzero(has_moved[self.config.model.body_tree])
             self._state.body_q[bodies] = shared["body_q"][bodies]
             self._last_number = int(shared["number"][0])
+            wind = None
+            if self.config.wind is not None and shared["wind_strength"][0] > 0.0:
+                wind = WindState(
+                    self.config.wind, float(shared["wind_time"][0]), float(shared["wind_strength"][0]),
+                    shared["tree_air"].copy(), shared["tree_drawn"].copy(),
+                )  # fmt: skip
             self._state.bunch_attached[:] = shared["bunch_attached"]
             self._frame_score = float(shared["frame_score"][0])
             time, tick = float(shared["time"][0]), int(shared["tick"][0])
@@ -273,7 +284,7 @@ class SensorWorker:
         state, names = self._state, tuple(self.config.sensor_frames)
         snapshot = Snapshot(
             time, tick, state.body_q, state.bunch_attached, self._visuals.visuals, visual_q,
-            np.flatnonzero(has_moved),
+            np.flatnonzero(has_moved), wind,
         )  # fmt: skip
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 

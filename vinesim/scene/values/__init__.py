@@ -22,7 +22,7 @@ from vinesim.scene.values.robot import (
 )
 from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
 from vinesim.scene.values.status import ComponentStatus
-from vinesim.scene.values.world import Contact, Detachment, Snapshot
+from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
 __all__ = [
     "POINT_NAMES",
@@ -56,5 +56,6 @@ __all__ = [
     "Shape",
     "Snapshot",
     "TreeUpdate",
+    "WindState",
     "Wrench",
 ]
