@@ -60,14 +60,16 @@ assert client.wait_for_server(float(sys.argv[1]))
 goal = FollowJointTrajectory.Goal(goal_tolerance=[JointTolerance(name="arm_left_1_joint", position=0.25)])
 goal.trajectory.joint_names = ["arm_left_1_joint", "arm_left_2_joint"]
 goal.trajectory.points = [JointTrajectoryPoint(positions=[0.5 * i, -1.0]) for i in range(3)]
-heard = []
 def wait(future):
     rclpy.spin_until_future_complete(node, future, timeout_sec=float(sys.argv[1]))
     return future.result()
-handle = wait(client.send_goal_async(goal, feedback_callback=lambda told: heard.append(told.feedback)))
-answer = wait(handle.get_result_async())
-while len(heard) < 3:
-    rclpy.spin_once(node, timeout_sec=float(sys.argv[1]))
+heard = []
+while len(heard) < 3:  # the server may not have found this node's subscription to feedback yet; then it has next time
+    heard = []
+    handle = wait(client.send_goal_async(goal, feedback_callback=lambda told, into=heard: into.append(told.feedback)))
+    answer = wait(handle.get_result_async())
+    for _ in range(10):
+        rclpy.spin_once(node, timeout_sec=0.05)
 assert [list(f.desired.positions) for f in heard] == [[0.0, -1.0], [0.5, -1.0], [1.0, -1.0]], heard
 assert heard[0].joint_names == goal.trajectory.joint_names
 assert answer.status == GoalStatus.STATUS_ABORTED

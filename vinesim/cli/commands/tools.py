@@ -55,16 +55,22 @@ def bench(
 
 def ros_build_interfaces(
     quiet: Annotated[bool, typer.Option(help="Print nothing if all is well, or if ROS is not installed.")] = False,
+    wheel: Annotated[
+        pathlib.Path | None, typer.Option(help="Write wheels into this folder; installs nothing.", show_default=False)
+    ] = None,
 ) -> None:
-    """Build the ROS message packages that have no wheel (once; cached). Needs g++.
+    """Make ROS message packages that have no official wheel importable here (built once; cached). Needs g++.
+
+    They are installed by pip into this environment, for every node that runs in it. What is official stays as it is.
 
     \b
     Examples:
       vinesim ros build-interfaces
+      vinesim ros build-interfaces --wheel wheels
     """
     from vinesim.cli.ros import build
 
-    raise typer.Exit(build(quiet))
+    raise typer.Exit(build(quiet, wheel))
 
 
 def certs_new(
