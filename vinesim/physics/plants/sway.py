@@ -2,9 +2,9 @@
 
 A tree is taken as three oscillators, one for wind along each axis of the world. The shape of each is the tree's own
 static deflection in that wind, found by the solver with weight, ties, wires and all; its frequency is the Rayleigh
-quotient of that shape, its damping that of the joints and of the air. A steady wind is answered by the equilibrium in it, gusts by
-linear answers about that. All of it is a function of place and time, without a state: the same for all clients, and at
-any instant that a sensor asks for. The physics of sleeping trees does not know of it.
+quotient of that shape, its damping that of the joints and of the air. A steady wind is answered by the equilibrium in
+it, gusts by linear answers about that. All of it is a function of place and time, without a state: the same for all
+clients, and at any instant that a sensor asks for. The physics of sleeping trees does not know of it.
 """
 
 from __future__ import annotations
