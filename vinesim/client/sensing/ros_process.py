@@ -53,7 +53,8 @@ class RosProcess:
         self._records = StepRecords(name, description, series_stiffness(description.drives))
         config = RosConfig(
             name, description.urdf, description.base, namespace, clock, tuple((p, c, q) for (p, c), q in fixed),
-            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body), model.bunch_of_body(),
+            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body), len(model.box_size),
+            model.bunch_of_body(),
             description.controllers, tuple(mount.name for mount in description.imus),
             tuple(mount.name for mount in description.wrenches),
         )  # fmt: skip
@@ -118,6 +119,9 @@ class RosProcess:
                     truth["time"][0] = physics.time + client.world_time.offset
                     truth["attached"][:] = physics.state.bunch_attached
                     truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
+                    names = {visual.name: i for i, visual in enumerate(physics.rigid.visuals())}
+                    boxes = [names[f"box/{i}"] for i in range(len(self._model.box_size))]
+                    truth["box_q"][:] = physics.rigid.visual_q()[boxes]
 
     def _wake(self) -> None:
         channel = self.worker.current().shared

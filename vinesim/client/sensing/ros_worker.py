@@ -51,6 +51,7 @@ class RosConfig:
     """Poses [pole, 7] m, 1."""
     records: StepRecords
     bunch_count: int
+    box_count: int
     bunch_of_body: np.ndarray
     """[body] -1 for wood."""
     controllers: tuple[ControllerSpec, ...]
@@ -73,7 +74,7 @@ class RosChannel:
         self.truth = SharedSnapshot(
             {
                 "time": ((1,), "f8"), "attached": ((config.bunch_count,), "?"),
-                "bunch_q": ((config.bunch_count, 7), "f4"),
+                "bunch_q": ((config.bunch_count, 7), "f4"), "box_q": ((config.box_count, 7), "f8"),
             },
             context,
         )  # fmt: skip
@@ -110,7 +111,8 @@ class RosWorker:
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
-        self._attached_names = self._bunch_names
+        self._box_names = tuple(f"box_{i}" for i in range(config.box_count))
+        self._truth_names: tuple[str, ...] = ()
         self._next_statistics = 0.0
 
     def run(self) -> None:
@@ -142,13 +144,13 @@ class RosWorker:
         return True
 
     def _publish_truth(self) -> None:
-        """True poses of the bunches that hang on their plants."""
+        """True poses of the boxes, and of the bunches that hang on their plants."""
         with self.channel.truth.reading() as truth:
             now, attached = float(truth["time"][0]), np.flatnonzero(truth["attached"])
-            poses = truth["bunch_q"][attached].astype(float)
-        if len(attached) != len(self._attached_names):
-            self._attached_names = tuple(self._bunch_names[i] for i in attached)
-        self.node.publish_environment(now, self._attached_names, poses)
+            poses = np.concatenate([truth["box_q"], truth["bunch_q"][attached]])
+        if len(poses) != len(self._truth_names):
+            self._truth_names = (*self._box_names, *(self._bunch_names[i] for i in attached))
+        self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:
         """Tell the client what is subscribed to, and now and then what was sent."""
