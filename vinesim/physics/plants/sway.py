@@ -1,10 +1,10 @@
 """Sway: poses of the trees that wind moves while they are not simulated, for cameras and lidars.
 
 A tree is taken as three oscillators, one for wind along each axis of the world. The shape of each is the tree's own
-static deflection in that wind, found by the solver with weight, ties and all; its frequency is the Rayleigh quotient of
-that shape, its damping that of the joints and of the air. A steady wind is answered by the equilibrium in it, gusts by
-linear answers about that. All of it is a function of place and time, without a state: the same for all clients, and at
-any instant that a sensor asks for. The physics of sleeping trees does not know of it.
+static deflection in that wind, found by the solver with weight, ties, wires and all; its frequency is the Rayleigh
+quotient of that shape, its damping that of the joints and of the air. A steady wind is answered by the equilibrium in
+it, gusts by linear answers about that. All of it is a function of place and time, without a state: the same for all
+clients, and at any instant that a sensor asks for. The physics of sleeping trees does not know of it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from vinesim.kernels.articulation.sway import sway_trees
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.equilibrium import EquilibriumFinder
 from vinesim.physics.plants.shelter import TreeDrag
+from vinesim.physics.plants.wires import Wires
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Snapshot, WindState
@@ -29,7 +30,7 @@ from vinesim.scene.wind import Wind
 
 MAX_TREES = 120
 """Trees that are posed for one frame where there is no time for all. TUNED: within 0.5 ms."""
-_LOAD_STEPS, _NEWTON_STEPS = 4, 10
+_LOAD_STEPS, _NEWTON_STEPS = 4, 80
 _CONVERGED = 1e-4
 """[m] Distance from equilibrium at which a tree is in it; where it is not found, a tree does not sway."""
 _MIN_DISTANCE = 1.0
@@ -127,7 +128,12 @@ class _Table:
     def load(cls, model: Model, wind: Wind) -> _Table:
         """From the cache on disk, or made anew: 0.1 s for two hundred trees, three seconds for ten thousand."""
         here = pathlib.Path(__file__)
-        code = [here, here.with_name("shelter.py"), here.parents[2] / "kernels" / "articulation"]
+        code = [
+            here,
+            here.with_name("shelter.py"),
+            here.with_name("wires.py"),
+            here.parents[2] / "kernels" / "articulation",
+        ]
         numbers = [wind.mean, wind.wave_number, wind.wave_phase, wind.wave_amplitude]
         blown = b"".join(x.astype(float).tobytes() for x in numbers)
         digest = disk_cache.source_digest(*code, model.digest(), blown)
@@ -185,7 +191,8 @@ class _Response:
         self.steady = drag.air_share(wind.mean)[:, None] * wind.mean
         self.share = drag.air_share(wind.mean)
         self.plants = ArticulationSolver(model, self.state)
-        self._finder = EquilibriumFinder(self.plants)
+        self._finder, self._wires = EquilibriumFinder(self.plants), Wires(self.plants)
+        self.plants.wake(np.arange(len(model.tree_first)))
         number, tree = np.arange(len(model.body_mass)), model.body_tree
         self._core = number - model.tree_first[tree] < model.tree_core[tree]
         self._area = 0.5 * AIR_DENSITY * np.where(self._core, model.body_drag, 0.0).astype(float)
@@ -231,14 +238,20 @@ class _Response:
         return np.linalg.norm(velocity, axis=-1, keepdims=True) * velocity
 
     def _move_to_equilibrium(self, trees: np.ndarray) -> np.ndarray:
-        """Move trees to where the steady wind holds them, by Newton's method; whether each is there [tree] bool."""
+        """Move trees to where the steady wind holds them; whether each is there [tree] bool.
+
+        Newton's method for each tree, its wires held, then the wires to where the trees hold them, and again: it comes
+        nearer to where all rest from one side only. With ties as soft as wires make them it would overshoot.
+        """
         good = np.ones(len(trees), bool)
         for step in range(_LOAD_STEPS + _NEWTON_STEPS):
             self._load(min((step + 1) / _LOAD_STEPS, 1.0) * self._pressure(self.steady))
+            self.plants.ties.softening[:] = 0.0
             _, distance, _ = self._finder.residual_motion(trees)
             good &= distance < 1e6
             self._finder.move_to_rest(trees[good])
             self.plants.forward_kinematics(trees)
+            self._wires.update()
             if step >= _LOAD_STEPS and (distance[good] < 0.1 * _CONVERGED).all():
                 break
         return good & (distance < _CONVERGED)
