@@ -19,6 +19,8 @@ from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, shapes
 from vinesim.scene.triangles import to_stl
 from vinesim.scene.values import RobotSpec
 
+MAX_HULL_VERTICES = 64
+"""Most vertices of a mesh's convex hull, so that contacts with it have a bounded cost. TUNED."""
 CONTACT_IMPEDANCE = (0.95, 0.99)
 """[1] Least and largest impedance of a link's contacts (MuJoCo's solimp). TUNED: with MuJoCo's 0.9 and 0.95 an arm that
 pushes against its own torso with all its effort stands 3 mm deep in it, with these less than 1 mm."""
@@ -246,6 +248,7 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
         geom.solimp[:2] = CONTACT_IMPEDANCE
     for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        mesh.maxhullvert = MAX_HULL_VERTICES
     for body in child.bodies[1:]:
         body.gravcomp = 1.0
     driven = {drive.joint: drive for drive in given.drives}
