@@ -130,9 +130,9 @@ def test_distance_of_segments_is_mujocos() -> None:
         mujoco.mj_forward(m, data)
         gap = mujoco.mj_geomDistance(m, data, 0, 1, 10.0, None)
         axis = frames.rotate(turn, np.array([0.0, 0.0, 0.1]))
-        ends = [hull.to_local(p[None]) for p in (place - axis, place + axis)]
+        start, end = (hull.to_local(p[None]) for p in (place - axis, place + axis))
         if gap > 0.0:
-            assert hull.closest(*ends)[0][0, 3] - 1e-3 == pytest.approx(gap, abs=1e-5)
+            assert hull.closest(start, end)[0][0, 3] - 1e-3 == pytest.approx(gap, abs=1e-5)
             compared += 1
     assert compared > 40
 
@@ -168,7 +168,8 @@ def test_what_lies_along_a_face_or_an_edge_has_two_ends(
     start: tuple[float, ...], end: tuple[float, ...], expected: tuple[float, float]
 ) -> None:
     hull = Hull(BRICK)
-    found, interval = hull.closest(*(hull.to_local(np.array([point])) for point in (start, end)))
+    first, last = (hull.to_local(np.array([point])) for point in (start, end))
+    found, interval = hull.closest(first, last)
     np.testing.assert_allclose(interval[0], expected, atol=1e-4)
     assert found[0, 3] == pytest.approx(0.01 if expected != (0.25, 0.75) or start[1] == 0.0 else 0.01 * 2**0.5)
 

@@ -107,6 +107,8 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
     cutters: tuple[Cutter, ...] = ()
+    friction: dict[str, float] = {}
+    """Coulomb coefficient [1] by link, of all that touches the link; instead of the URDF's ``mu1``."""
     srdf: str = ""
     """SRDF file whose pairs of ``disable_collisions`` never touch, by its path from the TOML file; unless given, the
     file of the URDF's name that ends with ``.srdf``, if there is one."""
