@@ -10,13 +10,14 @@ import numpy as np
 from vinesim.kernels.contact import structs
 from vinesim.physics.contact.warp_arrays import SharedArrays
 
+_MESH = int(mujoco.mjtGeom.mjGEOM_MESH)
 COPLANAR_COSINE = 1.0 - 1e-9
 """[1] Triangles whose normals agree better than this are one face."""
 
 
 def hull_numbers(m: mujoco.MjModel, ids: np.ndarray) -> np.ndarray:
     """[geom] number of the hull of each of the geoms ``ids``: of its mesh, -1 for other kinds and for flat meshes."""
-    mesh = np.where(m.geom_type[ids] == mujoco.mjtGeom.mjGEOM_MESH, m.geom_dataid[ids], -1)
+    mesh = np.where(m.geom_type[ids] == _MESH, m.geom_dataid[ids], -1)
     has_hull = np.append(m.mesh_graphadr >= 0, False)
     return np.where(has_hull[mesh], mesh, -1).astype(np.int32)
 
@@ -26,7 +27,7 @@ def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
     planes, edges, sides = [np.zeros((0, 4))], [np.zeros((0, 2, 3))], [np.zeros((0, 2), int)]
     plane_counts, edge_counts = [0], [0]
     center = np.zeros((m.nmesh, 3))
-    of_mesh = m.geom_type == mujoco.mjtGeom.mjGEOM_MESH
+    of_mesh = m.geom_type == _MESH
     center[m.geom_dataid[of_mesh]] = m.geom_aabb[of_mesh, :3]
     for mesh in range(m.nmesh):
         if m.mesh_graphadr[mesh] >= 0:

@@ -48,6 +48,8 @@ class CompiledWorld:
     """Free bunches that have bodies in it already, each with its slot."""
     hulls: SharedArrays
     """See :func:`vinesim.physics.contact.hulls.hull_arrays`."""
+    removed: tuple[RobotBody | HumanBody, ...] = ()
+    """Actors of the present world that it is made without."""
 
 
 def _log_mujoco_warnings() -> None:
