@@ -52,6 +52,7 @@ def add_tie(
     k: int,
     point: wp.vec3,
     anchor: wp.vec3,
+    anchor_velocity: wp.vec3,
     stiffness: float,
     damping: float,
     phi: float,
@@ -66,7 +67,7 @@ def add_tie(
     damper = residual_damping(damping, stiffness, phi, dt)
     mass = phi * dt * (phi * dt * stiffness + damper)
     swing = wp.cross(omega, point)
-    force = tie_force(stiffness, damper, stretch, wp.spatial_top(motion) + swing, phi, dt)
+    force = tie_force(stiffness, damper, stretch, wp.spatial_top(motion) + swing - anchor_velocity, phi, dt)
     force = force - mass * wp.cross(omega, swing)
     scratch_out.J[k] = scratch_out.J[k] + point_mass_inertia(mass, point)
     scratch_out.H[k] = scratch_out.H[k] + mass * wp.skew(point)
@@ -166,8 +167,8 @@ def assemble_bodies(
         ties = model.tie_span[k]
         for t in range(ties[0], ties[1]):
             add_tie(
-                k, rotation * model.tie_point[t], forces.tie_anchor[t], model.tie_stiffness[t], model.tie_damping[t],
-                phi, p.dt, pose, motion, scratch_out,
+                k, rotation * model.tie_point[t], forces.tie_anchor[t], forces.tie_anchor_velocity[t],
+                model.tie_stiffness[t], model.tie_damping[t], phi, p.dt, pose, motion, scratch_out,
             )  # fmt: skip
 
 
