@@ -325,7 +325,11 @@ def main() -> int:
         print(f"{name}: {side} hand, from ({place[0]:.2f}, {place[1]:.2f})", flush=True)
         try:
             pick(robot, name, side, place, heading)
-            put_into_box(robot, side)
+            try:
+                put_into_box(robot, side)
+            except RuntimeError as failure:
+                print(f"{name}: {failure}; once more", flush=True)
+                put_into_box(robot, side)
         except RuntimeError as failure:
             print(f"{name}: {failure}", flush=True)
             if len(tried) == 6:
