@@ -1,8 +1,7 @@
 """Prediction of eight trees of one topology at once: one lane of a SIMD vector is one tree.
 
 The same walk as :mod:`vinesim.kernels.articulation.prediction` with the same functions of one body, on a CPU only. All that a
-walk needs of eight trees is copied into records of 8 x :data:`RECORD` numbers, one record a body, in which a number of
-all eight lies side by side; LLVM then makes one vector instruction of eight turns of the loops over ``lane``
+walk needs of eight trees is copied into records (:mod:`vinesim.kernels.articulation.lane_records`); LLVM then makes one vector instruction of eight turns of the loops over ``lane``
 (docs/decisions/eight-trees.md says what that asks of them). Lanes know nothing of each other, so that a tree gets the
 same bits whichever trees share its vector, and those of a prediction alone.
 """
@@ -27,6 +26,43 @@ from vinesim.kernels.articulation.contiguous import (
     contiguous_scratch,
 )
 from vinesim.kernels.articulation.kinematics import body_kinematics
+from vinesim.kernels.articulation.lane_records import (
+    AXES,
+    COM,
+    CONTACT,
+    DAMPING,
+    DRAG,
+    END,
+    FACTORS,
+    INERTIA,
+    JOINT_Q,
+    JOINT_QD,
+    LANES,
+    LEVER,
+    LOAD,
+    MASS,
+    MOTION,
+    OFFSET,
+    POSE,
+    PRODUCT,
+    REST,
+    STIFFNESS,
+    STRIDE,
+    TERMS,
+    Floats,
+    load_tree,
+    mat33_at,
+    parent_record,
+    put_spatial,
+    put_vec3,
+    quat_at,
+    record,
+    spatial_at,
+    store_tree,
+    symmetric_at,
+    upper_triangle,
+    vec3_at,
+)
 from vinesim.kernels.articulation.prediction import chosen_phi, is_conservative, predict_tree
 from vinesim.kernels.articulation.spatial import inverse_symmetric, world_inertia
 from vinesim.kernels.articulation.structs import (
@@ -46,42 +82,9 @@ INLINE_ALL = (wp.config.cpu_compiler_flags or "").replace("-inline-threshold=900
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
-LANES = 8
-"""Trees in a vector."""
-
 MIN_LANES = wp.constant(2)
 """Fewer trees are predicted one by one. MEASURED"""
 
-# Where the numbers of a record begin. Kinematics: 20 of them.
-POSE = wp.constant(LANES * 0)
-MOTION = wp.constant(LANES * 7)
-AXES = wp.constant(LANES * 13)
-LEVER = wp.constant(LANES * 17)
-# Implicit inertia and bias of a subtree: 30. Of symmetric matrices the upper triangle.
-TERMS = wp.constant(LANES * 20)
-# Factors: 27.
-FACTORS = wp.constant(LANES * 50)
-# End of the step: 15.
-END = wp.constant(LANES * 77)
-# What is given: model, joints, forces.
-OFFSET = wp.constant(LANES * 92)
-REST = wp.constant(LANES * 95)
-JOINT_Q = wp.constant(LANES * 99)
-JOINT_QD = wp.constant(LANES * 103)
-MASS = wp.constant(LANES * 106)
-COM = wp.constant(LANES * 107)
-INERTIA = wp.constant(LANES * 110)
-PRODUCT = wp.constant(LANES * 113)
-DRAG = wp.constant(LANES * 116)
-LOAD = wp.constant(LANES * 117)
-CONTACT = wp.constant(LANES * 123)
-STIFFNESS = wp.constant(LANES * 126)
-DAMPING = wp.constant(LANES * 129)
-RECORD = 132
-"""Numbers of one body of one tree."""
-STRIDE = wp.constant(LANES * RECORD)
-
-Floats = wp.array(dtype=float)
 Lanes = wp.types.vector(length=LANES, dtype=wp.float32)
 LaneIndices = wp.types.vector(length=LANES, dtype=wp.int32)
 # results of a loop over lanes; a loop that wrote to the record it reads would not be vectorised
@@ -89,103 +92,6 @@ KinematicsOut = wp.types.vector(length=LANES * 20, dtype=wp.float32)
 TermsOut = wp.types.vector(length=LANES * 30, dtype=wp.float32)
 FactorsOut = wp.types.vector(length=LANES * 27, dtype=wp.float32)
 EndOut = wp.types.vector(length=LANES * 15, dtype=wp.float32)
-
-
-@wp.func_native("a.data += at; a.strides[0] = sizeof(*a.data); return a;")
-def record(a: wp.array(dtype=float), at: int) -> wp.array(dtype=float):
-    """The same array from number ``at`` on."""
-    ...
-
-
-@wp.func
-def vec3_at(a: Floats, i: int):
-    """A vector of one lane, its first number at i."""
-    return wp.vec3(a[i], a[i + 8], a[i + 16])
-
-
-@wp.func
-def quat_at(a: Floats, i: int):
-    """A rotation of one lane."""
-    return wp.quat(a[i], a[i + 8], a[i + 16], a[i + 24])
-
-
-@wp.func
-def spatial_at(a: Floats, i: int):
-    """A spatial vector of one lane."""
-    return wp.spatial_vector(a[i], a[i + 8], a[i + 16], a[i + 24], a[i + 32], a[i + 40])
-
-
-@wp.func
-def mat33_at(a: Floats, i: int):
-    """A matrix of one lane."""
-    return wp.mat33(a[i], a[i + 8], a[i + 16], a[i + 24], a[i + 32], a[i + 40], a[i + 48], a[i + 56], a[i + 64])
-
-
-@wp.func
-def symmetric_at(a: Floats, i: int):
-    """A symmetric matrix of one lane, of which the upper triangle is kept."""
-    return wp.mat33(a[i], a[i + 8], a[i + 16], a[i + 8], a[i + 24], a[i + 32], a[i + 16], a[i + 32], a[i + 40])
-
-
-@wp.func
-def upper_triangle(m: wp.mat33):
-    """The six numbers of a symmetric matrix that are kept."""
-    return wp.spatial_vector(m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2])
-
-
-@wp.func
-def put_vec3(a_out: Floats, i: int, v: wp.vec3):
-    """Write a vector of one lane."""
-    for c in range(3):
-        a_out[i + 8 * c] = v[c]
-
-
-@wp.func
-def put_quat(a_out: Floats, i: int, q: wp.quat):
-    """Write a rotation of one lane."""
-    for c in range(4):
-        a_out[i + 8 * c] = q[c]
-
-
-@wp.func
-def put_spatial(a_out: Floats, i: int, v: wp.spatial_vector):
-    """Write a spatial vector of one lane."""
-    for c in range(6):
-        a_out[i + 8 * c] = v[c]
-
-
-@wp.func
-def parent_record(model: ArticulationModel, k: int, first: int, records: Floats):
-    """The record of the parent of body k, or that of what roots stand on."""
-    return record(records, wp.max(model.body_parent[k] - first + 1, 0) * STRIDE)
-
-
-@wp.func
-def load_tree(
-    lane: int, tree: int, model: ArticulationModel, joints: JointState, forces: AppliedForces, records_out: Floats
-):
-    """Copy what the walk needs of one tree into its lane; record 0 is what roots stand on."""
-    pose = model.tree_pose[tree]
-    put_vec3(records_out, POSE + lane, wp.transform_get_translation(pose))
-    put_quat(records_out, POSE + 24 + lane, wp.transform_get_rotation(pose))
-    put_spatial(records_out, MOTION + lane, wp.spatial_vector())
-    first = model.tree_first[tree]
-    for i in range(model.tree_moving[tree]):
-        k = first + i
-        own = record(records_out, (i + 1) * STRIDE + lane)
-        put_vec3(own, OFFSET, model.body_offset[k])
-        put_quat(own, REST, model.body_rest[k])
-        put_quat(own, JOINT_Q, joints.joint_q[k])
-        put_vec3(own, JOINT_QD, joints.joint_qd[k])
-        own[MASS] = model.body_mass[k]
-        put_vec3(own, COM, model.body_com[k])
-        put_vec3(own, INERTIA, model.body_inertia[k])
-        put_vec3(own, PRODUCT, model.body_product[k])
-        own[DRAG] = model.body_drag[k]
-        put_spatial(own, LOAD, forces.body_load[k])
-        put_vec3(own, CONTACT, wp.spatial_top(forces.body_wrench[k]))
-        put_vec3(own, STIFFNESS, model.joint_stiffness[k])
-        put_vec3(own, DAMPING, model.joint_damping[k])
 
 
 @wp.func
@@ -364,35 +270,6 @@ def accelerate_eight(dt: float, top: Floats, own_out: Floats):
     while i < LANES * 15:
         own_out[END + i] = end[i]
         i += 1
-
-
-@wp.func
-def store_tree(
-    lane: int,
-    tree: int,
-    model: ArticulationModel,
-    records: Floats,
-    bodies_out: BodyState,
-    factors_out: Factors,
-    prediction_out: Prediction,
-):
-    """Copy one tree's results out of its lane."""
-    first = model.tree_first[tree]
-    for i in range(model.tree_moving[tree]):
-        k = first + i
-        own = record(records, (i + 1) * STRIDE + lane)
-        bodies_out.body_q[k] = wp.transform(vec3_at(own, POSE), quat_at(own, POSE + 24))
-        bodies_out.body_qd[k] = spatial_at(own, MOTION)
-        factors_out.axes[k] = quat_at(own, AXES)
-        factors_out.lever[k] = vec3_at(own, LEVER)
-        factors_out.D[k] = symmetric_at(own, FACTORS)
-        factors_out.DJ[k] = mat33_at(own, FACTORS + 8 * 6)
-        factors_out.DH[k] = mat33_at(own, FACTORS + 8 * 15)
-        if model.body_parent[k] < 0:
-            factors_out.root_inverse_mass[k] = wp.mat33()
-        prediction_out.body_acceleration[k] = spatial_at(own, END)
-        prediction_out.body_qd_free[k] = spatial_at(own, END + 8 * 6)
-        prediction_out.joint_qd_free[k] = vec3_at(own, END + 8 * 12)
 
 
 @wp.func

@@ -10,12 +10,13 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.articulation import first_mode, structs
-from vinesim.kernels.articulation.eight_trees import LANES, RECORD, predict_groups
+from vinesim.kernels.articulation.eight_trees import predict_groups
 from vinesim.kernels.articulation.floating_components import correct_floating_momentum
 from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.articulation.integration import integrate
 from vinesim.kernels.articulation.joint_wrench import joint_wrench
 from vinesim.kernels.articulation.kinematics import forward_kinematics
+from vinesim.kernels.articulation.lane_records import LANES, RECORD
 from vinesim.kernels.articulation.prediction import predict
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.parameters import PhysicsParameters

@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.articulation.eight_trees import LANES
+from vinesim.kernels.articulation.lane_records import LANES
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches

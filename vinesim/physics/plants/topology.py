@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim.kernels.articulation.eight_trees import LANES
+from vinesim.kernels.articulation.lane_records import LANES
 from vinesim.scene.model import Model
 
 
