@@ -677,6 +677,7 @@ def test_a_gpu_agrees_with_the_cpu() -> None:
         ({"tie_body": 1}, r"tie 1 on body 1: it stands behind a tie of a later body; sort ties by body"),
         ({"tie_stiffness": -1.0}, r"tie 1 on body 4: stiffness below 0 N/m; a spring pulls back"),
         ({"tie_damping": -1.0}, r"tie 1 on body 4: damping below 0 N s/m; a damper takes energy"),
+        ({"tie_wire": 0}, r"tie 1 on body 4: wire of 0 fixed pieces, counted from 0; give one of them, or -1 for none"),
         ({"tie_anchor": np.nan}, r"Model.tie_anchor\[1, 0\] is not finite"),
         ({"body_drag": -0.1}, r"body 1 of tree 0: drag area \[m\^2\] -0.1.*; air holds back"),
     ],

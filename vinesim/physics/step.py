@@ -19,7 +19,8 @@ from vinesim.physics.plants.fault_guard import FaultGuard
 from vinesim.physics.plants.level_of_detail import LevelOfDetail
 from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.physics.plants.validation import warn_of_raised_damping
-from vinesim.physics.plants.wind import Wind
+from vinesim.physics.plants.wind import WindOnPlants
+from vinesim.physics.plants.wires import Wires
 from vinesim.physics.rigid.dormant_bunches import DormantBunches
 from vinesim.physics.rigid.hand_grasp import GraspManager
 from vinesim.physics.rigid.rigid_world import RigidWorld
@@ -36,6 +37,7 @@ from vinesim.scene.values import (
     RobotSpec,
     Snapshot,
 )
+from vinesim.scene.wind import Wind
 
 
 class Physics:
@@ -71,11 +73,16 @@ class Physics:
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
         self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
+        self.wires = Wires(self.plants, p)
         self.level_of_detail = LevelOfDetail(self.plants, p)
         self.sleep_monitor = SleepMonitor(self.plants, p)
         self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
-        """The wind, None for calm; may be set at any time between steps."""
+        """The wind, None for calm; may be set at any time between steps, and then begins or ends in two seconds."""
+        self.wind_time_offset = 0.0
+        """[s] Time of the wind minus :attr:`time`: makes gusts those of other clients."""
+        self.wind_on_plants = WindOnPlants(self.plants, p)
+        """Which trees feel the wind."""
         self.detachments: tuple[Detachment, ...] = ()
         """What left its plant in the last step, or by command before it; sorted by body."""
         self.remotely_posed = np.zeros(0, np.int32)
@@ -96,6 +103,7 @@ class Physics:
             ("rigid: predict velocities without plant contacts", self.rigid.predict),
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
+            ("wires: bring to balance with awake trees, wake trees that they move", self._update_wires),
             ("plants: predict velocities without contacts", self.plants.predict),
             ("contacts: wake trees that others touch, solve all together", self.contact_solver.solve),
             ("plants: integrate with contact wrenches", self._integrate_plants),
@@ -127,15 +135,19 @@ class Physics:
     # ------------------------------------------------------------------ stages that pass values between parts
 
     def _set_wind(self) -> None:
-        if self.wind is not None:
-            actors = [self.rigid.actor_position(name) for name in self.rigid.actors]
-            observers = (np.array(actors), self.parameters.wind_radius) if actors else None
-            self.wind.update(self.plants, self.time, observers, self.parameters)
+        observers = None
+        if self.wind is not None and (actors := self.rigid.actors):
+            observers = np.array([self.rigid.actor_position(name) for name in actors]), self.parameters.wind_radius
+        self.wind_on_plants.update(self.wind, self.time + self.wind_time_offset, observers)
 
     def _refine_bunches(self) -> None:
         coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
         if len(coarsened):  # those that sleep collide with other shapes now
             self.contact_solver.update_tree_bounds(coarsened)
+
+    def _update_wires(self) -> None:
+        self.update_kinematics()
+        self.wires.update()
 
     def _integrate_plants(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
@@ -159,7 +171,7 @@ class Physics:
             keep_awake = self.contact_solver.remote_trees.copy()
             keep_awake[self.contact_solver.near_trees] = True
             keep_awake[self.model.body_tree[self.plants.held_bodies]] = True
-            self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs)
+            self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs, self.wires.is_coupled)
 
     # ------------------------------------------------------------------ results of a step
 
@@ -214,6 +226,7 @@ class Physics:
             visuals=self.visuals(),
             visual_q=self.visual_q(),
             moved_trees=np.union1d(self.plants.awake, self.remotely_posed),
+            wind=self.wind_on_plants.state,
         )
 
     def visuals(self) -> tuple[RigidVisual, ...]:
@@ -289,6 +302,7 @@ class Physics:
         resting = np.unique(trees).astype(np.int32)
         self.plants.put_to_sleep(resting)
         self.contact_solver.update_tree_bounds(resting)
+        self.wires.place(resting)
         self.remotely_posed = np.union1d(self.remotely_posed, trees).astype(np.int32)
         self._body_q = None
 

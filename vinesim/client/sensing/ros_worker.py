@@ -6,7 +6,9 @@ the rate of the topics of every step whatever the sensors do.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import queue
 import time
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -18,10 +20,12 @@ from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import report_ready, serve
+from vinesim.ros.commands.types import SimulationRequest
 from vinesim.ros.names import ros_name
+from vinesim.scene.values import ControllerKind, ControllerSpec
 
-STEP_TOPICS = ("/clock", "joint_states", "tf", "mobile_base_controller/odom", "vine/contacts")
-"""Topics with a message for every step."""
+STATE_TOPICS = ("joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "vine/markers")
+"""Topics that need a robot's state after a step, whatever robot it is."""
 TRUTH_TOPIC = "tf_environment"
 NICENESS = 5
 """Behind the client's loop, before the renderer."""
@@ -44,12 +48,25 @@ class RosConfig:
     namespace: str
     """Prefix of its topics."""
     clock: bool
-    """Whether the node publishes /clock."""
+    """Whether the node may publish /clock; one of a ROS domain does."""
     static_transforms: tuple[tuple[str, str, np.ndarray], ...]
     poles: np.ndarray
     """Poses [pole, 7] m, 1."""
     records: StepRecords
     bunch_count: int
+    box_count: int
+    bunch_of_body: np.ndarray
+    """[body] -1 for wood."""
+    controllers: tuple[ControllerSpec, ...]
+    imus: tuple[str, ...]
+    wrenches: tuple[str, ...]
+
+    @property
+    def step_topics(self) -> tuple[str, ...]:
+        """Topics that need the record of a step, or names above several such topics; /clock comes first."""
+        states = [one.name for one in self.controllers if one.kind is ControllerKind.JOINT_TRAJECTORY]
+        elastic = [one.name for one in self.controllers if one.kind is ControllerKind.SERIES_ELASTIC]
+        return ("/clock", *STATE_TOPICS, *self.imus, *self.wrenches, *states, *elastic)
 
 
 class RosChannel:
@@ -60,12 +77,14 @@ class RosChannel:
         self.truth = SharedSnapshot(
             {
                 "time": ((1,), "f8"), "attached": ((config.bunch_count,), "?"),
-                "bunch_q": ((config.bunch_count, 7), "f4"),
+                "bunch_q": ((config.bunch_count, 7), "f4"), "box_q": ((config.box_count, 7), "f8"),
             },
             context,
         )  # fmt: skip
-        self.wanted = SharedArrays({"steps": ((len(STEP_TOPICS),), "?"), "truth": ((1,), "?")})
-        """Whether topics have subscribers, written by the process."""
+        self.wanted = SharedArrays(
+            {"steps": ((len(config.step_topics),), "?"), "truth": ((1,), "?"), "goals": ((1,), "?")}
+        )
+        """Whether topics have subscribers, and actions goals; written by the process."""
 
     def close(self) -> None:
         """Release the memory."""
@@ -84,24 +103,31 @@ class RosWorker:
     def __init__(self, config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
         from vinesim.ros import middleware
         from vinesim.ros.robot_node import RobotNode
+        from vinesim.ros.simulation_node import SimulationNode
 
         middleware.configure(large_messages=False)
         self.config, self.channel, self.pipe = config, channel, pipe
         self.node = RobotNode(
             ros_name(config.name), config.urdf, namespace=config.namespace, static_transforms=config.static_transforms,
-            base=config.base, clock=config.clock,
+            controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
+            bunch_of_body=config.bunch_of_body, base=config.base, clock=config.clock,
         )  # fmt: skip
+        self._requests: queue.SimpleQueue[SimulationRequest] = queue.SimpleQueue()
+        self.simulation = None
+        if config.clock:
+            name = f"{ros_name(config.name)}_simulation"
+            self.simulation = SimulationNode(name, config.namespace, self._requests.put)
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
-        self._step_topics = [name if config.clock or name != "/clock" else None for name in STEP_TOPICS]
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
-        self._attached_names = self._bunch_names
+        self._box_names = tuple(f"box_{i}" for i in range(config.box_count))
+        self._truth_names: tuple[str, ...] = ()
         self._next_statistics = 0.0
 
     def run(self) -> None:
         """Publish until a "stop"."""
         report_ready(self.pipe, NICENESS)
-        with self.node:
+        with self.node, self.simulation or contextlib.nullcontext():
             while self._take_requests():
                 record = self.channel.steps.take(POLL_PERIOD)
                 if record is not None:
@@ -110,6 +136,8 @@ class RosWorker:
                         self.node.publish_robot_state(self.config.records.read(record))
                 if self.channel.truth.wait(0.0):
                     self._publish_truth()
+                while not self._requests.empty():
+                    self.pipe.send(("simulation", self._requests.get()))
                 if commands := self.node.commands():
                     self.pipe.send(("commands", commands))
                 self._report()
@@ -122,21 +150,26 @@ class RosWorker:
                 return False
             if kind == "diagnose":
                 self.node.publish_diagnostics(*value)
+            elif kind == "finish":
+                self.node.finish_goal(value)
+            elif kind == "simulated" and self.simulation is not None:
+                self.simulation.answer(value)
         return True
 
     def _publish_truth(self) -> None:
-        """True poses of the bunches that hang on their plants."""
+        """True poses of the boxes, and of the bunches that hang on their plants."""
         with self.channel.truth.reading() as truth:
             now, attached = float(truth["time"][0]), np.flatnonzero(truth["attached"])
-            poses = truth["bunch_q"][attached].astype(float)
-        if len(attached) != len(self._attached_names):
-            self._attached_names = tuple(self._bunch_names[i] for i in attached)
-        self.node.publish_environment(now, self._attached_names, poses)
+            poses = np.concatenate([truth["box_q"], truth["bunch_q"][attached]])
+        if len(poses) != len(self._truth_names):
+            self._truth_names = (*self._box_names, *(self._bunch_names[i] for i in attached))
+        self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:
         """Tell the client what is subscribed to, and now and then what was sent."""
         wanted = self.channel.wanted
-        wanted["steps"][:] = [name is not None and self.node.has_subscribers(name) for name in self._step_topics]
+        wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
+        wanted["goals"][0] = self.node.has_goals
         wanted["truth"][0] = self.node.has_subscribers(TRUTH_TOPIC)
         now = time.monotonic()
         if now >= self._next_statistics:

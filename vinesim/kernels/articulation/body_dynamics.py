@@ -93,19 +93,20 @@ def tie_terms(
     stiffness: float,
     damping: float,
     anchor: wp.vec3,
+    anchor_velocity: wp.vec3,
     point: wp.vec3,
     origin: wp.vec3,
     motion: wp.spatial_vector,
 ):
     """What a tie at ``point`` [m from the origin, world axes] adds to the J, H, M, bias and tension of one body: spring
-    and damper as a mass there, and their force. anchor, origin: [m] in the world.
+    and damper as a mass there, and their force. anchor, origin: [m] in the world; anchor_velocity: [m/s].
     """
     omega = wp.spatial_bottom(motion)
     stretch = origin + point - anchor
     damper = residual_damping(damping, stiffness, phi, dt)
     mass = phi * dt * (phi * dt * stiffness + damper)
     swing = wp.cross(omega, point)
-    force = tie_force(stiffness, damper, stretch, wp.spatial_top(motion) + swing, phi, dt)
+    force = tie_force(stiffness, damper, stretch, wp.spatial_top(motion) + swing - anchor_velocity, phi, dt)
     force = force - mass * wp.cross(omega, swing)
     H = mass * wp.skew(point)
     M = mass * wp.identity(n=3, dtype=float)

@@ -182,6 +182,7 @@ def add_ties(p: SolverParameters, phi: float, k: int, model: ArticulationModel, 
     for t in range(ties[0], ties[1]):
         J, H, M, bias, tension = tie_terms(
             p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+            forces.tie_anchor_velocity[t],
             wp.quat_to_matrix(quat_at(own_out, POSE + 24)) * model.tie_point[t], vec3_at(own_out, POSE),
             spatial_at(own_out, MOTION),
         )  # fmt: skip

@@ -61,7 +61,8 @@ def residual_damping(damping: float, stiffness: float, phi: float, dt: float):
 
 @wp.func
 def tie_force(stiffness: float, damping: float, stretch: wp.vec3, speed: wp.vec3, phi: float, dt: float):
-    """Force [N] of a tie whose point moves on at its present speed; ``damping`` is the residual one."""
+    """Force [N] of a tie whose point moves on at its present ``speed`` against the anchor; ``damping`` is the residual
+    one."""
     return -stiffness * (stretch + phi * dt * speed) - damping * speed
 
 
@@ -106,7 +107,7 @@ def tie_and_drag_wrench(
         damping = residual_damping(model.tie_damping[t], stiffness, phi, dt)
         implicit_mass = phi * dt * (phi * dt * stiffness + damping)
         swing = wp.cross(omega, point)
-        force = tie_force(stiffness, damping, stretch, velocity + swing, phi, dt)
+        force = tie_force(stiffness, damping, stretch, velocity + swing - forces.tie_anchor_velocity[t], phi, dt)
         force = force - implicit_mass * (a + wp.cross(alpha, point) + wp.cross(omega, swing))
         wrench += wp.spatial_vector(force, wp.cross(point, force))
     return wrench

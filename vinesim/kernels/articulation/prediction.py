@@ -112,7 +112,7 @@ def assemble_bodies(
         for t in range(ties[0], ties[1]):
             J, H, M, bias, tension = tie_terms(
                 p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
-                rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
+                forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
             )  # fmt: skip
             add_terms(k, J, H, M, bias, tension, scratch_out)
 

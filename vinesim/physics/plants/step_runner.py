@@ -2,7 +2,7 @@
 
 A tree whose first mode is too fast for the step takes substeps instead, of which all others see the sum:
 :mod:`vinesim.kernels.articulation.first_mode` says how many. While contacts act on it, it takes the whole step that
-they were solved for.
+they were solved for; and so does always a tree that is tied to wires, which move once a step.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ class StepRunner:
         tree_size: [tree] bodies, by which trees are dealt out.
         tree_substeps: [tree] into how many substeps each tree's step is to be divided.
         tree_steps: [tree] into how many it is divided now, which the kernels read.
+        whole: [tree] bool, trees whose steps are never divided.
         tree_rate: [tree] what the kernels write of each tree's speed.
         stepping: [tree] int32, the list that the kernels read.
         groups: [tree, 2] int32, groups that the kernels read: first place in the list, number of trees.
@@ -59,6 +60,7 @@ class StepRunner:
         tree_size: np.ndarray,
         tree_substeps: np.ndarray,
         tree_steps: np.ndarray,
+        whole: np.ndarray,
         tree_rate: np.ndarray,
         stepping: np.ndarray,
         groups: np.ndarray,
@@ -68,6 +70,7 @@ class StepRunner:
     ) -> None:
         self._buffers, self._launches, self._tree_size, self._list = buffers, launches, tree_size, stepping
         self._substeps, self._steps_of, self._rate, self._floating = tree_substeps, tree_steps, tree_rate, floating
+        self._is_whole = whole
         self._pool, self._threads = thread_pool, 1 if thread_pool is None else thread_pool.size
         self.stepped = np.zeros(0, np.int32)
         """The trees of this step [k], sorted."""
@@ -109,7 +112,7 @@ class StepRunner:
         self._list[: len(trees)] = trees
         self._launches.count_substeps(len(trees))
         self._buffers.synchronize()
-        self.fast = trees[self._substeps[trees] > 1]
+        self.fast = trees[(self._substeps[trees] > 1) & ~self._is_whole[trees]]
         self._steps_of[trees] = 1
         self._divided = np.ones(len(self.fast), np.int32)
         self._order()

@@ -229,7 +229,7 @@ class RobotBody:
     def _mimics(self, m: mujoco.MjModel) -> dict[str, tuple[str, np.ndarray]]:
         """Joints that mimic another joint: name -> (source, coefficients of the polynomial [5])."""
         joints = {}
-        for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        for e in np.flatnonzero(m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
             joint, source = m.joint(m.eq_obj1id[e]).name, m.joint(m.eq_obj2id[e]).name
             if joint.startswith(self.spec.name + "/"):
                 joints[joint] = (source, m.eq_data[e, :5].copy())

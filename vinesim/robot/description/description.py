@@ -11,7 +11,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.robot.description.kinematics import MovingJoints
 from vinesim.robot.description.sidecar import BaseLimits, CameraMount, Cutter, JointGroup, SensorMount
-from vinesim.scene.values import Drive, RobotSpec
+from vinesim.scene.values import ControllerSpec, Drive, RobotSpec
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +42,8 @@ class RobotDescription:
     imus: tuple[SensorMount, ...]
     wrenches: tuple[SensorMount, ...]
     cutters: tuple[Cutter, ...]
+    controllers: tuple[ControllerSpec, ...]
+    """What ROS may command, by which interface; sorted by name."""
     base_limits: BaseLimits
     mass: float
     """[kg]"""

@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
+from vinesim.robot.description.controllers import command_interfaces, make_controllers
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
 from vinesim.robot.description.errors import DescriptionError, description_error
@@ -155,6 +156,7 @@ def _assemble(
         imus=sidecar.imus,
         wrenches=sidecar.wrenches,
         cutters=sidecar.cutters,
+        controllers=make_controllers(sidecar, names, command_interfaces(urdf), file.with_suffix(".toml")),
         base_limits=msgspec.structs.replace(sidecar.base, linear=0.0, angular=0.0, effort=BOLTED_EFFORT)
         if base == MOUNT
         else sidecar.base,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 from collections.abc import Mapping
 
 import numpy as np
@@ -64,6 +65,31 @@ class RobotSpec:
     each other and the ground are counted already; boxes that stand for its meshes would touch where those do not."""
 
 
+class ControllerKind(enum.StrEnum):
+    """What a controller of a robot does with its joints, in the words of ros2_controllers where they have one."""
+
+    JOINT_TRAJECTORY = "joint_trajectory"
+    GRIPPER = "gripper"
+    CUTTER = "cutter"
+    FORWARD_POSITION = "forward_position"
+    FORWARD_VELOCITY = "forward_velocity"
+    FORWARD_EFFORT = "forward_effort"
+    IMPEDANCE = "impedance"
+    SERIES_ELASTIC = "series_elastic"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ControllerSpec:
+    """One controller of a robot: prefix of its topics and actions, and the joints that it moves."""
+
+    name: str
+    kind: ControllerKind
+    joints: tuple[str, ...]
+    """In the order of its commands; none for a cutter."""
+    group: str = ""
+    """The joint group of a gripper or cutter."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointSample:
     """Joints of one robot at one instant, in the order of ``names``."""
@@ -78,6 +104,16 @@ class JointSample:
     """[joint] N m or N: what the drive transmits; at rest gravity load minus J^T f of the contacts."""
     contact: np.ndarray
     """[joint] N m or N: J^T f of the contacts alone."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class JointReference:
+    """What the controllers of a robot ask of its joints in one step, in the order of joint arrays."""
+
+    position: np.ndarray
+    """[joint] rad or m"""
+    velocity: np.ndarray
+    """[joint] rad/s or m/s"""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -144,3 +180,4 @@ class RobotSample:
     elements: ElasticSample | None = None
     wrenches: tuple[Wrench, ...] = ()
     imus: tuple[Imu, ...] = ()
+    reference: JointReference | None = None
