@@ -14,6 +14,7 @@ import rclpy
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from rclpy.context import Context
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
@@ -53,7 +54,7 @@ def play(path: pathlib.Path, *, rate: float = 1.0, is_stopped: Callable[[], bool
         context.shutdown()
 
 
-def _play(reader: Any, node: rclpy.node.Node, rate: float, is_stopped: Callable[[], bool]) -> Counter[str]:
+def _play(reader: Any, node: Node, rate: float, is_stopped: Callable[[], bool]) -> Counter[str]:
     summary = reader.get_summary()
     if summary is None or reader.get_header().profile != "ros2":
         raise McapError("its profile is not ros2")
