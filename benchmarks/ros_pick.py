@@ -18,12 +18,18 @@ import subprocess
 import sys
 import time
 
+import numpy as np
+
+from vinesim import frames
+
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "ros" / "pick_a_bunch.py"
 HALF_BOX = (0.30, 0.20)
 """[m] Half edges of a box of the scene harvest."""
 BOX_HEIGHT = 0.30
-"""[m] A bunch whose upper end is higher does not lie in it."""
+"""[m] A bunch whose middle is higher does not lie in it."""
+MIDDLE = 0.07
+"""[m] From a bunch's upper end, its origin, to its middle."""
 TIMEOUT = 600.0
 """[s] For one vineyard."""
 
@@ -107,16 +113,17 @@ def lies_in_a_box(bunch: str) -> bool:
         answer = service.call_async(GetEntitiesStates.Request(filters=EntityFilters(filter=f"^(box_.*|{bunch})$")))
         rclpy.spin_until_future_complete(node, answer, timeout_sec=30.0)
         found = answer.result()
-        places = {name: state.pose.position for name, state in zip(found.entities, found.states, strict=True)}
+        poses = {
+            name: np.array([*(getattr(state.pose.position, a) for a in "xyz"),
+                            *(getattr(state.pose.orientation, a) for a in "xyzw")])
+            for name, state in zip(found.entities, found.states, strict=True)
+        }  # fmt: skip
         node.destroy_node()
     finally:
         rclpy.shutdown()
-    fruit = places[bunch]
-    return any(
-        abs(fruit.x - box.x) < HALF_BOX[0] and abs(fruit.y - box.y) < HALF_BOX[1] and 0.0 < fruit.z - box.z < BOX_HEIGHT
-        for name, box in places.items()
-        if name != bunch
-    )
+    middle = frames.compose(poses[bunch], frames.pose([MIDDLE, 0.0, 0.0]))
+    inside = [frames.compose(frames.inverse(box), middle)[:3] for name, box in poses.items() if name != bunch]
+    return any((np.abs(at[:2]) < HALF_BOX).all() and 0.0 < at[2] < BOX_HEIGHT for at in inside)
 
 
 if __name__ == "__main__":
