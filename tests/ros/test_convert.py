@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 
 import numpy as np
@@ -28,7 +27,6 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from vinesim.ros.commands import convert as commands
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.messages.transforms import SerializedTransforms, split_time
-from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import (
     CameraFrame,
     CameraInfo,
@@ -167,13 +165,6 @@ def test_compressed_image_shows_the_same_colours():
     assert "jpeg" in message.format
     decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert np.abs(decoded.astype(int) - plain.rgb).max() <= 4
-
-
-def test_label_map_takes_labels_apart():
-    known = json.loads(convert.label_map().data)
-    value = label(Organ.BUNCH, 4711)
-    assert known["organs"][str(value // known["stride"])] == "bunch"
-    assert value % known["stride"] == 4711
 
 
 def test_camera_info_projects_like_the_camera():

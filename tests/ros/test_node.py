@@ -73,7 +73,7 @@ def camera_frame(t: float, width: int = 640, height: int = 480, name: str = "hea
     info = CameraInfo(width, height, width, width, width / 2, height / 2, f"{name}_optical")
     rgb = np.full((height, width, 3), 7, np.uint8)
     depth = np.full((height, width), 1.5, np.float32)
-    return CameraFrame(t, name, info, REST, rgb, depth, np.ones((height, width), np.int32))
+    return CameraFrame(t, name, info, REST, rgb, depth, np.ones((height, width), np.int32), bunches=())
 
 
 def lidar_scan(t: float, count: int) -> LidarScan:
@@ -190,11 +190,10 @@ def test_every_topic_is_heard_with_its_official_type():
     assert received["/tf"]["type_hash"] == "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 
 
-LATCHED = ("robot_description", "label_map", "tf_static", "tf_environment_static")
+LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static")
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/robot_description": "std_msgs/msg/String",
-    "/label_map": "std_msgs/msg/String",
     "/joint_states": "sensor_msgs/msg/JointState",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -211,6 +210,10 @@ TYPES = {
     "/head_front_camera/depth/camera_info": "sensor_msgs/msg/CameraInfo",
     "/head_front_camera/depth/points": "sensor_msgs/msg/PointCloud2",
     "/head_front_camera/labels": "sensor_msgs/msg/Image",
+    "/head_front_camera/label_info": "vision_msgs/msg/LabelInfo",
+    "/head_front_camera/detections": "vision_msgs/msg/Detection2DArray",
+    "/head_front_camera/detections_3d": "vision_msgs/msg/Detection3DArray",
+    "/head_front_camera/bunches": "sensor_msgs/msg/PointCloud2",
 }
 
 

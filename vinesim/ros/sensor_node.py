@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeVar
 
+from vinesim.ros.messages import message_packages
 from vinesim.ros.node import Node
 from vinesim.ros.publishers.camera import CameraPublisher
 from vinesim.ros.publishers.lidar import LidarPublisher
@@ -25,6 +26,8 @@ class SensorNode(Node):
     def __init__(
         self, name: str, *, namespace: str = "", cameras: Sequence[str] = (), lidars: Sequence[str] = ()
     ) -> None:
+        if cameras:
+            message_packages.ensure_importable(["vision_msgs"])
         self._camera_names, self._lidar_names = cameras, lidars
         self._pending: dict[Topic, Build] = {}
         """The newest message of each topic; the one that waits longest is the first."""

@@ -21,6 +21,7 @@ from vinesim.sensors.camera.camera import Camera, load_camera_kernels
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import SpinningScan
 from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.truth.ground_truth import visible_bunches
 
 
 def load_kernels() -> None:
@@ -112,22 +113,32 @@ class SensorScheduler:
         due = [m for m in self.sensors if self._is_due(m, snapshot.time, poses)]
         if not due:
             return
-        self._update_primitives(snapshot, poses)
+        seen = self._update_primitives(snapshot, poses)
         for scheduled in due:
-            for result in self._results(scheduled, snapshot.time, poses[scheduled.name]):
+            for result in self._results(scheduled, seen, poses[scheduled.name]):
                 scheduled.deliver(result)
                 self.frames[scheduled.name] += 1
 
-    def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> None:
+    def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> Snapshot:
+        """Pose the primitives; the snapshot as it is drawn, good until the next call."""
         eye = next((pose[:3] for pose in poses.values()), None)
         seen = self._sway.apply(snapshot, np.flatnonzero(self._moved), eye)
         self.primitives.update(seen, seen.moved_trees)
         self._moved[:] = False
+        return seen
 
-    def _results(self, scheduled: ScheduledSensor, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
-        """Render what a sensor has to deliver at simulation time ``now`` [s]."""
+    def _results(
+        self, scheduled: ScheduledSensor, snapshot: Snapshot, pose: np.ndarray
+    ) -> Iterator[CameraFrame | LidarScan]:
+        """Render what a sensor has to deliver of a snapshot that the primitives show."""
+        now = snapshot.time
         if isinstance(scheduled.sensor, Camera):
-            yield scheduled.sensor.render(self.primitives, pose, now, outputs=scheduled.wanted())
+            camera, outputs = scheduled.sensor, scheduled.wanted()
+            frame = camera.render(self.primitives, pose, now, outputs=outputs)
+            if CameraOutput.BUNCHES in outputs:
+                bunches = visible_bunches(self.primitives, snapshot, camera.info, frame.pose, camera.rasterizer)
+                frame = dataclasses.replace(frame, bunches=bunches)
+            yield frame
             return
         scan = self._scans[scheduled.name]
         missed = scan.dropped

@@ -194,11 +194,10 @@ class SensorWorker:
         return device
 
     def _camera_demand(self, name: str, always: bool) -> Callable[[], CameraOutput]:
-        """The outputs of a camera that its subscribers need now; all but the exact depth if ``always``."""
-        if always:
-            return lambda: CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
+        """The outputs of a camera that its subscribers need now; if ``always``, also a whole picture."""
+        kept = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS if always else CameraOutput.NONE
         node = self.node
-        return lambda: CameraOutput.NONE if node is None else node.camera_outputs_wanted(name)
+        return lambda: kept if node is None else kept | node.camera_outputs_wanted(name)
 
     def _lidar_demand(self, name: str) -> Callable[[], CameraOutput]:
         """Whether a lidar has subscribers now."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import array
 import functools
-import json
 import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -23,7 +22,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo as CameraInfoMessage
 from sensor_msgs.msg import CompressedImage, Image, JointState, PointCloud2, PointField
 from sensor_msgs.msg import Imu as ImuMessage
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 from vinesim import frames
@@ -36,7 +35,6 @@ from vinesim.scene.camera_geometry import (
     intrinsic_matrix,
     write_points,
 )
-from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.values import (
     CameraFrame,
     CameraInfo,
@@ -173,7 +171,7 @@ robot's link by its number in the URDF or -1."""
 
 def contact_cloud(sample: RobotSample, links: Mapping[str, int], bunch_of_body: np.ndarray, frame: str) -> PointCloud2:
     """All contacts of one step, in the world's ``frame``; ``links``: numbers by name, ``bunch_of_body`` [body]."""
-    message, points = _cloud(sample.joints.time, frame, CONTACT_POINT, 1, len(sample.contacts))
+    message, points = cloud(sample.joints.time, frame, CONTACT_POINT, 1, len(sample.contacts))
     for row, contact in zip(points[0], sample.contacts, strict=True):
         row["x"], row["y"], row["z"] = contact.position
         row["force_x"], row["force_y"], row["force_z"] = contact.force
@@ -203,12 +201,6 @@ def label_image(frame: CameraFrame) -> Image:
     return _image(frame, frame.labels, "32SC1", np.int32)
 
 
-def label_map() -> String:
-    """The meaning of labels as JSON: ``label // stride`` is an organ, ``label % stride`` which one of them."""
-    organs = {str(int(organ)): organ.name.lower() for organ in Organ}
-    return String(data=json.dumps({"stride": LABEL_STRIDE, "organs": organs}))
-
-
 def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
     """The picture as JPEG."""
     import cv2  # here, as a process that sends no pictures should not load it
@@ -234,7 +226,7 @@ def camera_info(info: CameraInfo, time: float) -> CameraInfoMessage:
 
 def depth_cloud(frame: CameraFrame) -> PointCloud2:
     """Depth and colour as an organised cloud in the optical frame; NaN where there is no depth."""
-    message, points = _cloud(frame.time, frame.info.frame_id, POINT_DTYPE, frame.info.height, frame.info.width)
+    message, points = cloud(frame.time, frame.info.frame_id, POINT_DTYPE, frame.info.height, frame.info.width)
     write_points(frame, points)
     message.is_dense = False
     return message
@@ -246,7 +238,7 @@ def lidar_cloud(scan: LidarScan) -> PointCloud2:
     Raw, as drivers publish it: each point in the frame that the lidar had at that point's time.
     """
     point = LIDAR_POINT if scan.returned is None else DUAL_LIDAR_POINT
-    message, points = _cloud(scan.time, scan.frame_id, point, 1, len(scan.xyz))
+    message, points = cloud(scan.time, scan.frame_id, point, 1, len(scan.xyz))
     points = points[0]
     for axis, name in enumerate("xyz"):
         points[name] = scan.xyz[:, axis]
@@ -288,7 +280,7 @@ def _image(frame: CameraFrame, pixels: np.ndarray, encoding: str, dtype: type) -
     return message
 
 
-def _cloud(time: float, frame: str, point: np.dtype, height: int, width: int) -> tuple[PointCloud2, np.ndarray]:
+def cloud(time: float, frame: str, point: np.dtype, height: int, width: int) -> tuple[PointCloud2, np.ndarray]:
     """A cloud without values, and its points [height, width] to write them into."""
     message = PointCloud2(header=header(time, frame), height=height, width=width)
     message.fields = list(_fields(point))

@@ -1,4 +1,4 @@
-"""Topics of ground truth: true poses apart from the robot's own tf, and the meaning of label images."""
+"""Topics of true poses apart from the robot's own tf."""
 
 from __future__ import annotations
 
@@ -6,21 +6,18 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
-from std_msgs.msg import String
 
-from vinesim.ros.messages import convert
 from vinesim.ros.messages.transforms import SerializedTransforms
 from vinesim.ros.publishers.robot import MAP_FRAME
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
 
 
 class GroundTruthPublisher:
-    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles) in the map; ``label_map``, latched."""
+    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles) in the map."""
 
     def __init__(self, advertise: Advertise, tf_message: type) -> None:
         self._moving = advertise(tf_message, "tf_environment", RELIABLE)
         self._static = advertise(tf_message, "tf_environment_static", TRANSIENT_LOCAL)
-        advertise(String, "label_map", TRANSIENT_LOCAL).send(convert.label_map())
         self._names: Sequence[str] | None = None
         self._transforms = SerializedTransforms([])
 

@@ -20,12 +20,23 @@ from vinesim.scene.values.robot import (
     RobotSpec,
     Wrench,
 )
-from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
+from vinesim.scene.values.sensors import (
+    MIN_BERRY_PIXELS,
+    Box,
+    BunchTruth,
+    CameraFrame,
+    CameraInfo,
+    CameraOutput,
+    LidarScan,
+)
 from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
 __all__ = [
+    "MIN_BERRY_PIXELS",
     "POINT_NAMES",
+    "Box",
+    "BunchTruth",
     "CameraFrame",
     "CameraInfo",
     "CameraOutput",
