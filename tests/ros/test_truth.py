@@ -3,7 +3,14 @@
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import os
+import pathlib
+import subprocess
+import sys
+import threading
+import time
 from collections.abc import Iterator
 
 import cv2
@@ -40,11 +47,14 @@ from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.ros.messages.bunches import BUNCH_POINT
+from vinesim.ros.sensor_node import SensorNode
 from vinesim.scene.builder import assemble
 from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import CameraInfo, HumanSpec
+from vinesim.scene.values import CameraInfo, CameraOutput, HumanSpec
+from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.export.images import look_at
 from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -86,10 +96,11 @@ def test_people_boxes_and_bunches_stand_in_tf_environment_where_they_are(peer):
         physics, true, heard = client.physics, {}, []
 
         def keep(_: Client) -> None:
-            organs = {Organ.BOX, Organ.HUMAN, Organ.BUNCH}
-            true[round(physics.time * 100)] = {
-                one.name: q for one, q in zip(physics.visuals(), physics.visual_q(), strict=True) if one.organ in organs
-            } | {f"hangs {i}": physics.state.body_q[model.bunch_body[i]] for i in np.flatnonzero(physics.state.bunch_attached)}
+            shown = zip(physics.visuals(), physics.visual_q(), strict=True)
+            poses = {one.name: q for one, q in shown if one.organ in (Organ.BOX, Organ.HUMAN, Organ.BUNCH)}
+            for bunch in np.flatnonzero(physics.state.bunch_attached):
+                poses[f"hangs {bunch}"] = physics.state.body_q[model.bunch_body[bunch]].copy()
+            true[round(physics.time * 100)] = poses
 
         client.post_step.append(keep)
         peer.node.create_subscription(TFMessage, "/tf_environment", heard.append, 100)
@@ -108,7 +119,8 @@ def test_people_boxes_and_bunches_stand_in_tf_environment_where_they_are(peer):
         wait_until(lambda: newest() == plain, step)
         root = frames.pose(np.array([1.0, 1.0, 0.0]))
         client.add_human(HumanSpec("anna", 7, standing_pose(root)), None, hub.bus("anna"))
-        physics.add_human(HumanSpec("bob", 8, standing_pose(root + [0, 5, 0, 0, 0, 0, 0])), is_remote=True)
+        aside = frames.pose(np.array([1.0, 6.0, 0.0]))
+        physics.add_human(HumanSpec("bob", 8, standing_pose(aside)), is_remote=True)
         bones = {f"{who}/{bone}" for who in ("anna", "bob") for bone in ("head", "hips", "left_forearm", "right_foot")}
         wait_until(lambda: newest() >= plain | bones, step)
         assert len(newest()) == 3 + 2 * 46
@@ -142,9 +154,9 @@ class Chain:
     def _take(self, message: TFMessage) -> None:
         self.moving.setdefault(stamp_of(message.transforms[0].header), {}).update(self._read(message))
 
-    def pose(self, frame: str, time: int) -> np.ndarray:
+    def pose(self, frame: str, at: int) -> np.ndarray:
         """Of a frame in the map at a time [ns]."""
-        pose, known = frames.pose(np.zeros(3)), self.static | self.moving[time]
+        pose, known = frames.pose(np.zeros(3)), self.static | self.moving[at]
         while frame != "map":
             frame, step = known[frame]
             pose = frames.compose(step, pose)
@@ -153,8 +165,8 @@ class Chain:
 
 @pytest.mark.slow
 def test_detections_and_label_pixels_agree_while_the_robot_drives_and_turns(peer):
-    """Of a real client: boxes are those of the label pixels; bunches that are known project onto their label pixels
-    within 1 px through tf and camera_info, and so do the detections' poses and cut points."""
+    """Of a real client: boxes are those of the label pixels. Bunches that are known project onto their label pixels
+    within 1 px through tf and camera_info; poses and cut points agree with them."""
     scene, vinebot, model = load_scene("demo"), load_description("vinebot"), sensor_scenes.demo()
     processes = RobotProcesses("robot", scene, model, vinebot, sensor_hz=5.0)
     client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
@@ -167,7 +179,8 @@ def test_detections_and_label_pixels_agree_while_the_robot_drives_and_turns(peer
         heard: dict[str, dict[int, object]] = {topic: {} for topic in types}
         for topic, kind in types.items():
             take = heard[topic]
-            peer.node.create_subscription(kind, f"{CAMERA}/{topic}", lambda m, t=take: t.update({stamp_of(m.header): m}), 10)
+            keep = lambda m, t=take: t.update({stamp_of(m.header): m})  # noqa: E731
+            peer.node.create_subscription(kind, f"{CAMERA}/{topic}", keep, 10)
         infos: list[LabelInfo] = []
         peer.node.create_subscription(LabelInfo, f"{CAMERA}/label_info", infos.append, LATCHED)
         environment: list[TFMessage] = []
@@ -198,16 +211,16 @@ def test_detections_and_label_pixels_agree_while_the_robot_drives_and_turns(peer
         np.testing.assert_allclose(hanging[f"bunch_{i:05d}"], rest_snapshot(model).body_q[body], atol=2e-4)
     seen = turned = 0
     times = whole()
-    for time in times:
-        labels = np.frombuffer(heard["labels"][time].data, np.int32)
-        message = heard["rgb/camera_info"][time]
+    for now in times:
+        labels = np.frombuffer(heard["labels"][now].data, np.int32)
+        message = heard["rgb/camera_info"][now]
         k = np.reshape(message.k, (3, 3))
         info = CameraInfo(message.width, message.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], message.header.frame_id)
         labels = labels.reshape(info.height, info.width)
-        pose = chain.pose(info.frame_id, time)
-        known = known_labels(primitives, pose, info) if time in times[:: len(times) // 2] else None
-        flat, solid = heard["detections"][time].detections, heard["detections_3d"][time].detections
-        rows = np.frombuffer(heard["bunches"][time].data, BUNCH_POINT)
+        pose = chain.pose(info.frame_id, now)
+        known = known_labels(primitives, pose, info) if now in times[:: len(times) // 2] else None
+        flat, solid = heard["detections"][now].detections, heard["detections_3d"][now].detections
+        rows = np.frombuffer(heard["bunches"][now].data, BUNCH_POINT)
         shown = np.unique(labels[labels // LABEL_STRIDE == int(Organ.BUNCH)]) % LABEL_STRIDE
         assert [one.id for one in flat] == [one.id for one in solid] == [str(i) for i in shown]
         assert rows["bunch"].tolist() == shown.tolist()
@@ -233,7 +246,7 @@ def test_detections_and_label_pixels_agree_while_the_robot_drives_and_turns(peer
             if known is not None and mine.sum() > 50:
                 assert lies_within_one_pixel(mine, known == label(Organ.BUNCH, int(two.id)))
                 seen += 1
-    first, last = (chain.pose("base_footprint", time) for time in (times[0], times[-1]))
+    first, last = (chain.pose("base_footprint", now) for now in (times[0], times[-1]))
     turned = abs(frames.to_yaw(frames.multiply(frames.conjugate(first[3:]), last[3:])))
     assert turned > 0.1
     assert np.linalg.norm(last[:2] - first[:2]) > 0.05
@@ -263,3 +276,47 @@ def box_of(box) -> tuple[float, float, float, float]:
     """First column and row, last column and row of the pixels in a vision_msgs box."""
     x, y, wide, high = box.center.position.x, box.center.position.y, box.size_x, box.size_y
     return x - 0.5 * (wide - 1), y - 0.5 * (high - 1), x + 0.5 * (wide - 1), y + 0.5 * (high - 1)
+
+
+def test_the_example_of_a_perception_node_finds_bunches_in_colour_and_depth(peer):
+    """What it prints lies at a bunch, within half a bunch's length, and the nearest bunch is found within 5 cm."""
+    file = pathlib.Path(__file__).parents[2] / "examples" / "ros" / "find_bunches.py"
+    assert len(file.read_text().splitlines()) < 60
+    model = sensor_scenes.demo()
+    view, primitives = rest_snapshot(model), Primitives(model)
+    primitives.update(view)
+    middles = view.body_q[model.bunch_body].astype(float)
+    middles = frames.compose(middles, frames.pose(np.outer(0.5 * model.bunch_length, [1.0, 0.0, 0.0])))[:, :3]
+    spec = CameraSpec.load("d435")
+    camera = Camera(spec, spec.info("optical"), "head_front_camera", quality="fast")
+    pose = look_at(view.body_q[model.bunch_body[0], :3] + [0.1, -0.9, 0.1], view.body_q[model.bunch_body[0], :3])
+    picture = camera.render(primitives, pose)
+    found: list[np.ndarray] = []
+
+    def listen(stream) -> None:
+        for line in stream:
+            words = line.split()
+            assert words[0] == "optical:"
+            found.append(np.array([words[4], words[6], words[8]], float))
+
+    with (
+        SensorNode("sensors", cameras=["head_front_camera"]) as node,
+        subprocess.Popen([sys.executable, str(file)], stdout=subprocess.PIPE, text=True) as finder,
+    ):
+        reader = threading.Thread(target=listen, args=(finder.stdout,))
+        reader.start()
+        wait_until(lambda: node.camera_outputs_wanted("head_front_camera") & CameraOutput.DEPTH)
+        ticks = itertools.count(1)
+
+        def send() -> None:
+            node.publish_camera(dataclasses.replace(picture, time=0.1 * next(ticks)))
+            time.sleep(0.1)
+
+        wait_until(lambda: len(found) >= 6, send)
+        finder.kill()
+        reader.join()
+    true = frames.rotate(frames.conjugate(picture.pose[3:]), middles - picture.pose[:3])
+    away = np.linalg.norm(np.array(found)[:, None] - true, axis=2).min(1)
+    assert away.max() < 0.12
+    nearest = true[np.argmin(np.where(true[:, 2] > 0.3, np.linalg.norm(true - [0, 0, 0.9], axis=1), np.inf))]
+    assert np.linalg.norm(np.array(found) - nearest, axis=1).min() < 0.05
