@@ -1,4 +1,4 @@
-"""What is true around a robot as a stock node sees it: bunches in its pictures; bunches, boxes and people in the map."""
+"""What is true around a robot as a stock node sees it: bunches in pictures; bunches, boxes and people in the map."""
 
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
