@@ -201,6 +201,7 @@ TYPES = {
     "/tf_environment_static": "tf2_msgs/msg/TFMessage",
     "/mobile_base_controller/odom": "nav_msgs/msg/Odometry",
     "/vine/contacts": "sensor_msgs/msg/PointCloud2",
+    "/vine/markers": "visualization_msgs/msg/MarkerArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/lidar/points": "sensor_msgs/msg/PointCloud2",
     "/head_front_camera/rgb/image_raw": "sensor_msgs/msg/Image",
@@ -253,7 +254,7 @@ def test_subscribers_are_counted_by_family_and_knows_its_topics():
         assert not node.has_subscribers("left")  # a name that the other begins with
         peer.node.destroy_subscription(subscription)
         wait_until(lambda: not node.has_subscribers("left_arm"))
-        with pytest.raises(ValueError, match=r"no topic 'right'; there are: left/depth/camera_info"):
+        with pytest.raises(ValueError, match=r"no topic 'right'; there are: left/bunches, left/depth/camera_info"):
             node.has_subscribers("right")
 
 
