@@ -20,7 +20,7 @@ from vinesim.scene.values.robot import (
     RobotSpec,
     Wrench,
 )
-from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
+from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LevelLaser, LidarScan
 from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
@@ -45,6 +45,7 @@ __all__ = [
     "Imu",
     "JointReference",
     "JointSample",
+    "LevelLaser",
     "LidarScan",
     "Measurement",
     "Mesh",
