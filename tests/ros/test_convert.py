@@ -334,7 +334,7 @@ def trajectory(*points: tuple[float, list[float], list[float]]) -> JointTrajecto
     message = JointTrajectory(joint_names=["a", "b"])
     for time, positions, velocities in points:
         point = JointTrajectoryPoint(positions=positions, velocities=velocities)
-        point.time_from_start.sec, point.time_from_start.nanosec = int(time), round(time % 1 * 1e9)
+        point.time_from_start.sec, point.time_from_start.nanosec = math.floor(time), round(time % 1 * 1e9)
         message.points.append(point)
     return message
 

@@ -204,6 +204,7 @@ TYPES = {
     "/tf_environment_static": "tf2_msgs/msg/TFMessage",
     "/mobile_base_controller/odom": "nav_msgs/msg/Odometry",
     "/vine/contacts": "sensor_msgs/msg/PointCloud2",
+    "/vine/markers": "visualization_msgs/msg/MarkerArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/lidar/points": "sensor_msgs/msg/PointCloud2",
     "/scan": "sensor_msgs/msg/LaserScan",
