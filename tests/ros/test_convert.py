@@ -413,6 +413,7 @@ def test_compressed_depth_is_decoded_as_its_transport_does():
     assert message.format == "32FC1; compressedDepth png"
     kind, a, b = struct.unpack_from("<iff", bytes(message.data))
     pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8)[12:], cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
     assert (kind, pixels.dtype, pixels.shape) == (0, np.uint16, frame.depth.shape)
     found = np.where(pixels > 0, a / (np.maximum(pixels, 1) - np.float32(b)), np.nan)
     known = np.isfinite(frame.depth) & (frame.depth < 10.0) & (frame.depth > 0.16)
@@ -424,6 +425,7 @@ def test_compressed_depth_is_decoded_as_its_transport_does():
     assert message.format == "16UC1; compressedDepth png"
     assert bytes(message.data[:12]) == bytes(12)
     pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8)[12:], cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
     raw = np.frombuffer(convert.depth_image_millimetres(frame).data, np.uint16).reshape(pixels.shape)
     assert np.array_equal(pixels, np.where(raw > 10_000, 0, raw))
 

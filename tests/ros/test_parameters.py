@@ -54,7 +54,9 @@ class Setter:
         request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
         future = self._client.call_async(request)
         wait_until(future.done, self._tick, f"{name} = {value}")
-        (result,) = future.result().results
+        response = future.result()
+        assert response is not None
+        (result,) = response.results
         assert result.successful == (not result.reason)
         return result.reason
 
