@@ -591,7 +591,7 @@ def run_with_events(**options: object) -> tuple[list[bytes], np.ndarray]:
 
 
 def test_threads_and_device_buffers_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_TREES_PER_THREAD", 0)
+    monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_GROUPS_PER_THREAD", 0)
     monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_INTEGRATED_TREES_PER_THREAD", 0)
     single_threaded, response = run_with_events()
     copies = [{"buffers": DeviceBuffers("cpu", interleave=lanes)} for lanes in (1, 3)]
@@ -626,10 +626,11 @@ def test_partitions_have_similar_numbers_of_bodies() -> None:
     plants = ArticulationSolver(model, State.at_rest(model), threads=3)
     plants.wake(np.arange(1, 40))
     plants.predict()
-    ends, trees = plants._runner.partition_ends, np.arange(1, 40)
-    assert (ends[0], ends[-1]) == (0, 39)
-    partition_sizes = [int(model.tree_size[trees[a:b]].sum()) for a, b in itertools.pairwise(ends)]
-    assert max(partition_sizes) - min(partition_sizes) <= 2 * model.tree_size.max()
+    runner = plants._runner
+    places, trees = runner._starts[runner._group_ends], runner._list
+    assert (places[0], places[-1]) == (0, 39)
+    partition_sizes = [int(model.tree_size[trees[a:b]].sum()) for a, b in itertools.pairwise(places)]
+    assert max(partition_sizes) - min(partition_sizes) <= 8 * model.tree_size.max()
 
 
 def test_threads_end_with_their_solver() -> None:

@@ -527,7 +527,7 @@ def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axi
     return least
 
 
-@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 2**31))
 def test_waking_is_never_late(seed):
     """On any path of a bar through a vineyard, it touches no sleeping tree at the end of a step."""

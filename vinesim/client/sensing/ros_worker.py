@@ -6,7 +6,9 @@ the rate of the topics of every step whatever the sensors do.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import queue
 import time
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -18,6 +20,7 @@ from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import report_ready, serve
+from vinesim.ros.commands.types import SimulationRequest
 from vinesim.ros.names import ros_name
 from vinesim.scene.values import ControllerKind, ControllerSpec
 
@@ -100,6 +103,7 @@ class RosWorker:
     def __init__(self, config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
         from vinesim.ros import middleware
         from vinesim.ros.robot_node import RobotNode
+        from vinesim.ros.simulation_node import SimulationNode
 
         middleware.configure(large_messages=False)
         self.config, self.channel, self.pipe = config, channel, pipe
@@ -108,6 +112,11 @@ class RosWorker:
             controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
             bunch_of_body=config.bunch_of_body, base=config.base, clock=config.clock,
         )  # fmt: skip
+        self._requests: queue.SimpleQueue[SimulationRequest] = queue.SimpleQueue()
+        self.simulation = None
+        if config.clock:
+            name = f"{ros_name(config.name)}_simulation"
+            self.simulation = SimulationNode(name, config.namespace, self._requests.put)
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
@@ -118,7 +127,7 @@ class RosWorker:
     def run(self) -> None:
         """Publish until a "stop"."""
         report_ready(self.pipe, NICENESS)
-        with self.node:
+        with self.node, self.simulation or contextlib.nullcontext():
             while self._take_requests():
                 record = self.channel.steps.take(POLL_PERIOD)
                 if record is not None:
@@ -127,6 +136,8 @@ class RosWorker:
                         self.node.publish_robot_state(self.config.records.read(record))
                 if self.channel.truth.wait(0.0):
                     self._publish_truth()
+                while not self._requests.empty():
+                    self.pipe.send(("simulation", self._requests.get()))
                 if commands := self.node.commands():
                     self.pipe.send(("commands", commands))
                 self._report()
@@ -141,6 +152,8 @@ class RosWorker:
                 self.node.publish_diagnostics(*value)
             elif kind == "finish":
                 self.node.finish_goal(value)
+            elif kind == "simulated" and self.simulation is not None:
+                self.simulation.answer(value)
         return True
 
     def _publish_truth(self) -> None:

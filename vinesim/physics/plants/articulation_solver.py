@@ -32,6 +32,7 @@ from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parame
 from vinesim.physics.plants.remote_pose import blend_towards
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
+from vinesim.physics.plants.topology import Topologies
 from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -102,7 +103,6 @@ class ArticulationSolver:
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
         self.thread_pool = ThreadPool(threads) if threads > 1 else None
-        """Who shares the work, if there is more than one thread."""
         if self.thread_pool is not None:
             weakref.finalize(self, self.thread_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
@@ -111,7 +111,8 @@ class ArticulationSolver:
         """Kernels on these arrays."""
         self._runner = StepRunner(
             buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
-            tree_rate=self.tree_rate, stepping=self._stepping, floating=self._floating, thread_pool=self.thread_pool,
+            tree_rate=self.tree_rate, stepping=self._stepping, groups=self._groups, floating=self._floating,
+            topologies=Topologies(model, state.body_cut, self.tree_moving), thread_pool=self.thread_pool,
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]]),
         )  # fmt: skip
         self._list_awake()
@@ -166,9 +167,8 @@ class ArticulationSolver:
         self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
         self._last_contact = np.full(trees, -2, np.int64)  # tick of the last contact
         self._loaded_bodies = np.zeros(0, np.int32)
-        self._stepping, self._subset = np.zeros(trees, np.int32), np.zeros(trees, np.int32)
-        self._checked: np.ndarray | None = None
-        """Bodies that are known to be stepping."""
+        self._stepping, self._subset, self._groups = (np.zeros(n, np.int32) for n in (trees, trees, (trees, 2)))
+        self._checked: np.ndarray | None = None  # bodies that are known to be stepping
 
     def _pin_arrays(self) -> None:
         """Move the arrays of solver, ties and state to where the device can reach them."""
@@ -188,7 +188,7 @@ class ArticulationSolver:
             float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
                     "tie_damping": ties.damping, "tie_softening": ties.softening, "tree_phi": self.phi,
                     "phi_used": self.phi_used, "tree_rate": self.tree_rate},
-            wp.vec2i: {"tie_span": ties.span},
+            wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
             wp.bool: {"tree_awake": state.tree_awake},
             wp.vec3: {"body_offset": self._offset, "body_com": self.body_com, "body_inertia": self.body_inertia,
                       "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
