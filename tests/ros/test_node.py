@@ -67,7 +67,18 @@ def robot_sample(t: float, actor: str = "vinebot", contacts: tuple[Contact, ...]
     zeros = np.zeros(len(JOINTS))
     joints = JointSample(t, JOINTS, zeros + t, zeros, zeros, zeros)
     base = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(np.pi / 2))
-    return RobotSample(actor, joints, base, np.zeros(6), REST, np.zeros(6), np.zeros((2, 3, 3)), FRAMES, np.tile(REST, (len(FRAMES), 1)), contacts)
+    return RobotSample(
+        actor,
+        joints,
+        base,
+        np.zeros(6),
+        REST,
+        np.zeros(6),
+        np.zeros((2, 3, 3)),
+        FRAMES,
+        np.tile(REST, (len(FRAMES), 1)),
+        contacts,
+    )
 
 
 def camera_frame(t: float, width: int = 640, height: int = 480, name: str = "head_front_camera") -> CameraFrame:

@@ -22,8 +22,12 @@ class Parameters:
         node.add_post_set_parameters_callback(self._take)
 
     def declare(
-        self, name: str, default: float, description: str,
-        between: tuple[float, float] | None = None, changed: Callable[[], None] | None = None,
+        self,
+        name: str,
+        default: float,
+        description: str,
+        between: tuple[float, float] | None = None,
+        changed: Callable[[], None] | None = None,
     ) -> None:
         """Declare a parameter of the type of its ``default``: bool, int or float.
 

@@ -87,11 +87,15 @@ class RobotNode(Node):
         """Parameters that can be set while the node runs."""
         declare = self._parameters.declare
         declare(
-            MAP_TO_ODOM, True, "Publish the true pose of odom in the map on /tf; off for a localisation of your own.",
+            MAP_TO_ODOM,
+            True,
+            "Publish the true pose of odom in the map on /tf; off for a localisation of your own.",
             changed=self._apply_parameters,
         )
         declare(
-            TRUTH, True, "Publish what no robot could measure: tf_environment, vine/contacts, vine/markers.",
+            TRUTH,
+            True,
+            "Publish what no robot could measure: tf_environment, vine/contacts, vine/markers.",
             changed=self._apply_parameters,
         )
         declare(ENVIRONMENT_RATE, 10.0, "Messages a second of tf_environment [Hz].", (0.1, 50.0))

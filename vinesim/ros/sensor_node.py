@@ -25,7 +25,12 @@ class SensorNode(Node):
     """The topics of ``cameras`` and ``lidars``, the names under which they publish."""
 
     def __init__(
-        self, name: str, *, namespace: str = "", cameras: Sequence[str] = (), lidars: Sequence[str] = (),
+        self,
+        name: str,
+        *,
+        namespace: str = "",
+        cameras: Sequence[str] = (),
+        lidars: Sequence[str] = (),
         rates: Mapping[str, float] | None = None,
     ) -> None:
         """``rates``: those of sensors [Hz], from which the parameters start; without one there is no such parameter."""  # fmt: skip
@@ -45,7 +50,9 @@ class SensorNode(Node):
             for i, one in enumerate(self._lidar_names)
         }
         for sensor, rate in self._rates.items():
-            parameters.declare(f"{sensor}.rate", rate, "Pictures or revolutions a second [Hz].", (0.1, max(rate, 100.0)))
+            parameters.declare(
+                f"{sensor}.rate", rate, "Pictures or revolutions a second [Hz].", (0.1, max(rate, 100.0))
+            )
         parameters.declare(TRUTH, True, "Publish labels of pictures.", changed=self._mute_truth)
 
     def _mute_truth(self) -> None:

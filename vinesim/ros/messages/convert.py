@@ -335,7 +335,10 @@ def diagnostics(time: float, prefix: str, components: Iterable[ComponentStatus])
         values = [KeyValue(key=key, value=str(value)) for key, value in one.values.items()]
         statuses.append(
             DiagnosticStatus(
-                name=f"{prefix}: {one.name}", hardware_id=prefix, level=_LEVELS[one.level], message=one.message,
+                name=f"{prefix}: {one.name}",
+                hardware_id=prefix,
+                level=_LEVELS[one.level],
+                message=one.message,
                 values=values,
             )  # fmt: skip
         )
