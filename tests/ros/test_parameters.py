@@ -122,7 +122,8 @@ def test_a_robot_without_truth_and_bad_values():
             ("environment_rate", "fast"), ("publish_truth", 3),
         ):  # fmt: skip
             reason = put(name, value)
-            assert reason and "\n" not in reason, (name, value)
+            assert reason, (name, value)
+            assert "\n" not in reason
         assert node.environment_rate == 20.0
 
 

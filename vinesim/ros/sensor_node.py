@@ -33,7 +33,7 @@ class SensorNode(Node):
         lidars: Sequence[str] = (),
         rates: Mapping[str, float] | None = None,
     ) -> None:
-        """``rates``: those of sensors [Hz], from which the parameters start; without one there is no such parameter."""  # fmt: skip
+        """``rates``: those of sensors [Hz], with which their parameters start; others have none."""
         self._camera_names, self._lidar_names = cameras, lidars
         self._rates = rates or {}
         self._pending: dict[Topic, Build] = {}

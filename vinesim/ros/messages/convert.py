@@ -214,8 +214,8 @@ QUANTIZATION, MAX_COMPRESSED_DEPTH = 100.0, 10.0
 def compressed_depth(frame: CameraFrame, *, is_millimetres: bool = False) -> CompressedImage:
     """Depth as compressed_depth_image_transport encodes it: a header of 12 bytes, then a PNG of 16 bits.
 
-    Millimetres, or the inverse of depth: q = a / depth + b, 0 where there is none and from 10 m on; a and b stand in the
-    header. Nearer than 0.152 m 16 bits cannot hold q, which then is 0.
+    Millimetres, or the inverse of depth: q = a / depth + b, 0 where there is none and from 10 m on; a and b stand in
+    the header. Nearer than 0.152 m 16 bits cannot hold q, which then is 0.
     """
     import cv2  # here, as a process that sends no pictures should not load it
 
@@ -299,10 +299,10 @@ def lidar_cloud(scan: LidarScan) -> PointCloud2:
 
 
 def laser_scan(scan: LidarScan) -> LaserScan:
-    """The laser nearest to the horizontal as a scan in the lidar's plane: the nearest return of each shot, +Inf for none.
+    """The laser nearest to the horizontal as a scan in its plane: the nearest return of each shot, +Inf for none.
 
-    Angles rise, as most programs expect, while the head turns clockwise: the first ray is the last that was fired, which
-    the stamp is of, and ``time_increment`` is negative.
+    Angles rise, as most programs expect, while the head turns clockwise: the first ray is the last that was fired,
+    which the stamp is of, and ``time_increment`` is negative.
     """
     level = scan.level
     if level is None:
@@ -340,7 +340,7 @@ def diagnostics(time: float, prefix: str, components: Iterable[ComponentStatus])
                 level=_LEVELS[one.level],
                 message=one.message,
                 values=values,
-            )  # fmt: skip
+            )
         )
     return DiagnosticArray(header=header(time, ""), status=statuses)
 
