@@ -11,6 +11,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from vinesim.bench import soak
 from vinesim.bench.process_memory import ProcessHistory, ProcessSample, ProcessSampler, sample_process
 from vinesim.bench.soak import Cast, _Run, measurements, run_soak
 from vinesim.client.processes.child_process import Process, ProcessFailed
@@ -94,9 +95,10 @@ def test_a_client_that_ends_badly_does_not_cost_the_figures(tmp_path: pathlib.Pa
 
 
 @pytest.mark.slow
-def test_a_short_run_is_clean() -> None:
-    """One robot, one person and a recorder, half a minute: no thread and no file more, nothing malformed."""
-    result = run_soak(Cast(robots=1, people=1), 0.5, lambda line: None)
+def test_a_short_run_is_clean(monkeypatch) -> None:
+    """One robot, one person and a recorder, six samples: no thread and no file more, nothing malformed."""
+    monkeypatch.setattr(soak, "SAMPLE_PERIOD", 2.0)
+    result = run_soak(Cast(robots=1, people=1), 0.2, lambda line: None)
     kinds = {kind for kind, _ in result.histories}
     assert {"server", "robot client", "sensor process", "person's client", "recorder"} <= kinds
     changes = {

@@ -591,7 +591,7 @@ def run_with_events(**options: object) -> tuple[list[bytes], np.ndarray]:
 
 
 def test_threads_and_device_buffers_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_TREES_PER_THREAD", 0)
+    monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_GROUPS_PER_THREAD", 0)
     monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_INTEGRATED_TREES_PER_THREAD", 0)
     single_threaded, response = run_with_events()
     copies = [{"buffers": DeviceBuffers("cpu", interleave=lanes)} for lanes in (1, 3)]
@@ -626,10 +626,11 @@ def test_partitions_have_similar_numbers_of_bodies() -> None:
     plants = ArticulationSolver(model, State.at_rest(model), threads=3)
     plants.wake(np.arange(1, 40))
     plants.predict()
-    ends, trees = plants._runner.partition_ends, np.arange(1, 40)
-    assert (ends[0], ends[-1]) == (0, 39)
-    partition_sizes = [int(model.tree_size[trees[a:b]].sum()) for a, b in itertools.pairwise(ends)]
-    assert max(partition_sizes) - min(partition_sizes) <= 2 * model.tree_size.max()
+    runner = plants._runner
+    places, trees = runner._starts[runner._group_ends], runner._list
+    assert (places[0], places[-1]) == (0, 39)
+    partition_sizes = [int(model.tree_size[trees[a:b]].sum()) for a, b in itertools.pairwise(places)]
+    assert max(partition_sizes) - min(partition_sizes) <= 8 * model.tree_size.max()
 
 
 def test_threads_end_with_their_solver() -> None:
@@ -676,6 +677,7 @@ def test_a_gpu_agrees_with_the_cpu() -> None:
         ({"tie_body": 1}, r"tie 1 on body 1: it stands behind a tie of a later body; sort ties by body"),
         ({"tie_stiffness": -1.0}, r"tie 1 on body 4: stiffness below 0 N/m; a spring pulls back"),
         ({"tie_damping": -1.0}, r"tie 1 on body 4: damping below 0 N s/m; a damper takes energy"),
+        ({"tie_wire": 0}, r"tie 1 on body 4: wire of 0 fixed pieces, counted from 0; give one of them, or -1 for none"),
         ({"tie_anchor": np.nan}, r"Model.tie_anchor\[1, 0\] is not finite"),
         ({"body_drag": -0.1}, r"body 1 of tree 0: drag area \[m\^2\] -0.1.*; air holds back"),
     ],

@@ -373,8 +373,8 @@ def test_a_mimicking_finger_follows_the_driven_one():
     assert rigid.mj_data.joint("anna/oppose").qpos[0] == pytest.approx(0.3 - 2 * 0.09, abs=1e-3)
 
 
-def test_a_mesh_collides_as_its_bounding_box(tmp_path):
-    """An STL of a brick, off its link's origin: contacts use its bounding box, sensors get the file."""
+def test_a_mesh_collides_as_its_hull(tmp_path):
+    """An STL of a brick, off its link's origin: contacts use its hull, sensors get the file."""
     low, high = np.array([0.1, -0.05, 0.2]), np.array([0.16, 0.07, 0.5])
     corner = [np.where([i & 1, i & 2, i & 4], high, low) for i in range(8)]
     quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
@@ -389,7 +389,8 @@ def test_a_mesh_collides_as_its_bounding_box(tmp_path):
     rigid.add_robot(dataclasses.replace(arm(), urdf=urdf))
     rigid.predict()
     geom = rigid.geoms.link.index("slider")
-    assert rigid.geoms.kind[geom] == 6
+    assert rigid.geoms.kind[geom] == 7
+    assert rigid.geoms.hull[geom] >= 0
     np.testing.assert_allclose(np.sort(rigid.geoms.size[geom]), np.sort((high - low) / 2), atol=1e-6)
     index = rigid.geoms.id[geom]
     center = rigid.mj_data.geom_xpos[index] + rigid.mj_data.geom_xmat[index].reshape(3, 3) @ rigid.geoms.center[geom]

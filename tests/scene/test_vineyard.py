@@ -156,6 +156,9 @@ def test_shoots_are_tied_where_they_pass_wires(vineyard):
     gap = np.array([to_segment(point, start, end).min() for point in at])
     assert np.mean(gap < 0.075) > (0.99 if scene.training == "vsp" else 0.35)
     assert gap.max() < 0.36  # by a string of 0.3 m and a mesh of 0.5 m
+    own = to_segment(at, model.fixed_start[model.tie_wire].astype(float), model.fixed_end[model.tie_wire].astype(float))
+    assert (model.fixed_tension[model.tie_wire] > 0.0).all()
+    assert (own < gap + (1e-6 if scene.training == "vsp" else 0.36)).all()
     assert (np.diff(model.tie_body) >= 0).all()
     per_shoot = len(at) / len(model.tree_first)
     assert (3.0 < per_shoot <= 4.0) if scene.training == "vsp" else (0.5 < per_shoot < 4.0)

@@ -12,16 +12,13 @@ ROOT = pathlib.Path(__file__).parents[2]
 def imports_of(path: pathlib.Path, modules: set[str]) -> set[str]:
     """Modules of the package that one file imports, wherever in the file."""
     found = set()
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    only_types = {
-        id(node)
-        for block in ast.walk(tree)
-        if isinstance(block, ast.If) and ast.unparse(block.test) == "TYPE_CHECKING"
-        for node in ast.walk(block)
-    }
-    for node in ast.walk(tree):
-        if id(node) in only_types:
+    waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
             continue
+        # an import is a statement: what is inside an expression need not be looked at
+        waiting += [child for child in ast.iter_child_nodes(node) if not isinstance(child, ast.expr)]
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:

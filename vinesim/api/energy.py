@@ -40,7 +40,8 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     """Energy of some trees [k] (all unless given); ``gravity`` [m/s^2]. Poses and velocities must be up to date.
 
     Kinetic: sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic: k theta^2 / 2 about each joint axis, where
-    theta is the rotation vector of the joint, and k d^2 / 2 of each tie.
+    theta is the rotation vector of the joint, and k d^2 / 2 of each tie; k d (d + u) / 2 with its share of the wire
+    that it deflects by u.
     """
     model, state = plants.model, plants.state
     bodies = _moving_bodies(plants, trees)
@@ -50,8 +51,10 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     elastic = 0.5 * float((plants.joint_stiffness[bodies] * turned**2).sum())
     ties = np.flatnonzero(np.isin(model.tie_body, bodies))
     pose = state.body_q[model.tie_body[ties]].astype(float)
-    away = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[ties].astype(float)) - plants.tie_anchor[ties]
-    elastic += 0.5 * float(plants.tie_stiffness[ties] @ (away**2).sum(1))
+    point = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[ties].astype(float))
+    away, whole = point - plants.tie_anchor[ties], point - model.tie_anchor[ties]
+    whole = np.where(np.isin(ties, plants.ties.on_wire)[:, None], whole, away)
+    elastic += 0.5 * float(plants.tie_stiffness[ties] @ (away * whole).sum(1))
     return Energy(kinetic, elastic, gravity * float(mass @ com[:, 2]))
 
 

@@ -26,7 +26,7 @@ from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, render, scene_show
 from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
-from vinesim.cli.commands.tools import bench, certs_new, ros_build_interfaces
+from vinesim.cli.commands.tools import bench, certs_new, ros_build_interfaces, ros_play, ros_record
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False,
@@ -43,6 +43,8 @@ for command in (demo, server, client, record, replay, render, dataset, bench):
     app.command()(command)
 scene_app.command("show")(scene_show)
 ros_app.command("build-interfaces")(ros_build_interfaces)
+ros_app.command("record")(ros_record)
+ros_app.command("play")(ros_play)
 certs_app.command("new")(certs_new)
 
 

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import pathlib
+import signal
+import threading
+import time
 
+from vinesim.errors import UsageError
+from vinesim.net.recording.mcap_writer import free_path
 from vinesim.ros import middleware
+
+PROGRESS_PERIOD = 2.0
+"""Wall time between two lines of progress [s]."""
 
 
 def build(quiet: bool, wheel: pathlib.Path | None) -> int:
@@ -33,3 +41,50 @@ def build(quiet: bool, wheel: pathlib.Path | None) -> int:
         for package, place in places.items():
             print(f"{package}: {lines.get(package, f'the official one is there, {place}')}")
     return 0
+
+
+def record(path: pathlib.Path, topics: list[str], seconds: float | None) -> int:
+    """Record topics until Ctrl-C or for so many ``seconds``; the exit code."""
+    if (reason := middleware.unavailable_reason()) is not None:
+        print(f"ROS 2 is not usable here: {reason}")
+        return 3
+    from vinesim.ros.tools.bag_recorder import BagRecorder
+
+    stop, path = _stop_at_signals(), free_path(path)
+    began = told = time.monotonic()
+    with BagRecorder(path, topics) as recorder:
+        print(f"recording into {path}; Ctrl-C ends it", flush=True)
+        while not stop.is_set() and (seconds is None or time.monotonic() - began < seconds):
+            recorder.spin()
+            if time.monotonic() - told >= PROGRESS_PERIOD:
+                told = time.monotonic()
+                print(
+                    f"{told - began:.0f} s: {recorder.counts.total()} messages of {len(recorder.counts)} topics",
+                    flush=True,
+                )
+    print(f"{path}: {recorder.counts.total()} messages of {len(recorder.counts)} topics")
+    return 0
+
+
+def play(path: pathlib.Path, rate: float) -> int:
+    """Publish a recording's topics again; the exit code."""
+    if (reason := middleware.unavailable_reason()) is not None:
+        print(f"ROS 2 is not usable here: {reason}")
+        return 3
+    from vinesim.ros.tools import bag_player
+
+    stop = _stop_at_signals()
+    print(f"playing {path}", flush=True)
+    try:
+        played = bag_player.play(path, rate=rate, is_stopped=stop.is_set)
+    except bag_player.BagError as error:
+        raise UsageError(str(error)) from None
+    print(f"{path}: {played.total()} messages of {len(played)} topics")
+    return 0
+
+
+def _stop_at_signals() -> threading.Event:
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop

@@ -111,6 +111,10 @@ class Client:
         self.replicator = self.replicators[name]
         self.meshes.bus = bus
         self.remote_actors: dict[str, RemoteRobot | RemoteHuman] = {}
+        self.steps_before_pause: int | None = None
+        """Steps that are still simulated before the simulation pauses; None: it runs."""
+        self.between_steps: list[Callable[[], None]] = []
+        """Called at the start of every tick, also while the simulation pauses."""
         self.pre_step: list[Callable[[float], None]] = []
         """Called before every step with the simulation time [s]: tasks and commands of robots."""
         self.post_step: list[Callable[[Client], None]] = []
@@ -185,7 +189,13 @@ class Client:
             share.local_actors = self.replicators.keys() - {own}
 
     def tick(self) -> None:
-        """Simulate one step of ``physics.dt``."""
+        """Simulate one step of ``physics.dt``; none while :attr:`steps_before_pause` is 0."""
+        for callback in self.between_steps:
+            callback()
+        if self.steps_before_pause is not None:
+            if self.steps_before_pause == 0:
+                return
+            self.steps_before_pause -= 1
         now = self._clock()
         self.receive(now)
         if self.replicator.has_clock:

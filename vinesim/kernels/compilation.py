@@ -24,6 +24,7 @@ SENSOR_PACKAGES = ("raster", "sensing", "shading")
 TIMEOUT = 600.0
 """How long another process may take to compile, before this one compiles as well [s]."""
 _CUDA_ONLY = ("vinesim.kernels.raster.cuda_raster",)
+_CPU_ONLY = ("vinesim.kernels.articulation.eight_trees",)
 
 
 def compile_kernels(packages: tuple[str, ...] = (), device: str = "cpu") -> int:
@@ -34,7 +35,7 @@ def compile_kernels(packages: tuple[str, ...] = (), device: str = "cpu") -> int:
     """
     if device != "cpu":
         with disk_cache.exclusive("kernels-cuda", TIMEOUT, waiting_for="another process that compiles kernels"):
-            _compile(_modules(packages, without=()), device)
+            _compile(_modules(packages, without=_CPU_ONLY), device)
     stamp = _stamp(packages)
     if _is_valid(stamp):
         return 0

@@ -88,13 +88,15 @@ class Model(StructOfArrays):
     bunch_head_com: np.ndarray = array("bunch", 3, unit="m")
     bunch_head_inertia: np.ndarray = array("bunch", 3, unit="kg m^2")
 
-    # ties: canes bound to wires; springs between a point of a body and a point of the world, slack as drawn
+    # ties: canes bound to wires; springs between a point of a body and one of the world or of a wire, slack as drawn
     tie_body: np.ndarray = array("tie", unit="1", dtype=np.int32)
     """Sorted."""
     tie_point: np.ndarray = array("tie", 3, unit="m")
     """In the body's frame."""
     tie_anchor: np.ndarray = array("tie", 3, unit="m")
-    """In the world."""
+    """In the world, while the wire is straight."""
+    tie_wire: np.ndarray = array("tie", unit="1", dtype=np.int32, fill=-1)
+    """The piece of wire that the tie is bound to, an index of ``fixed_start``; -1: to a point that does not move."""
     tie_stiffness: np.ndarray = array("tie", unit="N/m")
     tie_damping: np.ndarray = array("tie", unit="N s/m")
 
@@ -116,6 +118,8 @@ class Model(StructOfArrays):
     fixed_organ: np.ndarray = array("fixed", unit="1", dtype=np.int32, fill=int(Organ.POLE))
     fixed_index: np.ndarray = array("fixed", unit="1", dtype=np.int32)
     """Which pole, wire, trunk or arm this piece belongs to."""
+    fixed_tension: np.ndarray = array("fixed", unit="N")
+    """With which a piece of wire is taut between its ends; 0: it does not give."""
 
     # picking boxes: open crates, dynamic
     box_pose: np.ndarray = array("box", 7, unit="m, 1", fill=_UNIT_POSE)

@@ -138,6 +138,7 @@ class Trellis(_Part, frozen=True, kw_only=True):
     wire_tension: Annotated[Number, "N"]
     tie_reach: Annotated[Number, "m"]
     tie_string: Annotated[Number, "m"]
+    tie_stiffness: Annotated[Number, "N/m"]
     tie_damping: Annotated[Number, "s"]
 
 

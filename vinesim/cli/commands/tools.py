@@ -73,6 +73,41 @@ def ros_build_interfaces(
     raise typer.Exit(build(quiet, wheel))
 
 
+def ros_record(
+    path: Annotated[pathlib.Path, typer.Argument(help="The MCAP file to write; an existing one is kept.")],
+    topic: Annotated[
+        list[str] | None, typer.Option(help="A topic, or a regular expression for whole names; may repeat. All else.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="Stop after so many seconds; else at Ctrl-C.")] = None,
+) -> None:
+    """Record ROS topics into one MCAP file with their definitions, as rosbag2 does, without rosbag2.
+
+    \b
+    Examples:
+      vinesim ros record run.mcap
+      vinesim ros record run.mcap --topic /joint_states --topic '/head_front_camera/.*'
+    """
+    from vinesim.cli.ros import record
+
+    raise typer.Exit(record(path, topic or [], seconds))
+
+
+def ros_play(
+    path: Annotated[pathlib.Path, typer.Argument(help="An MCAP file of ROS topics, of vinesim or rosbag2.")],
+    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Times as fast as recorded.")] = 1.0,
+) -> None:
+    """Publish the topics of a recording again, /clock included.
+
+    \b
+    Examples:
+      vinesim ros play run.mcap
+      vinesim ros play run.mcap --rate 0.5
+    """
+    from vinesim.cli.ros import play
+
+    raise typer.Exit(play(path, rate))
+
+
 def certs_new(
     actor: Annotated[str, typer.Argument(help="The actor's name, or server.")],
     dir: Annotated[

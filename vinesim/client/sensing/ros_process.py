@@ -17,6 +17,7 @@ from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import WorkerProcess
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
+from vinesim.client.tasks.simulation_control import SimulationControl
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import series_stiffness
@@ -37,7 +38,8 @@ class RosProcess:
     def __init__(
         self, name: str, model: Model, description: RobotDescription, *, namespace: str = "", clock: bool = True
     ) -> None:
-        """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock."""
+        """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock, and
+        serves simulation_interfaces."""
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
         self._sent: dict[str, int] = {}
@@ -47,13 +49,16 @@ class RosProcess:
         """Counts of the runs of the process before this one."""
         self._contacts_left_out = 0
         self._is_restarted = False
+        self._leads = clock
+        self._simulation: SimulationControl | None = None
         self._missed_truth = 0
         poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
         fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
         self._records = StepRecords(name, description, series_stiffness(description.drives))
         config = RosConfig(
             name, description.urdf, description.base, namespace, clock, tuple((p, c, q) for (p, c), q in fixed),
-            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body), model.bunch_of_body(),
+            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body), len(model.box_size),
+            model.bunch_of_body(),
             description.controllers, tuple(mount.name for mount in description.imus),
             tuple(mount.name for mount in description.wrenches),
         )  # fmt: skip
@@ -80,6 +85,9 @@ class RosProcess:
             self.robot, self._take_commands, lambda result: self.worker.send("finish", result), client.world_time
         )
         client.pre_step.insert(0, self._control)
+        if self._leads:
+            self._simulation = SimulationControl(client, lambda reply: self.worker.send("simulated", reply))
+            client.between_steps.append(self._simulation)
 
     # ------------------------------------------------------------------ in the loop
 
@@ -118,6 +126,9 @@ class RosProcess:
                     truth["time"][0] = physics.time + client.world_time.offset
                     truth["attached"][:] = physics.state.bunch_attached
                     truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
+                    names = {visual.name: i for i, visual in enumerate(physics.rigid.visuals())}
+                    boxes = [names[f"box/{i}"] for i in range(len(self._model.box_size))]
+                    truth["box_q"][:] = physics.rigid.visual_q()[boxes]
 
     def _wake(self) -> None:
         channel = self.worker.current().shared
@@ -133,6 +144,8 @@ class RosProcess:
         """Take a message of the process; in a thread."""
         if kind == "commands":
             self._commands.extend(value)
+        elif kind == "simulation" and self._simulation is not None:
+            self._simulation.put(value)
         elif kind == "statistics":
             self._sent, self._dropped = value["sent"], value["dropped"]
         elif kind == "restarted":

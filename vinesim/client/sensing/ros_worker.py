@@ -6,7 +6,9 @@ the rate of the topics of every step whatever the sensors do.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import queue
 import time
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -18,6 +20,7 @@ from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import report_ready, serve
+from vinesim.ros.commands.types import SimulationRequest
 from vinesim.ros.names import ros_name
 from vinesim.scene.values import ControllerKind, ControllerSpec
 
@@ -51,6 +54,7 @@ class RosConfig:
     """Poses [pole, 7] m, 1."""
     records: StepRecords
     bunch_count: int
+    box_count: int
     bunch_of_body: np.ndarray
     """[body] -1 for wood."""
     controllers: tuple[ControllerSpec, ...]
@@ -73,7 +77,7 @@ class RosChannel:
         self.truth = SharedSnapshot(
             {
                 "time": ((1,), "f8"), "attached": ((config.bunch_count,), "?"),
-                "bunch_q": ((config.bunch_count, 7), "f4"),
+                "bunch_q": ((config.bunch_count, 7), "f4"), "box_q": ((config.box_count, 7), "f8"),
             },
             context,
         )  # fmt: skip
@@ -99,6 +103,7 @@ class RosWorker:
     def __init__(self, config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
         from vinesim.ros import middleware
         from vinesim.ros.robot_node import RobotNode
+        from vinesim.ros.simulation_node import SimulationNode
 
         middleware.configure(large_messages=False)
         self.config, self.channel, self.pipe = config, channel, pipe
@@ -107,16 +112,22 @@ class RosWorker:
             controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
             bunch_of_body=config.bunch_of_body, base=config.base, clock=config.clock,
         )  # fmt: skip
+        self._requests: queue.SimpleQueue[SimulationRequest] = queue.SimpleQueue()
+        self.simulation = None
+        if config.clock:
+            name = f"{ros_name(config.name)}_simulation"
+            self.simulation = SimulationNode(name, config.namespace, self._requests.put)
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
-        self._attached_names = self._bunch_names
+        self._box_names = tuple(f"box_{i}" for i in range(config.box_count))
+        self._truth_names: tuple[str, ...] = ()
         self._next_statistics = 0.0
 
     def run(self) -> None:
         """Publish until a "stop"."""
         report_ready(self.pipe, NICENESS)
-        with self.node:
+        with self.node, self.simulation or contextlib.nullcontext():
             while self._take_requests():
                 record = self.channel.steps.take(POLL_PERIOD)
                 if record is not None:
@@ -125,6 +136,8 @@ class RosWorker:
                         self.node.publish_robot_state(self.config.records.read(record))
                 if self.channel.truth.wait(0.0):
                     self._publish_truth()
+                while not self._requests.empty():
+                    self.pipe.send(("simulation", self._requests.get()))
                 if commands := self.node.commands():
                     self.pipe.send(("commands", commands))
                 self._report()
@@ -139,16 +152,18 @@ class RosWorker:
                 self.node.publish_diagnostics(*value)
             elif kind == "finish":
                 self.node.finish_goal(value)
+            elif kind == "simulated" and self.simulation is not None:
+                self.simulation.answer(value)
         return True
 
     def _publish_truth(self) -> None:
-        """True poses of the bunches that hang on their plants."""
+        """True poses of the boxes, and of the bunches that hang on their plants."""
         with self.channel.truth.reading() as truth:
             now, attached = float(truth["time"][0]), np.flatnonzero(truth["attached"])
-            poses = truth["bunch_q"][attached].astype(float)
-        if len(attached) != len(self._attached_names):
-            self._attached_names = tuple(self._bunch_names[i] for i in attached)
-        self.node.publish_environment(now, self._attached_names, poses)
+            poses = np.concatenate([truth["box_q"], truth["bunch_q"][attached]])
+        if len(poses) != len(self._truth_names):
+            self._truth_names = (*self._box_names, *(self._bunch_names[i] for i in attached))
+        self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:
         """Tell the client what is subscribed to, and now and then what was sent."""

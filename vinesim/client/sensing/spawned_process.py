@@ -22,7 +22,7 @@ from typing import Any
 
 from vinesim import allocator
 
-ROS_MODULES = ("vinesim.client.sensing.ros_worker", "vinesim.ros.robot_node")
+ROS_MODULES = ("vinesim.client.sensing.ros_worker", "vinesim.ros.robot_node", "vinesim.ros.simulation_node")
 """What a ROS process needs."""
 SENSOR_REHEARSAL = "vinesim.client.sensing.sensor_rehearsal"
 """What a sensor process that stands by does beforehand."""

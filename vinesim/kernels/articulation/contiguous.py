@@ -98,7 +98,11 @@ def contiguous_bodies(s: BodyState):
 def contiguous_forces(s: AppliedForces):
     """The same forces, its arrays contiguous."""
     return AppliedForces(
-        dense_vec3(s.tree_air), dense_vec3(s.tie_anchor), dense_spatial(s.body_load), dense_spatial(s.body_wrench)
+        dense_vec3(s.tree_air),
+        dense_vec3(s.tie_anchor),
+        dense_vec3(s.tie_anchor_velocity),
+        dense_spatial(s.body_load),
+        dense_spatial(s.body_wrench),
     )
 
 

@@ -13,12 +13,9 @@ AIR_DENSITY = wp.constant(1.2)
 @wp.func
 def tension_stiffness(lever: wp.vec3, force: wp.vec3):
     """Stiffness [N m/rad] against turning that a steady force lends to a lever it draws out; none if it pushes."""
-    along_lever = wp.dot(lever, force)
-    stiffness = wp.mat33()
-    if along_lever > 0.0:
-        share = along_lever / wp.dot(lever, lever)
-        stiffness = along_lever * wp.identity(n=3, dtype=float) - share * wp.outer(lever, lever)
-    return stiffness
+    along_lever = wp.max(wp.dot(lever, force), 0.0)
+    share = along_lever / wp.max(wp.dot(lever, lever), 1.0e-30)
+    return along_lever * wp.identity(n=3, dtype=float) - share * wp.outer(lever, lever)
 
 
 @wp.func
@@ -41,15 +38,16 @@ def spring_torque(stiffness: wp.vec3, q: wp.quat):
     bending and twist.
     """
     v = wp.vec3(q[0], q[1], q[2])
-    w = q[3]
-    if w < 0.0:
-        v = -v
-        w = -w
+    v = wp.where(q[3] < 0.0, -1.0, 1.0) * v
     square = wp.dot(v, v)
-    excess = 1.0 / 6.0 + square * (3.0 / 40.0 + square * (5.0 / 112.0))  # (s - 1) / square, s = asin(|v|) / |v|
-    if square > 0.02:
-        sine = wp.sqrt(square)
-        excess = (wp.atan2(sine, w) / sine - 1.0) / square
+    # with y = sin(|theta| / 4) and c its cosine, s = asin(y) / (y c); the polynomial is (asin(y) / y - 1) / y^2 up to
+    # y^2 = 1/2, so that s errs by 5e-8 at most
+    cosine = wp.sqrt(0.5 * (1.0 + wp.abs(q[3])))
+    u = square / (2.0 * (1.0 + wp.abs(q[3])))
+    series = -0.050192467868328094 + u * 0.08603843301534653
+    series = 0.02518542669713497 + u * (0.04930693283677101 + u * series)
+    series = 0.16666674613952637 + u * (0.07498478889465332 + u * (0.04510609060525894 + u * series))
+    excess = (series + 1.0 / (1.0 + cosine)) / (4.0 * cosine * cosine * cosine)  # (s - 1) / square
     s = 1.0 + excess * square
     torque = wp.cw_mul(stiffness, 2.0 * s * v)
     return s * torque - excess * wp.dot(v, torque) * v
@@ -63,7 +61,8 @@ def residual_damping(damping: float, stiffness: float, phi: float, dt: float):
 
 @wp.func
 def tie_force(stiffness: float, damping: float, stretch: wp.vec3, speed: wp.vec3, phi: float, dt: float):
-    """Force [N] of a tie whose point moves on at its present speed; ``damping`` is the residual one."""
+    """Force [N] of a tie whose point moves on at its present ``speed`` against the anchor; ``damping`` is the residual
+    one."""
     return -stiffness * (stretch + phi * dt * speed) - damping * speed
 
 
@@ -108,7 +107,7 @@ def tie_and_drag_wrench(
         damping = residual_damping(model.tie_damping[t], stiffness, phi, dt)
         implicit_mass = phi * dt * (phi * dt * stiffness + damping)
         swing = wp.cross(omega, point)
-        force = tie_force(stiffness, damping, stretch, velocity + swing, phi, dt)
+        force = tie_force(stiffness, damping, stretch, velocity + swing - forces.tie_anchor_velocity[t], phi, dt)
         force = force - implicit_mass * (a + wp.cross(alpha, point) + wp.cross(omega, swing))
         wrench += wp.spatial_vector(force, wp.cross(point, force))
     return wrench

@@ -7,6 +7,14 @@ that loads lend to levers are implicit; :mod:`vinesim.kernels.articulation` stat
 
 import warp as wp
 
+from vinesim.kernels.articulation.body_dynamics import (
+    accelerate_body,
+    drag_terms,
+    joint_terms,
+    own_terms,
+    terms_left,
+    tie_terms,
+)
 from vinesim.kernels.articulation.contiguous import (
     contiguous_bodies,
     contiguous_factors,
@@ -16,22 +24,9 @@ from vinesim.kernels.articulation.contiguous import (
     contiguous_prediction,
     contiguous_scratch,
 )
-from vinesim.kernels.articulation.forces import (
-    drag_coefficient,
-    residual_damping,
-    shear_stiffness,
-    spring_torque,
-    tension_stiffness,
-    tie_force,
-)
+from vinesim.kernels.articulation.forces import shear_stiffness
 from vinesim.kernels.articulation.kinematics import body_kinematics, max_joint_rate, parent_kinematics
-from vinesim.kernels.articulation.spatial import (
-    cross_rows,
-    half_rotation,
-    point_mass_inertia,
-    rotated_diagonal,
-    world_inertia,
-)
+from vinesim.kernels.articulation.spatial import cross_rows, inverse_symmetric, symmetric, world_inertia
 from vinesim.kernels.articulation.structs import (
     AppliedForces,
     ArticulationModel,
@@ -48,56 +43,21 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def add_tie(
-    k: int,
-    point: wp.vec3,
-    anchor: wp.vec3,
-    stiffness: float,
-    damping: float,
-    phi: float,
-    dt: float,
-    pose: wp.transform,
-    motion: wp.spatial_vector,
-    scratch_out: Scratch,
-):
-    """Add one tie to body k: spring and damper as a mass at its point, and their force."""
-    omega = wp.spatial_bottom(motion)
-    stretch = wp.transform_get_translation(pose) + point - anchor
-    damper = residual_damping(damping, stiffness, phi, dt)
-    mass = phi * dt * (phi * dt * stiffness + damper)
-    swing = wp.cross(omega, point)
-    force = tie_force(stiffness, damper, stretch, wp.spatial_top(motion) + swing, phi, dt)
-    force = force - mass * wp.cross(omega, swing)
-    scratch_out.J[k] = scratch_out.J[k] + point_mass_inertia(mass, point)
-    scratch_out.H[k] = scratch_out.H[k] + mass * wp.skew(point)
-    scratch_out.M[k] = scratch_out.M[k] + mass * wp.identity(n=3, dtype=float)
-    scratch_out.bias[k] = scratch_out.bias[k] + wp.spatial_vector(-force, -wp.cross(point, force))
-    scratch_out.tension[k] = scratch_out.tension[k] - stiffness * stretch
+def is_conservative(p: SolverParameters, phi: float):
+    """Whether a step must keep energy, and couples bending with twist for it."""
+    return p.geometric_stiffness > 0.0 and phi == 0.5
 
 
 @wp.func
-def add_drag(
-    k: int,
-    coefficient: float,
-    wind: wp.vec3,
-    com: wp.vec3,
-    slip: wp.vec3,
-    ahead: float,
-    reach: float,
-    dt: float,
-    scratch_out: Scratch,
+def add_terms(
+    k: int, J: wp.mat33, H: wp.mat33, M: wp.mat33, bias: wp.spatial_vector, tension: wp.vec3, scratch_out: Scratch
 ):
-    """Add the drag of a relative ``wind`` [m/s] at the centre of mass of body k, as a mass there and its force."""
-    force = coefficient * wind
-    scratch_out.J[k] = (
-        scratch_out.J[k] + point_mass_inertia(dt * coefficient, com) + reach * tension_stiffness(com, force)
-    )
-    scratch_out.H[k] = scratch_out.H[k] + dt * coefficient * wp.skew(com)
-    scratch_out.M[k] = scratch_out.M[k] + dt * coefficient * wp.identity(n=3, dtype=float)
-    scratch_out.bias[k] = scratch_out.bias[k] + wp.spatial_vector(
-        -coefficient * wind, -coefficient * wp.cross(com + ahead * slip, wind)
-    )
-    scratch_out.tension[k] = scratch_out.tension[k] + coefficient * wind
+    """Add what acts on body k besides its inertia and weight, or hangs on it."""
+    scratch_out.J[k] = scratch_out.J[k] + J
+    scratch_out.H[k] = scratch_out.H[k] + H
+    scratch_out.M[k] = scratch_out.M[k] + M
+    scratch_out.bias[k] = scratch_out.bias[k] + bias
+    scratch_out.tension[k] = scratch_out.tension[k] + tension
 
 
 @wp.func
@@ -113,9 +73,8 @@ def assemble_bodies(
     scratch_out: Scratch,
 ):
     """From the root to the tips of one tree: pose and velocity of each body, its own implicit inertia, bias, tension."""
-    ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
-    conservative = p.geometric_stiffness > 0.0 and phi == 0.5
+    conservative = is_conservative(p, phi)
     first = model.tree_first[tree]
     for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
         above, above_motion = parent_kinematics(k, tree, model, joints, bodies_out)
@@ -126,49 +85,36 @@ def assemble_bodies(
         bodies_out.body_qd[k] = motion
         factors_out.axes[k] = axes
         factors_out.lever[k] = lever
-        velocity = wp.spatial_top(motion)
-        omega = wp.spatial_bottom(motion)
-        mass = model.body_mass[k]
         rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
         com = rotation * model.body_com[k]
         inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
-        load = forces.body_load[k]
-        slip = wp.cross(omega, com)  # velocity of the centre of mass against the origin
-        spin_drag = p.dt * wp.max(wp.length_sq(omega) - p.fast_rate * p.fast_rate, 0.0)
-        implicit_scale = 1.0 + p.dt * spin_drag
-        dragged_velocity = velocity + slip
-        weight = mass * p.gravity
-        steady_force = weight
-        if model.body_root[k] >= 0:  # weight does not draw out what falls, and drag does not hold back its fall
-            dragged_velocity = dragged_velocity - joints.joint_xd[model.body_root[k]]
-            weight = implicit_scale * weight
-            steady_force = wp.vec3()
-        force = mass * (wp.cross(omega, slip) + spin_drag * dragged_velocity) - weight
-        moment = (
-            wp.cross(omega, inertia * omega)
-            + wp.cross(com, force)
-            + spin_drag * (inertia * omega)
-            - ahead * wp.cross(slip, steady_force)
+        falls = float(0.0)
+        fall = wp.vec3()
+        if model.body_root[k] >= 0:
+            falls = 1.0
+            fall = joints.joint_xd[model.body_root[k]]
+        contact = wp.spatial_top(forces.body_wrench[k])
+        J, H, M, bias, tension, steady_force = own_terms(
+            p, phi, motion, model.body_mass[k], com, inertia, forces.body_load[k], contact, falls, fall
         )
-        scratch_out.bias[k] = wp.spatial_vector(force, moment) - load
-        scratch_out.tension[k] = steady_force + wp.spatial_top(load) + wp.spatial_top(forces.body_wrench[k])
-        scratch_out.J[k] = implicit_scale * (inertia + point_mass_inertia(mass, com)) + reach * tension_stiffness(
-            com, steady_force
-        )
-        scratch_out.H[k] = implicit_scale * mass * wp.skew(com)
-        scratch_out.M[k] = implicit_scale * mass * wp.identity(n=3, dtype=float)
+        scratch_out.J[k] = J
+        scratch_out.H[k] = H
+        scratch_out.M[k] = M
+        scratch_out.bias[k] = bias
+        scratch_out.tension[k] = tension
         if conservative:
             scratch_out.J[k] = scratch_out.J[k] + reach * shear_stiffness(com, steady_force)
         area = model.body_drag[k]
         if area > 0.0:
-            wind = forces.tree_air[tree] - velocity - slip
-            add_drag(k, drag_coefficient(area, wind), wind, com, slip, ahead, reach, p.dt, scratch_out)
+            J, H, M, bias, tension = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
+            add_terms(k, J, H, M, bias, tension, scratch_out)
         ties = model.tie_span[k]
         for t in range(ties[0], ties[1]):
-            add_tie(
-                k, rotation * model.tie_point[t], forces.tie_anchor[t], model.tie_stiffness[t], model.tie_damping[t],
-                phi, p.dt, pose, motion, scratch_out,
+            J, H, M, bias, tension = tie_terms(
+                p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+                forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
             )  # fmt: skip
+            add_terms(k, J, H, M, bias, tension, scratch_out)
 
 
 @wp.func
@@ -204,50 +150,6 @@ def couple_bending_and_twist(
 
 
 @wp.func
-def add_to_parent(
-    k: int,
-    parent: int,
-    ahead: float,
-    reach: float,
-    turning: wp.vec3,
-    metric: wp.mat33,
-    lever: wp.vec3,
-    J: wp.mat33,
-    H: wp.mat33,
-    M: wp.mat33,
-    bias: wp.spatial_vector,
-    DJ: wp.mat33,
-    DH: wp.mat33,
-    Du: wp.vec3,
-    scratch_out: Scratch,
-):
-    """Add what is left of a subtree's inertia and bias, its joint eliminated, to its parent."""
-    J_left = metric * DJ  # = J - J D J without the cancellation; the same for H
-    H_left = metric * DH
-    M_left = M - wp.transpose(H) * DH
-    centripetal = wp.cross(turning, wp.cross(turning, lever))
-    force = wp.spatial_top(bias) + wp.transpose(H) * Du + M_left * centripetal
-    moment = wp.spatial_bottom(bias) + J * Du + H_left * centripetal + wp.cross(lever, force)
-    tension = scratch_out.tension[k]
-    scratch_out.tension[parent] = scratch_out.tension[parent] + tension
-    M_arm = wp.transpose(cross_rows(M_left, lever))
-    H_arm = cross_rows(H_left, lever)
-    scratch_out.J[parent] = (
-        scratch_out.J[parent]
-        + reach * tension_stiffness(lever, tension)
-        + J_left
-        + cross_rows(M_arm, lever)
-        - H_arm
-        - wp.transpose(H_arm)
-    )
-    scratch_out.H[parent] = scratch_out.H[parent] + (H_left - M_arm)
-    scratch_out.M[parent] = scratch_out.M[parent] + M_left
-    scratch_out.bias[parent] = scratch_out.bias[parent] + wp.spatial_vector(
-        force, moment - ahead * wp.cross(wp.cross(turning, lever), tension)
-    )
-
-
-@wp.func
 def eliminate_joints(
     p: SolverParameters,
     model: ArticulationModel,
@@ -259,10 +161,9 @@ def eliminate_joints(
     scratch_out: Scratch,
 ):
     """From the tips to the root of one tree: factor each joint's implicit inertia and hand the rest to the parent."""
-    dt = p.dt
-    ahead = p.geometric_stiffness * (1.0 - phi) * dt
-    reach = p.geometric_stiffness * phi * phi * dt * dt
-    conservative = p.geometric_stiffness > 0.0 and phi == 0.5
+    ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
+    reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
+    conservative = is_conservative(p, phi)
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
     for i in range(size):
@@ -271,29 +172,23 @@ def eliminate_joints(
         turning = wp.vec3()
         if parent >= 0:
             turning = wp.spatial_bottom(bodies.body_qd[parent])
-        half = half_rotation(joints.joint_q[k])
-        frame = wp.quat_to_matrix(factors_out.axes[k] * half)
-        stiffness = model.joint_stiffness[k]
-        artificial = (2.0 * phi - 1.0) * dt  # [s] the scheme damps as if beta were larger by this
-        damping = wp.max(model.joint_damping[k] - artificial * stiffness, wp.vec3())
-        metric = rotated_diagonal(frame, phi * dt * (phi * dt * stiffness + damping))
-        rate = wp.quat_rotate_inv(half, joints.joint_qd[k])
-        torque = spring_torque(stiffness, joints.joint_q[k])
-        spring = torque + wp.cw_mul(phi * dt * stiffness + damping, rate)
-        bias = scratch_out.bias[k]
-        J = scratch_out.J[k]
-        H = scratch_out.H[k]
-        M = scratch_out.M[k]
-        # the metric acts on the rate as the joint frame sees it, hence turning x omega = turning x (joint rate)
         omega = wp.spatial_bottom(bodies.body_qd[k])
-        u = metric * wp.cross(turning, omega) - frame * spring - wp.spatial_bottom(bias)
+        metric, drive, torque = joint_terms(
+            p.dt, phi, factors_out.axes[k], joints.joint_q[k], joints.joint_qd[k], model.joint_stiffness[k],
+            model.joint_damping[k], turning, omega,
+        )  # fmt: skip
+        bias = scratch_out.bias[k]
+        J = symmetric(scratch_out.J[k])
+        H = scratch_out.H[k]
+        M = symmetric(scratch_out.M[k])
+        u = drive - wp.spatial_bottom(bias)
         if conservative:
             turns = turning + omega
-            u = u - 0.5 * ahead * wp.cross(turns, frame * torque)
-        D = wp.inverse(J + metric)
+            u = u - 0.5 * ahead * wp.cross(turns, torque)
+        D = inverse_symmetric(J + metric)
         DJ = D * J
         if conservative and parent >= 0:
-            DJ = DJ - cross_rows(D, 0.5 * reach * (frame * torque))
+            DJ = DJ - cross_rows(D, 0.5 * reach * torque)
         DH = D * H
         factors_out.D[k] = D
         factors_out.DJ[k] = DJ
@@ -302,11 +197,16 @@ def eliminate_joints(
         scratch_out.Du[k] = Du
         if parent >= 0:
             lever = factors_out.lever[k]
-            add_to_parent(k, parent, ahead, reach, turning, metric, lever, J, H, M, bias, DJ, DH, Du, scratch_out)
+            tension = scratch_out.tension[k]
+            J_left, H_left, M_left, bias_left = terms_left(
+                p, phi, turning, metric, lever, J, H, M, bias, tension, DJ, DH, Du
+            )
+            add_terms(parent, J_left, H_left, M_left, bias_left, tension, scratch_out)
             if conservative:
-                moment = 0.5 * reach * (frame * torque)
                 centripetal = wp.cross(turning, wp.cross(turning, lever))
-                couple_bending_and_twist(k, parent, reach, moment, centripetal, lever, DJ, DH, scratch_out)
+                couple_bending_and_twist(
+                    k, parent, reach, 0.5 * reach * torque, centripetal, lever, DJ, DH, scratch_out
+                )
         else:
             factors_out.root_inverse_mass[k] = wp.mat33()
             if model.body_root[k] >= 0:
@@ -341,18 +241,44 @@ def accelerate_bodies(
             above = wp.spatial_vector(falling, wp.vec3())
             prediction_out.joint_xd_free[k] = joints.joint_xd[k] + dt * falling
             motion = wp.spatial_vector(prediction_out.joint_xd_free[k], wp.vec3())
-        lever = factors.lever[k]
-        alpha = wp.spatial_bottom(above)
-        a = wp.spatial_top(above) + wp.cross(alpha, lever) + wp.cross(turning, wp.cross(turning, lever))
-        relative = scratch.Du[k] - factors.DJ[k] * alpha - factors.DH[k] * a
-        prediction_out.body_acceleration[k] = wp.spatial_vector(a, alpha + relative)
-        swing = wp.spatial_bottom(bodies.body_qd[k]) - turning
-        gain = dt * (relative - wp.cross(turning, swing))
-        prediction_out.joint_qd_free[k] = joints.joint_qd[k] + wp.quat_rotate_inv(factors.axes[k], gain)
-        omega = wp.spatial_bottom(motion)
-        prediction_out.body_qd_free[k] = wp.spatial_vector(
-            wp.spatial_top(motion) + wp.cross(omega, lever), omega + swing + gain
-        )
+        acceleration, rate, velocity = accelerate_body(
+            dt, above, motion, turning, wp.spatial_bottom(bodies.body_qd[k]), factors.lever[k], factors.axes[k],
+            joints.joint_qd[k], factors.DJ[k], factors.DH[k], scratch.Du[k],
+        )  # fmt: skip
+        prediction_out.body_acceleration[k] = acceleration
+        prediction_out.joint_qd_free[k] = rate
+        prediction_out.body_qd_free[k] = velocity
+
+
+@wp.func
+def chosen_phi(
+    p: SolverParameters, model: ArticulationModel, joints: JointState, tree: int, asked: float, euler_steps: int
+):
+    """phi of this step of a tree: as ``asked``, but 1 while a joint is fast or ``euler_steps`` are left."""
+    fastest = max_joint_rate(joints.joint_qd, model.tree_first[tree], model.tree_moving[tree], model.pitch)
+    phi = asked
+    if fastest > p.fast_rate or euler_steps > 0:
+        phi = 1.0
+    return phi
+
+
+@wp.func
+def predict_tree(
+    p: SolverParameters,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    joints: JointState,
+    tree: int,
+    phi: float,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """The three passes over one tree."""
+    assemble_bodies(p, model, forces, joints, tree, phi, bodies_out, factors_out, scratch_out)
+    eliminate_joints(p, model, joints, bodies_out, tree, phi, factors_out, scratch_out)
+    accelerate_bodies(p.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)
 
 
 @wp.kernel
@@ -386,19 +312,11 @@ def predict(
     """
     trees_model = contiguous_model(model)
     state = contiguous_joints(joints)
-    bodies = contiguous_bodies(bodies_out)
-    factors = contiguous_factors(factors_out)
-    scratch = contiguous_scratch(scratch_out)
     tree = trees[wp.tid()]
-    step = substep_parameters(p, tree_steps[tree])
-    phi = tree_phi[tree]
-    first = trees_model.tree_first[tree]
-    fastest = max_joint_rate(state.joint_qd, first, trees_model.tree_moving[tree], trees_model.pitch)
-    if fastest > p.fast_rate or tree_euler_steps[tree] > 0:
-        phi = 1.0
+    phi = chosen_phi(p, trees_model, state, tree, tree_phi[tree], tree_euler_steps[tree])
     tree_phi_out[tree] = phi
-    assemble_bodies(step, trees_model, contiguous_forces(forces), state, tree, phi, bodies, factors, scratch)
-    eliminate_joints(step, trees_model, state, bodies, tree, phi, factors, scratch)
-    accelerate_bodies(
-        step.dt, trees_model, state, bodies, factors, scratch, tree, contiguous_prediction(prediction_out)
-    )
+    predict_tree(
+        substep_parameters(p, tree_steps[tree]), trees_model, contiguous_forces(forces), state, tree, phi,
+        contiguous_bodies(bodies_out), contiguous_factors(factors_out), contiguous_scratch(scratch_out),
+        contiguous_prediction(prediction_out),
+    )  # fmt: skip

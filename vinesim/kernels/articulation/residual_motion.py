@@ -3,7 +3,8 @@
 The displacement to that pose follows from one step of the articulated-body algorithm that starts at zero velocity, has no
 damping and is so long that springs outweigh inertia: it solves (M + (T/2)^2 K) a = u for the generalized force u that
 is not in balance, and (T/2)^2 a is K^-1 u, the quasi-static displacement. K is the tangent stiffness at the present
-pose, loads and ties included. Where K is not positive definite the pose is no stable equilibrium, and the tree no nearer
+pose, loads and ties included; a tie to a wire is as soft as it is when the wire's awake trees all move as one: no
+tree of the wire is then further from rest than it would be alone. Where K is not positive definite the pose is no stable equilibrium, and the tree no nearer
 to rest than anywhere else.
 """
 
@@ -53,13 +54,25 @@ def largest_displacement(linear: wp.vec3, angular: wp.vec3, arm: wp.vec3, so_far
     return most
 
 
+@wp.func
+def soften_tie(k: int, point: wp.vec3, axis: wp.vec3, mass: float, scratch_out: Scratch):
+    """Take ``mass`` off at ``point`` of body k, across ``axis``: by so much less does a tie hold whose wire gives."""
+    across = mass * (wp.identity(n=3, dtype=float) - wp.outer(axis, axis))
+    arm = wp.skew(point)
+    scratch_out.J[k] = scratch_out.J[k] + arm * across * arm
+    scratch_out.H[k] = scratch_out.H[k] - arm * across
+    scratch_out.M[k] = scratch_out.M[k] - across
+
+
 @wp.kernel
 def residual_motion(
     # model
     p: SolverParameters,
     model: ArticulationModel,
     body_length: wp.array(dtype=float),
+    tie_axis: wp.array(dtype=wp.vec3),
     # in
+    tie_softening: wp.array(dtype=float),
     trees: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     joints: JointState,
@@ -80,8 +93,8 @@ def residual_motion(
     Contacts count as forces that stay as they were in the last step. What a floating component does as a whole is in
     its speed, not in its distance: it may rest anywhere.
 
-    p: with :data:`REST_STEP` as its step. model: without joint damping. body_length: [body] m. trees: [thread] which
-    tree. forces: with the contact wrenches of the last step. joints: at its end; joints_still: the same without
+    p: with :data:`REST_STEP` as its step. model: without joint damping. body_length: [body] m. tie_axis, tie_softening:
+    [tie] see :class:`vinesim.physics.plants.ties.TieTable`. trees: [thread] which tree. forces: with the contact wrenches of the last step. joints: at its end; joints_still: the same without
     rates. forces_static: with ``static_load_out`` as the load and no contact wrenches. prediction_out: its
     ``joint_qd_free`` times T / 4 is the displacement of each joint. speed_out, distance_out: [tree] m/s, m.
     is_free_out: [tree] whether nothing touches it and none of it floats, so that all of its displacement is known. All
@@ -108,6 +121,12 @@ def residual_motion(
     speed_out[tree] = speed
 
     assemble_bodies(p, model, forces_static, joints_still, tree, 0.5, bodies_out, factors_out, scratch_out)
+    for k in range(first, end, model.pitch):
+        ties = model.tie_span[k]
+        for t in range(ties[0], ties[1]):
+            if tie_softening[t] > 0.0:
+                point = wp.quat_rotate(wp.transform_get_rotation(bodies_out.body_q[k]), model.tie_point[t])
+                soften_tie(k, point, tie_axis[t], 0.25 * p.dt * p.dt * tie_softening[t], scratch_out)
     eliminate_joints(p, model, joints_still, bodies_out, tree, 0.5, factors_out, scratch_out)
     accelerate_bodies(p.dt, model, joints_still, bodies_out, factors_out, scratch_out, tree, prediction_out)
     distance = float(0.0)

@@ -1,4 +1,8 @@
-"""Rotations and inertias: exponential map, rotated tensors, point masses."""
+"""Rotations and inertias: exponential map, rotated tensors, point masses.
+
+Functions of a prediction have no branches: :mod:`vinesim.kernels.articulation.eight_trees` calls them in loops that LLVM
+is to make vectors of.
+"""
 
 import warp as wp
 
@@ -52,10 +56,28 @@ def point_mass_inertia(mass: float, lever: wp.vec3):
 @wp.func
 def world_inertia(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
     """Inertia in world axes from its diagonal and its entries yz, zx, xy in the body's axes."""
-    inertia = rotated_diagonal(rotation, moments)
-    if wp.length_sq(products) > 0.0:
-        mixed = wp.mat33(
-            0.0, products[2], products[1], products[2], 0.0, products[0], products[1], products[0], 0.0
-        )  # fmt: skip
-        inertia = inertia + rotation * mixed * wp.transpose(rotation)
-    return inertia
+    inertia = wp.mat33(
+        moments[0], products[2], products[1], products[2], moments[1], products[0], products[1], products[0], moments[2]
+    )  # fmt: skip
+    return rotation * inertia * wp.transpose(rotation)
+
+
+@wp.func
+def symmetric(m: wp.mat33):
+    """The matrix with the upper triangle of m in its lower one too, so that no rounding sets them apart."""
+    return wp.mat33(m[0, 0], m[0, 1], m[0, 2], m[0, 1], m[1, 1], m[1, 2], m[0, 2], m[1, 2], m[2, 2])
+
+
+@wp.func
+def inverse_symmetric(m: wp.mat33):
+    """Inverse of a symmetric matrix by its cofactors, of which only the upper triangle is read; 0 if it is singular."""
+    xx = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
+    xy = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
+    xz = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
+    yy = m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2]
+    yz = m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2]
+    zz = m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1]
+    determinant = m[0, 0] * xx + m[0, 1] * xy + m[0, 2] * xz
+    is_singular = determinant == 0.0
+    scale = wp.where(is_singular, 0.0, 1.0) / wp.where(is_singular, 1.0, determinant)
+    return scale * wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)

@@ -94,6 +94,7 @@ class AppliedForces:
 
     tree_air: wp.array(dtype=wp.vec3)  # [m/s] velocity of the air
     tie_anchor: wp.array(dtype=wp.vec3)  # [m] where ties are held
+    tie_anchor_velocity: wp.array(dtype=wp.vec3)  # [m/s] how fast that place moves
     body_load: wp.array(dtype=wp.spatial_vector)  # [N, N m] lasting, at the origin
     body_wrench: wp.array(dtype=wp.spatial_vector)  # [N, N m] of contacts, at the origin
 

@@ -60,6 +60,29 @@ def solve_rigid_row(
         response_out[row, i] = value
 
 
+@wp.func_native("""
+    const float* from = body_response.data + source;
+    double* to = response.data + target;
+    for (int i = 0; i < count; ++i) {
+        const double change = factor * from[i];
+        to[i] += change;
+    }
+""")
+def add_body_response(
+    response: wp.array2d(dtype=wp.float64),
+    target: int,
+    body_response: wp.array4d(dtype=float),
+    source: int,
+    count: int,
+    factor: wp.float64,
+):
+    """Add ``factor`` times ``count`` numbers of the body response, from ``source`` on, to a response from ``target`` on.
+
+    Both contiguous. Native, as Warp's loops over arrays in structs are not vectorised.
+    """
+    ...
+
+
 @wp.func
 def respond_within_tree(
     row: int,
@@ -70,14 +93,15 @@ def respond_within_tree(
     body_response: wp.array4d(dtype=float),
     response_out: wp.array2d(dtype=wp.float64),
 ):
-    """Add to a row's response in one tree what its six entries from ``column`` on, of the body in ``slot``, give."""
-    start = touched.tree_start[slot]
-    for b in range(start, touched.tree_end[slot]):
-        for k in range(6):
-            change = response_out[row, 6 * (b - start) + k]
-            for j in range(6):
-                change = change + plant_jacobian[row, column + j] * wp.float64(body_response[b, k, slot - start, j])
-            response_out[row, 6 * (b - start) + k] = change
+    """Add to a row's response in one tree what its six entries from ``column`` on, of the body in ``slot``, give.
+
+    The body response is symmetric: what an impulse on one body gives all is read along its row, not down its column.
+    """
+    count = 6 * (touched.tree_end[slot] - touched.tree_start[slot])
+    for j in range(6):
+        source = (6 * slot + j) * 6 * body_response.shape[2]
+        factor = plant_jacobian[row, column + j]
+        add_body_response(response_out, row * response_out.shape[1], body_response, source, count, factor)
 
 
 @wp.kernel

@@ -16,6 +16,7 @@ CAPSULE = wp.constant(3)
 ELLIPSOID = wp.constant(4)
 CYLINDER = wp.constant(5)
 BOX = wp.constant(6)
+MESH = wp.constant(7)
 
 MIN_COPLANAR_COSINE = wp.constant(wp.float64(0.999))
 """[1] Least cosine between the normals at both ends of the part of a segment that lies along one face. TUNED."""

@@ -15,11 +15,13 @@ from vinesim.kernels.contact.body_motion import (
 from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import (
+    MESH,
     has_flat_or_straight_side,
     interval_along_face,
     segment_primitive_distance,
     vec5d,
 )
+from vinesim.kernels.contact.hull_distance import interval_along_hull, segment_hull_distance
 from vinesim.kernels.contact.structs import (
     AABB_BLOCK,
     Aabbs,
@@ -28,6 +30,7 @@ from vinesim.kernels.contact.structs import (
     CapsuleStates,
     Geoms,
     GeomStates,
+    Hulls,
     Parameters,
     PlantBodies,
     RigidBodies,
@@ -35,6 +38,9 @@ from vinesim.kernels.contact.structs import (
 )
 
 wp.set_module_options({"enable_backward": False})
+
+FAR = wp.constant(wp.float64(1.0e30))
+"""[m] Reach of a search without end."""
 
 
 @wp.struct
@@ -84,6 +90,34 @@ def list_near_geoms(
 
 
 @wp.func
+def segment_geom_distance(
+    geoms: Geoms,
+    hulls: Hulls,
+    g: int,
+    rotation: wp.mat33d,
+    center: wp.vec3d,
+    a: wp.vec3d,
+    b: wp.vec3d,
+    reach: wp.float64,
+):
+    """World normal (0 to 2) and distance (3) [m] from a geom to the segment a b, and where on it (4, 0 to 1).
+
+    Beyond ``reach`` [m] the distance from a hull is a lower bound.
+    """
+    found = vec5d()
+    if geoms.kind[g] == MESH:
+        to_local = wp.transpose(rotation)
+        found = segment_hull_distance(hulls, geoms.hull[g], to_local * (a - center), to_local * (b - center), reach)
+        normal = rotation * wp.vec3d(found[0], found[1], found[2])
+        found[0] = normal[0]
+        found[1] = normal[1]
+        found[2] = normal[2]
+    else:
+        found = segment_primitive_distance(geoms.kind[g], geoms.size[g], rotation, center, a, b)
+    return found
+
+
+@wp.func
 def follow_contact(
     parameters: Parameters,
     candidate: Candidate,
@@ -96,6 +130,7 @@ def follow_contact(
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     geoms: Geoms,
+    hulls: Hulls,
     geom_states: GeomStates,
 ):
     """The candidate with normal, point and gap of the whole step: both sides go on as they move now.
@@ -119,13 +154,15 @@ def follow_contact(
     if pair.ends == 2:
         end_a = end_a + t * (end_b - end_a)
         end_b = end_a
-    later = segment_primitive_distance(
-        geoms.kind[g],
-        geoms.size[g],
+    later = segment_geom_distance(
+        geoms,
+        hulls,
+        g,
         rotate_by_small_angle(dt * geom_states.angular_velocity[g], pair.rotation),
         geom_states.center[g] + dt * geom_states.velocity[g],
         end_a,
         end_b,
+        FAR,
     )
     end_normal = wp.vec3d(later[0], later[1], later[2])
     curvature = wp.float64(0.0)
@@ -152,6 +189,7 @@ def rigid_candidate(
     capsules: Capsules,
     capsule_states: CapsuleStates,
     geoms: Geoms,
+    hulls: Hulls,
     geom_states: GeomStates,
 ):
     """The contact of a pair at ``t`` (0 to 1) on the capsule; ``nearest``: see :func:`segment_primitive_distance`."""
@@ -190,21 +228,34 @@ def rigid_candidate(
     if candidate.exists:
         candidate = follow_contact(
             parameters, candidate, pair, nearest, t, approach, relative, velocity, bodies, capsule_states, geoms,
-            geom_states,
+            hulls, geom_states,
         )  # fmt: skip
     return candidate
 
 
 @wp.func
 def contact_ends(
-    parameters: Parameters, kind: int, size: wp.vec3d, rotation: wp.mat33d, center: wp.vec3d, a: wp.vec3d, b: wp.vec3d,
-    t: wp.float64,
-):  # fmt: skip
-    """Ends (0 to 1) of the part of the segment a b that lies along a face of a geom; ``t`` twice if none does."""
-    ends = wp.vec2d(t, t)
-    if has_flat_or_straight_side(kind):
-        to_local = wp.transpose(rotation)
-        ends = interval_along_face(kind, size, to_local * (a - center), to_local * (b - center), t, parameters.margin)
+    parameters: Parameters,
+    geoms: Geoms,
+    hulls: Hulls,
+    g: int,
+    rotation: wp.mat33d,
+    center: wp.vec3d,
+    a: wp.vec3d,
+    b: wp.vec3d,
+    nearest: vec5d,
+):
+    """Ends (0 to 1) of the part of the segment a b that lies along a face of a geom; the same one twice if none does."""
+    ends = wp.vec2d(nearest[4], nearest[4])
+    to_local = wp.transpose(rotation)
+    local_a = to_local * (a - center)
+    local_b = to_local * (b - center)
+    if geoms.kind[g] == MESH:
+        normal = to_local * wp.vec3d(nearest[0], nearest[1], nearest[2])
+        local = vec5d(normal[0], normal[1], normal[2], nearest[3], nearest[4])
+        ends = interval_along_hull(hulls, geoms.hull[g], local_a, local_b, local, parameters.margin)
+    elif has_flat_or_straight_side(geoms.kind[g]):
+        ends = interval_along_face(geoms.kind[g], geoms.size[g], local_a, local_b, nearest[4], parameters.margin)
     return ends
 
 
@@ -230,6 +281,7 @@ def find_rigid_contacts(
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     rigid: RigidBodies,
+    hulls: Hulls,
     geom_states: GeomStates,
     static_blocks: Aabbs,
     # out
@@ -271,11 +323,9 @@ def find_rigid_contacts(
                 )
                 if overlap and wp.dot(between, between) < limit * limit:
                     rotation = rigid.xmat[geoms.id[g]]
-                    nearest = segment_primitive_distance(geoms.kind[g], geoms.size[g], rotation, center, a, b)
+                    nearest = segment_geom_distance(geoms, hulls, g, rotation, center, a, b, radius + margin)
                     if nearest[3] - radius < margin:
-                        ends = contact_ends(
-                            parameters, geoms.kind[g], geoms.size[g], rotation, center, a, b, nearest[4]
-                        )
+                        ends = contact_ends(parameters, geoms, hulls, g, rotation, center, a, b, nearest)
                         pair = Pair()
                         pair.capsule = s
                         pair.body = capsules.body[s]
@@ -285,12 +335,10 @@ def find_rigid_contacts(
                         for end in range(pair.ends):
                             if pair.ends == 2:
                                 p = a + ends[end] * (b - a)
-                                nearest = segment_primitive_distance(
-                                    geoms.kind[g], geoms.size[g], rotation, center, p, p
-                                )
+                                nearest = segment_geom_distance(geoms, hulls, g, rotation, center, p, p, FAR)
                             candidate = rigid_candidate(
                                 parameters, pair, nearest, ends[end], g >= geoms.count[0], bodies, capsules, capsule_states,
-                                geoms, geom_states,
+                                geoms, hulls, geom_states,
                             )  # fmt: skip
                             if candidate.exists:
                                 is_impact = is_impact or candidate.is_impact

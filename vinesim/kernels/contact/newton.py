@@ -58,6 +58,22 @@ def write_block(
                     scratch_out.columns[row, 1 + k] = -rows.rigid_jacobian[row, dof]
 
 
+@wp.func_native("""
+    const double* from = a.data + source;
+    double* to = a.data + target;
+    for (int i = 0; i < count; ++i) {
+        const double change = factor * from[i];
+        to[i] -= change;
+    }
+""")
+def subtract_row(a: wp.array(dtype=wp.float64), target: int, source: int, count: int, factor: wp.float64):
+    """Subtract from ``count`` numbers of an array, from ``target`` on, ``factor`` times those from ``source`` on.
+
+    Native, as Warp's loops over arrays in structs are not vectorised.
+    """
+    ...
+
+
 @wp.func
 def solve_block(block: int, columns: int, islands: Islands, scratch_out: SolverScratch):
     """Gaussian elimination without pivoting: B is positive definite, and sliding rows change that little."""
@@ -73,8 +89,7 @@ def solve_block(block: int, columns: int, islands: Islands, scratch_out: SolverS
             factor = scratch_out.matrix[at + k] * scale
             if factor != wp.float64(0.0):
                 row = 3 * islands.contact[start + m // 3] + m % 3
-                for c in range(k + 1, size):
-                    scratch_out.matrix[at + c] = scratch_out.matrix[at + c] - factor * scratch_out.matrix[pivot_at + c]
+                subtract_row(scratch_out.matrix, at + k + 1, pivot_at + k + 1, size - k - 1, factor)
                 for c in range(columns):
                     scratch_out.columns[row, c] = (
                         scratch_out.columns[row, c] - factor * scratch_out.columns[pivot_row, c]

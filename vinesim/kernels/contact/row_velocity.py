@@ -21,7 +21,8 @@ def velocity_along(
     first = islands.block_start[block]
     last = islands.block_start[block + 1]
     at = islands.matrix_start[block] + (3 * (contacts.place[c] - first) + row % 3) * 3 * (last - first)
-    for m in range(first, last):
+    m = int(first)
+    while m < last:
         i = 3 * islands.contact[m]
         value = (
             value
@@ -30,6 +31,7 @@ def velocity_along(
             + rows.delassus[at + 2] * rows.impulse[i + 2]
         )
         at = at + 3
+        m = m + 1
     if contacts.other[c] >= 0:
         dof = geoms.dof[contacts.other[c]]
         while dof >= 0:

@@ -166,7 +166,9 @@ class Geoms:
     dof: wp.array(dtype=wp.int32)
     """last degree of freedom that moves it, -1 for none."""
     kind: wp.array(dtype=wp.int32)
-    """mjtGeom."""
+    """mjtGeom; a mesh is its convex hull."""
+    hull: wp.array(dtype=wp.int32)
+    """of a mesh, -1 for other kinds."""
     size: wp.array(dtype=wp.vec3d)
     """geom_size of MuJoCo."""
     center: wp.array(dtype=wp.vec3d)
@@ -178,6 +180,26 @@ class Geoms:
     friction: wp.array(dtype=wp.float64)
     is_remote: wp.array(dtype=wp.bool)
     """whether it belongs to the copy of another client's robot or person: that touches remote trees only."""
+
+
+@wp.struct
+class Hulls:
+    """Convex hulls of meshes, each in the frame of its geoms, about their centre."""
+
+    first_plane: wp.array(dtype=wp.int32)
+    """[hull + 1]"""
+    first_edge: wp.array(dtype=wp.int32)
+    """[hull + 1]"""
+    plane: wp.array(dtype=wp.vec4d)
+    """[plane] outward normal and distance [m] from the centre."""
+    edge_start: wp.array(dtype=wp.vec3d)
+    """[edge] m"""
+    edge_end: wp.array(dtype=wp.vec3d)
+    """[edge] m"""
+    edge_left: wp.array(dtype=wp.int32)
+    """[edge] plane on one side of it."""
+    edge_right: wp.array(dtype=wp.int32)
+    """[edge] plane on the other side."""
 
 
 @wp.struct

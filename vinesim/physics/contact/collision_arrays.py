@@ -97,6 +97,7 @@ class RigidArrays:
         self.actors = SharedArrays.zeros(
             structs.Actors, self.capacity, start=np.zeros(self.capacity + 1, np.int32), count=np.zeros(1, np.int32)
         )
+        self.hulls = rigid.hulls
         self._list(rigid, remote_actors)
         self.dof_names = rigid.dof_names
         velocity, correction, before = rigid.velocity_free, np.zeros(world.nv), np.zeros(world.nv)

@@ -8,6 +8,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from vinesim.physics.contact.hulls import hull_numbers
+
 _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))  # NumPy would compare with MuJoCo's own type entry by entry
     for name in ("PLANE", "SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
@@ -25,9 +27,12 @@ class RigidGeoms:
     body: np.ndarray
     """[geom] MuJoCo body."""
     kind: np.ndarray
-    """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box; a mesh stands as its box."""
+    """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh; a flat mesh stands as
+    its box."""
+    hull: np.ndarray
+    """[geom] number of its convex hull in :func:`vinesim.physics.contact.hulls.hull_arrays`; -1 unless it is a mesh."""
     size: np.ndarray
-    """[geom, 3] as MuJoCo writes it for the kind."""
+    """[geom, 3] as MuJoCo writes it for the kind; of a mesh, half edges of its box."""
     half: np.ndarray
     """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`PLANE_HALF_SIZE` and no
     height."""
@@ -72,7 +77,9 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
     last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1)[moved_by]
     body, kind, size = m.geom_bodyid[ids], m.geom_type[ids].copy(), m.geom_size[ids].copy()
     mesh = kind == _MESH
-    kind[mesh], size[mesh] = _BOX, m.geom_aabb[ids][mesh, 3:]
+    size[mesh] = m.geom_aabb[ids][mesh, 3:]
+    hull = hull_numbers(m, ids)
+    kind[mesh & (hull < 0)] = _BOX
     center = np.where(mesh[:, None], m.geom_aabb[ids, :3], 0.0)
     radius = np.where(mesh, np.linalg.norm(size, axis=1), m.geom_rbound[ids])
     half = size.copy()
@@ -86,6 +93,7 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
         id=ids.astype(np.int32),
         body=body.astype(np.int32),
         kind=kind.astype(np.int32),
+        hull=hull,
         size=size,
         half=half,
         center=center,

@@ -212,7 +212,7 @@ class ContactDetection:
         self._find_rigid_contacts = bind_launch(
             narrowphase_rigid.find_rigid_contacts,
             [parameters, self.parameters.max_static_geoms_per_tree, capsules, geoms, order, trees, tree_boxes, bodies,
-             capsule_states, rigid.bodies.struct, geom_states, self._static_blocks.struct],
+             capsule_states, rigid.bodies.struct, rigid.hulls.struct, geom_states, self._static_blocks.struct],
             [candidates],
             **by_tree,
         )  # fmt: skip

@@ -32,6 +32,7 @@ from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parame
 from vinesim.physics.plants.remote_pose import blend_towards
 from vinesim.physics.plants.step_runner import StepRunner
 from vinesim.physics.plants.ties import TieTable
+from vinesim.physics.plants.topology import Topologies
 from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -97,12 +98,11 @@ class ArticulationSolver:
         """Where arrays live, for NumPy and for kernels."""
         self.tick = 0
         """Integrations so far."""
-        self._ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
+        self.ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
         self._allocate(phi)
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
         self.thread_pool = ThreadPool(threads) if threads > 1 else None
-        """Who shares the work, if there is more than one thread."""
         if self.thread_pool is not None:
             weakref.finalize(self, self.thread_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
@@ -111,7 +111,9 @@ class ArticulationSolver:
         """Kernels on these arrays."""
         self._runner = StepRunner(
             buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
-            tree_rate=self.tree_rate, stepping=self._stepping, floating=self._floating, thread_pool=self.thread_pool,
+            tree_rate=self.tree_rate, stepping=self._stepping, groups=self._groups, floating=self._floating,
+            topologies=Topologies(model, state.body_cut, self.tree_moving), thread_pool=self.thread_pool,
+            whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]]),
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -134,7 +136,7 @@ class ArticulationSolver:
         self.tree_rate = np.zeros(trees, np.float32)
         """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
         self.tree_substeps = np.ones(trees, np.int32)
-        """Into how many substeps the step of each awake tree is divided while nothing touches it [tree]."""
+        """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -165,36 +167,35 @@ class ArticulationSolver:
         self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
         self._last_contact = np.full(trees, -2, np.int64)  # tick of the last contact
         self._loaded_bodies = np.zeros(0, np.int32)
-        self._stepping, self._subset = np.zeros(trees, np.int32), np.zeros(trees, np.int32)
-        self._checked: np.ndarray | None = None
-        """Bodies that are known to be stepping."""
+        self._stepping, self._subset, self._groups = (np.zeros(n, np.int32) for n in (trees, trees, (trees, 2)))
+        self._checked: np.ndarray | None = None  # bodies that are known to be stepping
 
     def _pin_arrays(self) -> None:
         """Move the arrays of solver, ties and state to where the device can reach them."""
-        for owner in (self, self._ties, self.state):
+        for owner in (self, self.ties, self.state):
             for name, value in vars(owner).items():
                 if isinstance(value, np.ndarray):
                     setattr(owner, name, self.buffers.pinned(value))
 
     def kernel_arrays(self) -> dict[Any, dict[str, np.ndarray]]:
         """All arrays that kernels read or write, by element type and name."""
-        model, state, ties = self.model, self.state, self._ties
+        model, state, ties = self.model, self.state, self.ties
         return {
             wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
                        "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
                        "tree_euler_steps": self._euler_steps, "tree_steps": self._steps,
                        "tree_substeps": self.tree_substeps, "floating": self._floating},
             float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
-                    "tie_damping": ties.damping, "tree_phi": self.phi, "phi_used": self.phi_used,
-                    "tree_rate": self.tree_rate},
-            wp.vec2i: {"tie_span": ties.span},
+                    "tie_damping": ties.damping, "tie_softening": ties.softening, "tree_phi": self.phi,
+                    "phi_used": self.phi_used, "tree_rate": self.tree_rate},
+            wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
             wp.bool: {"tree_awake": state.tree_awake},
             wp.vec3: {"body_offset": self._offset, "body_com": self.body_com, "body_inertia": self.body_inertia,
                       "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
                       "joint_damping": self.joint_damping, "tie_point": ties.point, "tie_anchor": ties.anchor,
-                      "tree_air": self.tree_air, "joint_x": state.joint_x, "joint_xd": state.joint_xd,
-                      "joint_qd": state.joint_qd, "joint_xd_free": self.joint_xd_free,
-                      "joint_qd_free": self.joint_qd_free},
+                      "tie_anchor_velocity": ties.anchor_velocity, "tie_axis": ties.axis, "tree_air": self.tree_air,
+                      "joint_x": state.joint_x, "joint_xd": state.joint_xd, "joint_qd": state.joint_qd,
+                      "joint_xd_free": self.joint_xd_free, "joint_qd_free": self.joint_qd_free},
             wp.quat: {"body_rest": self._rest, "joint_q": state.joint_q},
             wp.transform: {"body_q": state.body_q},
             wp.spatial_vector: {"body_qd": state.body_qd, "body_load": self.body_load, "body_wrench": self._wrench,
@@ -449,22 +450,22 @@ class ArticulationSolver:
     @property
     def tie_anchor(self) -> np.ndarray:
         """Where ties are held [tie, 3] m, in the world; move them as you like. See :meth:`add_tie`."""
-        return self._ties.anchor
+        return self.ties.anchor
 
     @property
     def tie_stiffness(self) -> np.ndarray:
         """N/m [tie]; a tie of zero does nothing."""
-        return self._ties.stiffness
+        return self.ties.stiffness
 
     @property
     def tie_damping(self) -> np.ndarray:
         """N s/m [tie]."""
-        return self._ties.damping
+        return self.ties.damping
 
     @property
     def held_bodies(self) -> list[int]:
         """Bodies that ties of :meth:`add_tie` hold."""
-        return self._ties.held_bodies
+        return self.ties.held_bodies
 
     def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
@@ -477,13 +478,13 @@ class ArticulationSolver:
         if body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]:
             raise ValueError(f"body {body} is a berry cluster, which cannot be held; hold its bunch")
         self.forward_kinematics(np.array([tree]))
-        tie = self._ties.add(body, point, self.state.body_q[body].astype(float), stiffness, damping)
+        tie = self.ties.add(body, point, self.state.body_q[body].astype(float), stiffness, damping)
         self.launches.changed = True
         return tie
 
     def remove_tie(self, body: int, tie: int) -> None:
         """Undo a tie of :meth:`add_tie`."""
-        self._ties.remove(body, tie)
+        self.ties.remove(body, tie)
         self.launches.changed = True
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:

@@ -10,11 +10,13 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.articulation import first_mode, structs
+from vinesim.kernels.articulation.eight_trees import predict_groups
 from vinesim.kernels.articulation.floating_components import correct_floating_momentum
 from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.articulation.integration import integrate
 from vinesim.kernels.articulation.joint_wrench import joint_wrench
 from vinesim.kernels.articulation.kinematics import forward_kinematics
+from vinesim.kernels.articulation.lane_records import LANES, RECORD
 from vinesim.kernels.articulation.prediction import predict
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.parameters import PhysicsParameters
@@ -162,6 +164,10 @@ class KernelLaunches:
             )
             for trees, options in (("stepping", partitioned), ("subset", {"index_list": "trees"}))
         )  # fmt: skip
+        self.predict_groups = (
+            None if self.buffers.has_copies else self._record_groups(parameters, joints, scratch, prediction)
+        )
+        """Predicts groups of trees, on a CPU."""
         self.integrate = record(
             integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
             "tree_rate", "tree_euler_steps", joints, **partitioned,
@@ -181,6 +187,23 @@ class KernelLaunches:
             first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
             scratch, fill(s.WrenchScratch), "tree_substeps",
         )  # fmt: skip
+
+    def _record_groups(self, parameters: Any, joints: Any, scratch: Any, prediction: Any) -> Launch:
+        """The prediction of up to eight trees at once, each thread with memory of its own."""
+        size = LANES * RECORD * (self.buffers.max_tree_size + 2)
+        launches = [
+            self.record(
+                predict_groups, parameters, self._model, "groups", "stepping", "tree_phi", "tree_euler_steps",
+                "tree_steps", self._forces, joints, wp.zeros(size, dtype=float, device=self.buffers.device),
+                "phi_used", self._bodies, self._factors, scratch, prediction, index_list="groups",
+            )
+            for _ in range(self._threads)
+        ]  # fmt: skip
+
+        def launch(groups: int, first: int = 0, partition: int = 0) -> None:
+            launches[partition](groups, first)
+
+        return launch
 
     def _record_impact(self, parameters: Any) -> None:
         """An impact within no time: factors of inertia and springs alone, and wrenches that are impulses."""

@@ -62,11 +62,15 @@ class SleepMonitor:
         _, distance, _ = self._equilibrium.residual_motion(asleep)
         self.wake(asleep[distance > CONTACT_SHARE * self.distance])
 
-    def update(self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS) -> np.ndarray:
+    def update(
+        self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS,
+        is_coupled: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
         """After an integration: the trees that have just been put to sleep [k].
 
         ``keep_awake`` [tree] bool: what an actor is near to, holds or owns. ``contact_pairs`` [n, 2]: awake trees that
-        touch each other.
+        touch each other. ``is_coupled`` [tree] bool: awake trees that wires join to others. They are not moved to rest:
+        where that is depends on the others.
         """
         plants, awake = self.plants, self.plants.awake
         self.quiet_steps[awake] += 1
@@ -83,7 +87,8 @@ class SleepMonitor:
         while len(spread := contact_pairs[stays[contact_pairs[:, 0]] != stays[contact_pairs[:, 1]]]):
             stays[spread] = True
         asleep = slow[~stays[slow]]
-        self._equilibrium.move_to_rest(slow[~stays[slow] & is_free])
+        is_alone = is_free if is_coupled is None else is_free & ~is_coupled[slow]
+        self._equilibrium.move_to_rest(slow[~stays[slow] & is_alone])
         plants.put_to_sleep(asleep)
         self._forget(asleep)
         return asleep

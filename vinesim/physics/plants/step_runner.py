@@ -2,7 +2,7 @@
 
 A tree whose first mode is too fast for the step takes substeps instead, of which all others see the sum:
 :mod:`vinesim.kernels.articulation.first_mode` says how many. While contacts act on it, it takes the whole step that
-they were solved for.
+they were solved for; and so does always a tree that is tied to wires, which move once a step.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from vinesim.kernels.articulation.lane_records import LANES
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches
+from vinesim.physics.plants.topology import Topologies, group_starts
 
-MIN_TREES_PER_THREAD = 16
-"""[tree] For fewer awake trees a thread, handing a prediction to other threads costs more than it saves. MEASURED"""
+MIN_GROUPS_PER_THREAD = 4
+"""[group] For fewer a thread, handing a prediction to other threads costs more than it saves. MEASURED"""
 
 MIN_INTEGRATED_TREES_PER_THREAD = 100
 """[tree] The same for an integration, which is twelve times as short. MEASURED"""
@@ -31,7 +33,9 @@ Levels = tuple[int, ...]
 class StepRunner:
     """Runs predictions and integrations of the listed trees.
 
-    The list that the kernels read has the trees of one step first, then the others, those of most substeps first.
+    The list that the kernels read has the trees of one step first, then the others, those of most substeps first. On a
+    CPU those of one topology are neighbours within that order and are predicted in groups of up to eight; on a GPU each
+    tree is a group.
 
     Args:
         buffers: of the solver.
@@ -39,9 +43,12 @@ class StepRunner:
         tree_size: [tree] bodies, by which trees are dealt out.
         tree_substeps: [tree] into how many substeps each tree's step is to be divided.
         tree_steps: [tree] into how many it is divided now, which the kernels read.
+        whole: [tree] bool, trees whose steps are never divided.
         tree_rate: [tree] what the kernels write of each tree's speed.
         stepping: [tree] int32, the list that the kernels read.
+        groups: [tree, 2] int32, groups that the kernels read: first place in the list, number of trees.
         floating: [tree] int32, the floating roots that the kernels read.
+        topologies: of the trees.
         thread_pool: threads that share the work; none for one thread.
     """
 
@@ -53,13 +60,17 @@ class StepRunner:
         tree_size: np.ndarray,
         tree_substeps: np.ndarray,
         tree_steps: np.ndarray,
+        whole: np.ndarray,
         tree_rate: np.ndarray,
         stepping: np.ndarray,
+        groups: np.ndarray,
         floating: np.ndarray,
+        topologies: Topologies,
         thread_pool: ThreadPool | None,
     ) -> None:
         self._buffers, self._launches, self._tree_size, self._list = buffers, launches, tree_size, stepping
         self._substeps, self._steps_of, self._rate, self._floating = tree_substeps, tree_steps, tree_rate, floating
+        self._is_whole = whole
         self._pool, self._threads = thread_pool, 1 if thread_pool is None else thread_pool.size
         self.stepped = np.zeros(0, np.int32)
         """The trees of this step [k], sorted."""
@@ -70,17 +81,23 @@ class StepRunner:
         """Into how many substeps the steps of ``fast`` were divided when the list was put in order [k]."""
         self._graph: wp.Graph | None = None
         self._graph_of: tuple = ()
-        self._whole_ends = [0] * (self._threads + 1)
-        """Thread i works on places ``_whole_ends[i]`` to ``_whole_ends[i + 1]`` of the trees of whole steps."""
-        self.partition_ends = [0] * (self._threads + 1)
-        """The same of all trees."""
+        self._groups, self._topologies = groups, topologies
+        self._starts = np.zeros(1, np.int32)
+        """Place in the list at which each group begins, and the end of the list."""
+        self._whole_groups = 0
+        """Groups of the trees of whole steps: the first ones."""
+        self._predict = launches.predict_groups or launches.predict
+        """Predicts groups."""
+        self._group_ends, self._whole_group_ends, self._whole_ends = ([0] * (self._threads + 1) for _ in range(3))
+        """Thread i works on groups ``_group_ends[i]`` to ``_group_ends[i + 1]``; the same of the groups of whole steps,
+        and of their trees."""
 
         def part(launch: Callable[..., None], ends: list[int], i: int) -> Callable[[], None]:
             return lambda: launch(ends[i + 1] - ends[i], ends[i], i)
 
         self._parts = {
             launch: [part(launch, ends, i) for i in range(self._threads)]
-            for launch, ends in ((launches.predict, self.partition_ends), (launches.integrate, self._whole_ends))
+            for launch, ends in ((self._predict, self._group_ends), (launches.integrate, self._whole_ends))
         }
 
     # ------------------------------------------------------------------ which trees, in which order
@@ -95,19 +112,32 @@ class StepRunner:
         self._list[: len(trees)] = trees
         self._launches.count_substeps(len(trees))
         self._buffers.synchronize()
-        self.fast = trees[self._substeps[trees] > 1]
+        self.fast = trees[(self._substeps[trees] > 1) & ~self._is_whole[trees]]
         self._steps_of[trees] = 1
         self._divided = np.ones(len(self.fast), np.int32)
         self._order()
 
     def _order(self) -> None:
         """List the trees by what ``_steps_of`` says of each, and deal them out to the threads by their bodies."""
-        trees, self._whole, self._levels = _by_substeps(self.stepped, self._steps_of[self.stepped])
+        trees, on_cpu = self.stepped, self._buffers.device.is_cpu
+        topologies = self._topologies.of(trees)
+        if on_cpu:
+            order = np.argsort(topologies, kind="stable")
+            trees, topologies = trees[order], topologies[order]
+        listed, self._whole, self._levels = _by_substeps(np.arange(len(trees)), self._steps_of[trees])
+        trees, topologies = trees[listed], topologies[listed]
         self._list[: len(trees)] = trees
-        for ends, some in ((self.partition_ends, trees), (self._whole_ends, trees[: self._whole])):
-            bodies = np.cumsum(self._tree_size[some])
-            shares = np.arange(self._threads + 1) * (int(bodies[-1]) if len(some) else 0) // self._threads
-            ends[:] = np.searchsorted(bodies, shares, side="right").tolist()
+        in_groups = self._launches.predict_groups is not None
+        self._starts = group_starts(topologies, self._whole) if in_groups else np.arange(len(trees) + 1)
+        counts = np.diff(self._starts)
+        self._groups[: len(counts), 0], self._groups[: len(counts), 1] = self._starts[:-1], counts
+        self._whole_groups = int(np.searchsorted(self._starts, self._whole))
+        work = self._tree_size[trees[self._starts[:-1]]] * (LANES + counts)
+        for ends, groups in ((self._group_ends, len(counts)), (self._whole_group_ends, self._whole_groups)):
+            done = np.cumsum(work[:groups])
+            shares = np.arange(self._threads + 1) * (int(done[-1]) if groups else 0) // self._threads
+            ends[:] = np.searchsorted(done, shares, side="right").tolist()
+        self._whole_ends[:] = self._starts[self._whole_group_ends].tolist()
 
     def _divide(self, touched: np.ndarray) -> None:
         """Divide the coming step of all fast trees but those ``touched`` [k]."""
@@ -133,7 +163,7 @@ class StepRunner:
         """Predict the listed trees over the whole step."""
         if len(self.fast):
             self._steps_of[self.fast] = 1
-        self._launch(self._launches.predict, len(self.stepped), MIN_TREES_PER_THREAD)
+        self._launch(self._predict, len(self._starts) - 1, MIN_GROUPS_PER_THREAD)
 
     def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
         """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
@@ -147,7 +177,7 @@ class StepRunner:
         self._take_substeps(self._levels, self._whole, 0, self._root_levels)
 
     def _launch(self, launch: Callable[..., None], count: int, least: int) -> None:
-        """Launch over the first trees of the list, on all threads if there are ``least`` for each."""
+        """Launch over the first trees or groups of the list, on all threads if there are ``least`` for each."""
         if self._pool is None or count < least * self._threads:
             launch(count)
         else:
@@ -181,12 +211,8 @@ class StepRunner:
         elif self._pool is None or count < self._threads or len(roots):
             self._steps(steps)
         else:
-            ends, jobs = self._whole_ends, []
-            for i, (first, levels) in enumerate(self._shares_of_substeps()):
-                jobs.append(
-                    functools.partial(self._steps_of_part, steps, ends[i + 1] - ends[i], ends[i], i, levels, first)
-                )
-            self._pool.run(jobs)
+            shares = enumerate(self._shares_of_substeps())
+            self._pool.run([functools.partial(self._steps_of_part, steps, i, levels, at) for i, (at, levels) in shares])
 
     def _shares_of_substeps(self) -> list[tuple[int, Levels]]:
         """For each thread where its fast trees begin in the list, and how many take each substep."""
@@ -196,15 +222,16 @@ class StepRunner:
 
     def _steps(self, steps: int) -> None:
         for _ in range(steps):
-            self._launches.predict(self._whole)
+            self._predict(self._whole_groups)
             self._launches.integrate(self._whole)
             self._launches.correct_floating_momentum(self._roots)
             self._take_substeps(self._levels, self._whole, 0, self._root_levels)
 
-    def _steps_of_part(self, steps: int, count: int, first: int, partition: int, levels: Levels, fast: int) -> None:
+    def _steps_of_part(self, steps: int, partition: int, levels: Levels, fast: int) -> None:
+        groups, ends = self._whole_group_ends[partition : partition + 2], self._whole_ends[partition : partition + 2]
         for _ in range(steps):
-            self._launches.predict(count, first, partition)
-            self._launches.integrate(count, first, partition)
+            self._predict(groups[1] - groups[0], groups[0], partition)
+            self._launches.integrate(ends[1] - ends[0], ends[0], partition)
             self._take_substeps(levels, fast, partition)
 
 

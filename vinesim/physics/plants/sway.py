@@ -1,10 +1,10 @@
 """Sway: poses of the trees that wind moves while they are not simulated, for cameras and lidars.
 
 A tree is taken as three oscillators, one for wind along each axis of the world. The shape of each is the tree's own
-static deflection in that wind, found by the solver with weight, ties and all; its frequency is the Rayleigh quotient of
-that shape, its damping that of the joints and of the air. A steady wind is answered by the equilibrium in it, gusts by
-linear answers about that. All of it is a function of place and time, without a state: the same for all clients, and at
-any instant that a sensor asks for. The physics of sleeping trees does not know of it.
+static deflection in that wind, found by the solver with weight, ties, wires and all; its frequency is the Rayleigh
+quotient of that shape, its damping that of the joints and of the air. A steady wind is answered by the equilibrium in
+it, gusts by linear answers about that. All of it is a function of place and time, without a state: the same for all
+clients, and at any instant that a sensor asks for. The physics of sleeping trees does not know of it.
 """
 
 from __future__ import annotations
@@ -22,16 +22,19 @@ from vinesim.kernels.articulation.sway import sway_trees
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.equilibrium import EquilibriumFinder
 from vinesim.physics.plants.shelter import TreeDrag
+from vinesim.physics.plants.wires import Wires
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Snapshot, WindState
 from vinesim.scene.wind import Wind
 
-MAX_TREES = 150
-"""Trees that are posed for one frame where there is no time for all. TUNED: 0.5 ms."""
-_LOAD_STEPS, _NEWTON_STEPS = 4, 10
+MAX_TREES = 120
+"""Trees that are posed for one frame where there is no time for all. TUNED: within 0.5 ms."""
+_LOAD_STEPS, _NEWTON_STEPS = 4, 80
 _CONVERGED = 1e-4
 """[m] Distance from equilibrium at which a tree is in it; where it is not found, a tree does not sway."""
+_ENOUGH = 0.99
+"""[1] Share of the trees that must be well within it: rounding keeps a few far from the origin at its edge."""
 _MIN_DISTANCE = 1.0
 """[m] Nearer trees are not more urgent than those at this distance."""
 
@@ -50,7 +53,7 @@ class Sway:
         """Whether each tree stands elsewhere than where it is simulated."""
         self._drawn_at = np.full(len(model.tree_first), -1e6)
         """Time of the wind at which each tree was drawn last [s]."""
-        self._foot = model.tree_pose[:, :3].astype(np.float32)
+        self._foot = np.ascontiguousarray(model.tree_pose[:, :3].T, np.float32)
         self._body_q = np.zeros((0, 7), np.float32)
 
     def apply(self, snapshot: Snapshot, moved: np.ndarray | None = None, eye: np.ndarray | None = None) -> Snapshot:
@@ -67,7 +70,7 @@ class Sway:
         if wind is not self._wind:
             self._wind = wind
             self._table = None if wind is None else _Table.load(self.model, wind)
-        changed = np.zeros(len(self._foot), bool)
+        changed = np.zeros(len(self._is_drawn), bool)
         changed[snapshot.moved_trees if moved is None else moved] = True
         if state is None or self._table is None:
             changed |= self._is_drawn
@@ -88,8 +91,9 @@ class Sway:
         """Of the trees that are drawn [tree] bool those whose picture from ``eye`` is out of date by the largest
         angles: reach times age by distance."""
         assert self._table is not None
-        away = self._foot - eye
-        square = np.maximum(np.einsum("ij,ij->i", away, away), _MIN_DISTANCE**2)
+        away = self._foot - eye[:, None]
+        away *= away
+        square = np.maximum(away[0] + away[1] + away[2], _MIN_DISTANCE**2)
         angle = self._table.tree_reach * (time - self._drawn_at)
         angle *= angle * drawn
         angle /= square
@@ -126,7 +130,12 @@ class _Table:
     def load(cls, model: Model, wind: Wind) -> _Table:
         """From the cache on disk, or made anew: 0.1 s for two hundred trees, three seconds for ten thousand."""
         here = pathlib.Path(__file__)
-        code = [here, here.with_name("shelter.py"), here.parents[2] / "kernels" / "articulation"]
+        code = [
+            here,
+            here.with_name("shelter.py"),
+            here.with_name("wires.py"),
+            here.parents[2] / "kernels" / "articulation",
+        ]
         numbers = [wind.mean, wind.wave_number, wind.wave_phase, wind.wave_amplitude]
         blown = b"".join(x.astype(float).tobytes() for x in numbers)
         digest = disk_cache.source_digest(*code, model.digest(), blown)
@@ -184,7 +193,8 @@ class _Response:
         self.steady = drag.air_share(wind.mean)[:, None] * wind.mean
         self.share = drag.air_share(wind.mean)
         self.plants = ArticulationSolver(model, self.state)
-        self._finder = EquilibriumFinder(self.plants)
+        self._finder, self._wires = EquilibriumFinder(self.plants), Wires(self.plants)
+        self.plants.wake(np.arange(len(model.tree_first)))
         number, tree = np.arange(len(model.body_mass)), model.body_tree
         self._core = number - model.tree_first[tree] < model.tree_core[tree]
         self._area = 0.5 * AIR_DENSITY * np.where(self._core, model.body_drag, 0.0).astype(float)
@@ -230,15 +240,21 @@ class _Response:
         return np.linalg.norm(velocity, axis=-1, keepdims=True) * velocity
 
     def _move_to_equilibrium(self, trees: np.ndarray) -> np.ndarray:
-        """Move trees to where the steady wind holds them, by Newton's method; whether each is there [tree] bool."""
+        """Move trees to where the steady wind holds them; whether each is there [tree] bool.
+
+        Newton's method for each tree, its wires held, then the wires to where the trees hold them, and again: it comes
+        nearer to where all rest from one side only. With ties as soft as wires make them it would overshoot.
+        """
         good = np.ones(len(trees), bool)
         for step in range(_LOAD_STEPS + _NEWTON_STEPS):
             self._load(min((step + 1) / _LOAD_STEPS, 1.0) * self._pressure(self.steady))
+            self.plants.ties.softening[:] = 0.0
             _, distance, _ = self._finder.residual_motion(trees)
             good &= distance < 1e6
             self._finder.move_to_rest(trees[good])
             self.plants.forward_kinematics(trees)
-            if step >= _LOAD_STEPS and (distance[good] < 0.1 * _CONVERGED).all():
+            self._wires.update()
+            if step >= _LOAD_STEPS and np.mean(distance[good] < 0.45 * _CONVERGED) > _ENOUGH:
                 break
         return good & (distance < _CONVERGED)
 

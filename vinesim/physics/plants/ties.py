@@ -36,6 +36,13 @@ class TieTable:
         room = max_bodies * self._span_size
         self.anchor = np.append(model.tie_anchor, np.zeros((room, 3), np.float32), 0)
         """Where ties are held [tie, 3] m, in the world."""
+        self.anchor_velocity = np.zeros_like(self.anchor)
+        """How fast that place moves [tie, 3] m/s."""
+        self.axis = np.zeros_like(self.anchor)
+        """Direction of the wire that a tie is bound to [tie, 3], 0 for none."""
+        self.softening = np.zeros(len(self.anchor), np.float32)
+        """How much less stiff than the tie alone tie and wire are across the wire [tie] N/m, when all awake trees of it
+        move as one. Only the sleep of trees asks for it."""
         self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
         """[tie] N/m; a tie of zero does nothing."""
         self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))
@@ -45,6 +52,9 @@ class TieTable:
         ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
         self.span = np.stack([ends[:-1], ends[1:]], -1)
         """[body, 2] first tie of a body and the one after its last."""
+        bound = (model.tie_wire >= 0) & (model.fixed_tension[model.tie_wire] > 0.0) if len(model.fixed_tension) else []
+        self.on_wire = np.flatnonzero(bound)
+        """Ties of the model that are bound to wires that give [k], sorted."""
         self._model_span = self.span.copy()
         self._slot_of: dict[int, int] = {}
 
@@ -93,7 +103,9 @@ class TieTable:
         own = slice(*self._model_span[body].tolist())
         start = self._model_ties + self._span_size * free[0]
         here = slice(start, start + own.stop - own.start)
-        for values in (self.anchor, self.stiffness, self.damping, self.point):
+        for values in (
+            self.anchor, self.anchor_velocity, self.axis, self.softening, self.stiffness, self.damping, self.point,
+        ):  # fmt: skip
             values[start : start + self._span_size] = 0.0
             values[here] = values[own]
         self.span[body] = start, start + self._span_size

@@ -135,4 +135,12 @@ def _validate_ties(model: Model) -> None:
     tree = model.body_tree[body]
     refuse(body - model.tree_first[tree] >= model.tree_core[tree], "a berry cluster cannot be tied; tie its bunch")
     refuse(~(model.tie_stiffness >= 0.0), "stiffness below 0 N/m; a spring pulls back: use 0 or more")
+    wire, pieces = model.tie_wire, len(model.fixed_start)
+    refuse(
+        (wire < -1) | (wire >= pieces),
+        f"wire of {pieces} fixed pieces, counted from 0; give one of them, or -1 for none",
+    )
+    if (bad := ~((model.fixed_tension >= 0.0) & np.isfinite(model.fixed_tension))).any():
+        piece = int(np.argmax(bad))
+        raise ValueError(f"fixed piece {piece}: tension {model.fixed_tension[piece]} N; give 0 or more")
     refuse(~(model.tie_damping >= 0.0), "damping below 0 N s/m; a damper takes energy: use 0 or more")

@@ -16,6 +16,8 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact import collision_geoms
 from vinesim.physics.contact.effective_mass import EffectiveMass
+from vinesim.physics.contact.hulls import hull_arrays
+from vinesim.physics.contact.warp_arrays import SharedArrays
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import free_bunch, recompile, static_world
 from vinesim.physics.rigid.body_tables import list_owners, list_visuals
@@ -44,6 +46,8 @@ class CompiledWorld:
     names: WorldNames
     bunches: dict[int, tuple[int, FreeBunch]]
     """Free bunches that have bodies in it already, each with its slot."""
+    hulls: SharedArrays
+    """See :func:`vinesim.physics.contact.hulls.hull_arrays`."""
     removed: tuple[RobotBody | HumanBody, ...] = ()
     """Actors of the present world that it is made without."""
 
@@ -204,7 +208,7 @@ class WorldCore:
             free_bunch.disable_collision(mj_model, slot)
         for slot, body in bunches.values():
             free_bunch.activate(mj_model, slot, body, self._derive(body))
-        return CompiledWorld(robots, humans, slots, mj_model, WorldNames.of(mj_model), bunches)
+        return CompiledWorld(robots, humans, slots, mj_model, WorldNames.of(mj_model), bunches, hull_arrays(mj_model))
 
     def _derive(self, body: FreeBunch) -> mujoco.MjModel:
         """Constants of a free bunch; ``ValueError`` if it has too many shapes or none."""
@@ -221,7 +225,7 @@ class WorldCore:
         """Use another compiled world; the state of every joint and body is transferred by its name."""
         before = (self.mj_model, self._names, self.mj_data, self.contact_force) if self.generation else None
         self.mj_model, self._names, self._pool_size = compiled.mj_model, compiled.names, compiled.bunch_slots
-        m = self.mj_model
+        m, self.hulls = self.mj_model, compiled.hulls
         for bunch, (slot, body) in compiled.bunches.items():
             if self._free_bunches.get(bunch) is not body or self._bunch_slot[bunch] != slot:
                 free_bunch.disable_collision(m, slot)  # it was removed meanwhile

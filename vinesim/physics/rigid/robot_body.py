@@ -15,10 +15,15 @@ from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import recompile, self_collision
 from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction
-from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, shapes_of_robot
+from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, link_friction, shapes_of_robot
 from vinesim.scene.triangles import to_stl
 from vinesim.scene.values import RobotSpec
 
+MIN_FRICTION, MAX_FRICTION = 1e-5, 10.0
+"""[1] Bounds of a link's own coefficient: the least that MuJoCo takes, and what hardly slips. Files give up to 1e14 for
+what never does."""
+MAX_HULL_VERTICES = 64
+"""Most vertices of a mesh's convex hull, so that contacts with it have a bounded cost. TUNED."""
 CONTACT_IMPEDANCE = (0.95, 0.99)
 """[1] Least and largest impedance of a link's contacts (MuJoCo's solimp). TUNED: with MuJoCo's 0.9 and 0.95 an arm that
 pushes against its own torso with all its effort stands 3 mm deep in it, with these less than 1 mm."""
@@ -240,12 +245,16 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
     """A robot without base and servos from its URDF; its shapes carry the collision ``code``."""
     text = collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives))
     child = mujoco.MjSpec.from_string(text, assets={name: to_stl(corners) for name, corners in given.meshes.items()})
+    own_friction = link_friction(given.urdf)
     for geom in child.geoms:
         geom.contype, geom.conaffinity = code, ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
-        geom.friction = contact_friction(friction)
+        own = own_friction.get(geom.parent.name)
+        geom.friction = contact_friction(friction if own is None else min(max(own, MIN_FRICTION), MAX_FRICTION))
+        geom.priority = int(own is not None)  # or MuJoCo would take the larger coefficient of the two in contact
         geom.solimp[:2] = CONTACT_IMPEDANCE
     for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        mesh.maxhullvert = MAX_HULL_VERTICES
     for body in child.bodies[1:]:
         body.gravcomp = 1.0
     driven = {drive.joint: drive for drive in given.drives}

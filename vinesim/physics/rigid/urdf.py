@@ -65,6 +65,21 @@ def collision_urdf(urdf: str, driven: frozenset[str]) -> str:
 
 
 @functools.lru_cache(16)
+def link_friction(urdf: str) -> dict[str, float]:
+    """Coulomb coefficient [1] of the links for which a URDF gives one: Gazebo's ``mu1`` or Bullet's
+    ``lateral_friction``."""
+    root = ElementTree.fromstring(urdf)
+    found = {}
+    for link in root.findall("link"):
+        for element in link.findall("contact/lateral_friction"):
+            found[link.get("name", "")] = float(element.get("value", ""))
+    for gazebo in root.findall("gazebo"):
+        for element in gazebo.findall("mu1"):
+            found[gazebo.get("reference", "")] = float(element.get("value") or element.text or "")
+    return found
+
+
+@functools.lru_cache(16)
 def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
     """Shapes of each link of a URDF for sensors: its visual shapes, or its collision shapes if it has none."""
     root = ElementTree.fromstring(urdf)

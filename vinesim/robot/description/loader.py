@@ -40,10 +40,12 @@ from vinesim.robot.description.urdf_checks import check_joints, check_masses, ch
 from vinesim.robot.description.urdf_model import Joint, Robot, parse_robot
 from vinesim.robot.description.urdf_reader import (
     MOVABLE_JOINT_TYPES,
+    check_friction,
     check_numbers,
     fix_wheels,
     merge_disabled_collisions,
     read_xml,
+    set_friction,
 )
 from vinesim.scene import data_files
 
@@ -85,6 +87,8 @@ def load_description(
     cameras = sidecar.cameras if sidecar.cameras is not None else guess_cameras(root, notes)
     lidars = sidecar.lidars if sidecar.lidars is not None else guess_lidars(root, notes)
     sidecar = msgspec.structs.replace(sidecar, cameras=cameras, lidars=lidars)
+    set_friction(root, sidecar.friction, file.with_suffix(".toml"))
+    check_friction(root, file)
     srdf = file.parent / sidecar.srdf if sidecar.srdf else file.with_suffix(".srdf")
     if not is_remote and (sidecar.srdf or srdf.is_file()):
         merge_disabled_collisions(root, srdf, notes)

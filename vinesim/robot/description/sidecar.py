@@ -120,6 +120,8 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
     cutters: tuple[Cutter, ...] = ()
+    friction: dict[str, float] = {}
+    """Coulomb coefficient [1] by link, of all that touches the link; instead of the URDF's ``mu1``."""
     controllers: dict[str, Controller] | None = None
     """By name; None: those that :mod:`vinesim.robot.description.controllers` derives from the groups."""
     srdf: str = ""

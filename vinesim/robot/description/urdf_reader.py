@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pathlib
 import re
+from collections.abc import Mapping
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
@@ -46,6 +47,35 @@ def read_xml(file: pathlib.Path) -> etree._Element:
             file, f"its root is <{root.tag}>, not <robot>", "give a URDF (MJCF and SDF are not read)"
         )
     return root
+
+
+def check_friction(root: etree._Element, file: pathlib.Path) -> None:
+    """Raise :class:`DescriptionError` unless the coefficients that links are given are finite numbers of 0 or more."""
+    given = [
+        (element, element.get("value") if element.get("value") is not None else element.text)
+        for element in (*root.iterfind("gazebo/mu1"), *root.iterfind("link/contact/lateral_friction"))
+    ]
+    for element, text in given:
+        try:
+            fits = 0.0 <= float(text or "") < math.inf
+        except ValueError:
+            fits = False
+        if not fits:
+            owner = next(up for up in element.iterancestors() if up.tag in ("gazebo", "link"))
+            where = f"{element.tag} of {owner.get('reference') or owner.get('name')!r}"
+            raise description_error(file, f"{where} is {text!r}", "give a friction coefficient of 0 or more")
+
+
+def set_friction(root: etree._Element, friction: Mapping[str, float], file: pathlib.Path) -> None:
+    """Write the coefficients by link of a TOML ``file`` into the URDF as Gazebo's ``mu1``, instead of its own ones."""
+    links = {link.get("name") for link in root.iterfind("link")}
+    for name, coefficient in friction.items():
+        if name not in links:
+            raise description_error(file, f"friction is given for {name!r}", "name a link of the URDF")
+        for old in root.xpath("gazebo[@reference=$name]/mu1", name=name):
+            old.getparent().remove(old)
+        gazebo = etree.SubElement(root, "gazebo", reference=name)
+        etree.SubElement(gazebo, "mu1").text = repr(float(coefficient))
 
 
 def merge_disabled_collisions(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:

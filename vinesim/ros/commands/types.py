@@ -136,3 +136,57 @@ class GoalResult:
     """Error code of control_msgs/action/FollowJointTrajectory."""
     text: str = ""
     gripper: GripperResult | None = None
+
+
+class SimulationAction(enum.StrEnum):
+    """What a node asks of the simulation, in the words of simulation_interfaces."""
+
+    GET_STATE = "get_simulation_state"
+    PLAY = "play"
+    PAUSE = "pause"
+    STEP = "step_simulation"
+    GET_ENTITIES = "get_entities"
+
+
+class EntityCategory(enum.StrEnum):
+    """Kinds of entities, as simulation_interfaces/EntityCategory names them."""
+
+    OBJECT = "object"
+    ROBOT = "robot"
+    HUMAN = "human"
+    DYNAMIC_OBJECT = "dynamic_object"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Entity:
+    """Something in the world that has a name, a pose and a velocity."""
+
+    name: str
+    category: EntityCategory
+    pose: np.ndarray
+    """[7] m, 1 in the map"""
+    velocity: np.ndarray
+    """[6] m/s, rad/s, world axes; NaN where it is not known"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class SimulationRequest:
+    """A request to the simulation; it is answered between two steps."""
+
+    number: int
+    action: SimulationAction
+    steps: int = 0
+    """Of :attr:`SimulationAction.STEP`."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class SimulationReply:
+    """The answer to a request of the same number."""
+
+    number: int
+    time: float
+    """[s] of the world"""
+    is_paused: bool
+    refusal: str = ""
+    """Why it was not done, in one line; empty if it was."""
+    entities: tuple[Entity, ...] = ()

@@ -20,7 +20,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import importlib
 import json
 import pathlib
 import queue
@@ -35,6 +34,7 @@ from typing import Any
 
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
+from vinesim.ros.tools.message_types import message_class
 
 DISCOVERY_PERIOD = 0.05
 """Time between two searches for new topics, until all that were named are found [s]."""
@@ -214,7 +214,7 @@ class TopicMonitor:
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
         offered = self._node.get_publishers_info_by_topic(name)
-        message = _message_class(type_name)
+        message = message_class(type_name)
         if not offered or message is None:
             return
         # The strictest that every publisher offers, as `ros2 topic hz` does.
@@ -247,14 +247,6 @@ def _percentiles_ms(times: Sequence[int]) -> dict[str, float] | None:
         return None
     ordered = sorted(times)
     return {f"p{p}": round(ordered[min(p * len(ordered) // 100, len(ordered) - 1)] * 1e-6, 3) for p in (50, 95)}
-
-
-def _message_class(type_name: str) -> type | None:
-    """The class of ``package/msg/Name``, or None if its package is not installed."""
-    package, kind, name = type_name.split("/")
-    with contextlib.suppress(ImportError, AttributeError):
-        return getattr(importlib.import_module(f"{package}.{kind}"), name)
-    return None
 
 
 def _stamp_offset(message: Any) -> int | None:

@@ -74,7 +74,9 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
     return FixedStructure(foot, row, rngs, arms, trunk, fixed)
 
 
-def _cone_chains(points: np.ndarray, radius: np.ndarray, organ: Organ, index: np.ndarray) -> dict[str, np.ndarray]:
+def _cone_chains(
+    points: np.ndarray, radius: np.ndarray, organ: Organ, index: np.ndarray, tension: float = 0.0
+) -> dict[str, np.ndarray]:
     """Round cones along polylines [chain, point, 3]."""
     pieces = points.shape[1] - 1
     pairs = np.broadcast_to(np.stack([radius[:-1], radius[1:]], -1), (len(points), pieces, 2))
@@ -84,6 +86,7 @@ def _cone_chains(points: np.ndarray, radius: np.ndarray, organ: Organ, index: np
         "fixed_radius": pairs.reshape(-1, 2),
         "fixed_organ": np.full(len(points) * pieces, int(organ)),
         "fixed_index": np.repeat(index, pieces),
+        "fixed_tension": np.full(len(points) * pieces, tension),
     }
 
 
@@ -112,6 +115,8 @@ def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarra
         lines = [np.stack(np.broadcast_arrays(xs[None], (rows + y)[:, None], z), -1) for y, z in across]
     first, pieces = 0, []
     for line in lines:
-        pieces.append(_cone_chains(line, np.full(line.shape[1], radius), Organ.WIRE, first + np.arange(len(line))))
+        number = first + np.arange(len(line))
+        thickness = np.full(line.shape[1], radius)
+        pieces.append(_cone_chains(line, thickness, Organ.WIRE, number, trellis.wire_tension.value))
         first += len(line)
     return pieces

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.plant_bodies import Bodies
 from vinesim.scene.generation.shoots import Shoots
+from vinesim.scene.ids import Organ
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Scene
 
@@ -13,10 +15,12 @@ TIED_SEGMENT = 10
 """The piece of a shoot at whose beginning a string binds it to the net."""
 
 
-def find_ties(scene: Scene, parameters: VineParameters, shoots: Shoots, bodies: Bodies) -> dict[str, np.ndarray]:
+def find_ties(
+    scene: Scene, parameters: VineParameters, structure: FixedStructure, shoots: Shoots, bodies: Bodies
+) -> dict[str, np.ndarray]:
     """Where shoots pass wires closely: over the net they are tied to it or lie on it, in a hedge wires hold them.
 
-    A taut wire pushed aside half way between two posts gives way with 4 tension / span.
+    Each tie is bound to the piece of wire that is nearest; of two catch wires that hold a shoot, to one.
     """
     layout, trellis, tendone = scene.layout, parameters.trellis, scene.training == "tendone"
     start, end = shoots.points[:, :-1], shoots.points[:, 1:]
@@ -47,13 +51,32 @@ def find_ties(scene: Scene, parameters: VineParameters, shoots: Shoots, bodies: 
         tied[:, TIED_SEGMENT, 0] = np.abs(start[:, TIED_SEGMENT, 2] - layout.height) < trellis.tie_string.value
     shoot, slot, which = np.nonzero(tied)
     along = share[shoot, slot, which] * bodies.length[shoot, slot]
-    stiffness = 4.0 * trellis.wire_tension.value / layout.vine_spacing
+    anchor = start[shoot, slot] + share[shoot, slot, which, None] * (end - start)[shoot, slot]
+    stiffness = trellis.tie_stiffness.value
     return {
-        "shoot": shoot, "slot": slot, "point": along[:, None] * [1.0, 0.0, 0.0],
-        "anchor": start[shoot, slot] + share[shoot, slot, which, None] * (end - start)[shoot, slot],
+        "shoot": shoot, "slot": slot, "point": along[:, None] * [1.0, 0.0, 0.0], "anchor": anchor,
+        "wire": _nearest_wire(structure, anchor, 1 - which if tendone else 0 * which),
         "stiffness": np.full(len(slot), stiffness),
         "damping": np.full(len(slot), trellis.tie_damping.value * stiffness),
     }  # fmt: skip
+
+
+def _nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """The piece of wire along x (``axis`` [k] 0) or y (1) that is nearest to each of ``points`` [k, 3] m."""
+    fixed = structure.fixed
+    wires = np.flatnonzero(fixed["fixed_organ"] == int(Organ.WIRE))
+    start, way = fixed["fixed_start"][wires], (fixed["fixed_end"] - fixed["fixed_start"])[wires]
+    nearest = np.full(len(points), -1)
+    for a in np.unique(axis):
+        runs, here = np.abs(way[:, a]) > np.abs(way[:, 1 - a]), np.flatnonzero(axis == a)
+        posts, post = np.unique(start[runs, a], return_inverse=True)
+        lines, line = np.unique(np.delete(start[runs], a, 1), axis=0, return_inverse=True)
+        piece = np.full((len(lines), len(posts)), -1)
+        piece[line.ravel(), post] = wires[runs]
+        place = np.delete(points[here], a, 1)
+        closest = ((place[:, None] - lines) ** 2).sum(-1).argmin(1)
+        nearest[here] = piece[closest, np.maximum(np.searchsorted(posts, points[here, a], "right") - 1, 0)]
+    return nearest
 
 
 def _crossing(start: np.ndarray, end: np.ndarray, first: float, step: float) -> tuple[np.ndarray, np.ndarray]:

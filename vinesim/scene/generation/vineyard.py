@@ -66,7 +66,7 @@ def _generate(scene: Scene, parameters: VineParameters) -> Model:
     shoots = sample_shoots(scene, parameters, structure)
     bodies = build_bodies(parameters, shoots)
     leaf = place_leaves(scene, parameters, shoots, bodies)
-    ties = find_ties(scene, parameters, shoots, bodies)
+    ties = find_ties(scene, parameters, structure, shoots, bodies)
     model = _assemble_model(scene, parameters, structure, shoots, bodies, leaf, ties)
     return builder.solve_rest_pose(model).check()
 
@@ -126,7 +126,7 @@ def _assemble_model(
         getattr(model, f"bunch_head_{name}")[:] = head[shoots.has_bunch]
 
     model.tie_body[:] = number[ties["shoot"], ties["slot"]]
-    for name in ("point", "anchor", "stiffness", "damping"):
+    for name in ("point", "anchor", "wire", "stiffness", "damping"):
         getattr(model, f"tie_{name}")[:] = ties[name]
 
     model.leaf_body[:] = carrier

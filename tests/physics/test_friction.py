@@ -1,0 +1,138 @@
+"""Friction of robots' links: as a URDF or the robot's TOML file gives it, against boxes and plants alike."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import pathlib
+
+import numpy as np
+import pytest
+
+from tests.support.contact_scenes import bar, cane
+from vinesim import frames
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.physics.step import Physics
+from vinesim.robot.description.errors import DescriptionError
+from vinesim.robot.description.loader import load_description
+from vinesim.scene.builder import assemble
+from vinesim.scene.model import Model
+
+INERTIAL = '<inertial><mass value="50"/><inertia ixx="5" iyy="5" izz="5" ixy="0" ixz="0" iyz="0"/></inertial>'
+TRAY = f"""<robot name="tray"><link name="base">{INERTIAL}</link><link name="tray">{INERTIAL}
+<collision><origin xyz="0 0 -0.05"/><geometry><box size="2 2 0.1"/></geometry></collision>CONTACT</link>
+<joint name="tilt" type="revolute"><parent link="base"/><child link="tray"/><origin xyz="0 0 1"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="5000" velocity="1"/></joint>GAZEBO</robot>"""
+
+
+def tray(folder: pathlib.Path, *, gazebo: str = "", contact: str = "", toml: str = "") -> pathlib.Path:
+    """A robot with a tray that tilts."""
+    file = folder / "tray.urdf"
+    file.write_text(TRAY.replace("GAZEBO", gazebo).replace("CONTACT", contact))
+    group = '[groups.arm]\njoints = ["tilt"]\nstiffness = [1e6]\ndamping = [1e5]\nhome = [0.0]\n'
+    (folder / "tray.toml").write_text(toml + group)
+    return file
+
+
+def slides(file: pathlib.Path, slope: float) -> bool:
+    """Whether a crate slides on the tray when that has tilted to ``slope`` = tan(angle)."""
+    model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=1)
+    model.box_pose[0] = frames.pose([0.0, 0.0, 1.001])
+    model.box_size[:], model.box_mass[:] = (0.4, 0.3, 0.2), 2.0
+    rigid = RigidWorld(model)
+    rigid.add_robot(load_description(file).to_spec("anna"))
+    angle = math.atan(slope)
+    for step in range(300):
+        rigid.command("anna", np.array([angle * min(1.0, step / 100)]))
+        rigid.predict()
+        rigid.integrate()
+    box = rigid.visual_q()[0, :3]
+    return bool(np.linalg.norm(box - [0.0, 0.0, 1.0]) > 0.1)
+
+
+GAZEBO = '<gazebo reference="tray"><mu1>0.3</mu1><mu2>0.3</mu2></gazebo>'
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"gazebo": GAZEBO},
+        {"gazebo": '<gazebo reference="tray"><mu1 value="0.3"/></gazebo>'},
+        {"contact": '<contact><lateral_friction value="0.3"/></contact>'},
+        {"toml": "friction = {tray = 0.3}\n", "gazebo": GAZEBO.replace("0.3", "0.9")},
+    ],
+)
+def test_a_crate_slides_on_a_tray_from_the_slope_that_its_friction_says(
+    given: dict[str, str], tmp_path: pathlib.Path
+) -> None:
+    """At 0.3 it stays on a slope of 0.27 and slides on one of 0.33, although the crate's plastic has 0.8."""
+    file = tray(tmp_path, **given)
+    assert not slides(file, 0.27)
+    assert slides(file, 0.33)
+
+
+def test_a_link_without_friction_of_its_own_has_that_of_the_scene(tmp_path: pathlib.Path) -> None:
+    assert not slides(tray(tmp_path), 0.7)
+    assert slides(tray(tmp_path), 0.9)
+
+
+def test_plants_feel_the_friction_of_a_link() -> None:
+    """The force of a bar that bends a cane stays within the cone of 0.2, not of 0.8."""
+    physics = Physics(assemble([cane((0.0, 0.0, 1.0), pieces=8)]))
+    robot = bar((0.5, -0.045, 0.95), stiffness=5000.0, damping=300.0)
+    urdf = robot.urdf.replace("</robot>", '<gazebo reference="bar"><mu1>0.2</mu1></gazebo></robot>')
+    physics.add_robot(dataclasses.replace(robot, urdf=urdf))
+    geom = physics.rigid.geoms.link.index("bar")
+    assert physics.rigid.geoms.friction[geom] == pytest.approx(0.2)
+    physics.rigid.command("bar", np.array([0.1]))
+    ratio = []
+    for _ in range(60):
+        physics.step()
+        axis = physics.rigid.link_pose("bar", "bar")[:2]
+        for contact in physics.contacts:
+            normal = np.append(contact.position[:2] - axis, 0.0) / np.linalg.norm(contact.position[:2] - axis)
+            along = float(contact.force @ normal)
+            ratio.append(np.linalg.norm(contact.force - along * normal) / abs(along))
+    assert ratio
+    assert max(ratio) < 0.25  # the normal is that of the step's end, the contact's is that of its middle
+
+
+def test_what_never_slips_holds_a_crate_on_a_steep_slope(tmp_path: pathlib.Path) -> None:
+    """Files write coefficients of 500 to 1e14 for it. A crate as low as this one tips on no slope below 1.5."""
+    assert not slides(tray(tmp_path, gazebo=GAZEBO.replace("0.3", "1e14")), 1.0)
+
+
+@pytest.mark.parametrize("text", ["-0.1", "rubber", "", "nan", "inf"])
+def test_a_coefficient_that_is_none_is_refused_in_one_line(text: str, tmp_path: pathlib.Path) -> None:
+    file = tray(tmp_path, gazebo=GAZEBO.replace("<mu1>0.3", f"<mu1>{text}"))
+    with pytest.raises(DescriptionError, match=r"mu1 of 'tray'.*0 or more") as caught:
+        load_description(file)
+    assert "\n" not in str(caught.value)
+
+
+def test_friction_of_an_unknown_link_is_refused(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(DescriptionError, match="'spoon'"):
+        load_description(tray(tmp_path, toml="friction = {spoon = 0.3}\n"))
+
+
+# ---------------------------------------------------------------------- steps of other lengths
+
+
+def rebound(dt: float, speed: float) -> float:
+    """[m/s] With which a bar of 3 kg that hit a cane at ``speed`` leaves it."""
+    physics = Physics(assemble([cane((0.0, 0.0, 1.0), pieces=8)]), parameters=PhysicsParameters(dt=dt))
+    physics.add_robot(bar((0.3, -0.06, 0.95)))
+    dof = physics.rigid.robot("bar").v
+    physics.rigid.mj_data.qvel[dof] = speed
+    for _ in range(round(0.8 / dt)):
+        physics.step()
+    return float(physics.rigid.mj_data.qvel[dof][0])
+
+
+@pytest.mark.parametrize("speed", [0.2, 1.0])
+def test_a_contact_gives_back_as_much_whatever_the_step_takes(speed: float) -> None:
+    """With 5 and with 10 ms a bar leaves a cane at speeds within 5 %: a contact's damping is a time, not a step."""
+    short, normal = rebound(0.005, speed), rebound(0.01, speed)
+    assert -0.75 * speed < normal < -0.5 * speed
+    assert short == pytest.approx(normal, rel=0.05)

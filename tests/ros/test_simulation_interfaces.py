@@ -1,0 +1,139 @@
+"""simulation_interfaces as a test program uses them: pause, step, and what is in the world."""
+
+# ruff: noqa: E402 (messages are imported only where ROS is installed)
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from vinesim.ros import middleware
+
+pytestmark = pytest.mark.ros
+if middleware.unavailable_reason() is not None:
+    pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
+
+from tests.support.contact_scenes import cane
+from tests.support.stock_node import StockNode, wait_until
+from vinesim.client.client import Client
+from vinesim.client.tasks.simulation_control import SimulationControl
+from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.robot.description.loader import load_description
+from vinesim.ros.simulation_node import SimulationNode
+from vinesim.scene.builder import assemble
+from vinesim.scene.spec import load_scene
+
+
+class SimulationInRos:
+    """A client with a cane and a robot, its services, and a stock node that calls them."""
+
+    def __init__(self) -> None:
+        scene = load_scene("demo")
+        model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+        bus = MemoryHub().bus("robot")
+        pose = spawn_pose(scene, 0)
+        self.client = Client(scene, model, load_description("vinebot"), bus, name="robot", pose=pose)
+        self.control = SimulationControl(self.client, lambda reply: self.node.answer(reply))
+        self.client.between_steps.append(self.control)
+        self.node = SimulationNode("robot_simulation", "", self.control.put)
+        self.peer = StockNode()
+        self._services: dict[str, Any] = {}
+
+    def call(self, service: str, **fields: Any) -> Any:
+        """The response of a service by its type's name."""
+        import simulation_interfaces.srv as services
+
+        kind = getattr(services, service)
+        if service not in self._services:
+            name = "".join(f"_{c.lower()}" if c.isupper() else c for c in service).lstrip("_")
+            self._services[service] = self.peer.node.create_client(kind, name)
+        client = self._services[service]
+        wait_until(client.service_is_ready, self.peer.spin, service)
+        answer = client.call_async(kind.Request(**fields))
+        wait_until(answer.done, self.step, service)
+        return answer.result()
+
+    def step(self) -> None:
+        self.client.tick()
+        self.peer.spin(0.002)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> Iterator[SimulationInRos]:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("log")))
+        found = SimulationInRos()
+        with found.node, found.peer:
+            yield found
+
+
+def test_pause_and_single_steps(world: SimulationInRos) -> None:
+    """A paused simulation stands still, goes on by exactly as many steps as asked, and plays again."""
+    from simulation_interfaces.msg import Result, SimulationState
+
+    physics = world.client.physics
+    assert world.call("GetSimulationState").state.state == SimulationState.STATE_PLAYING
+    assert world.call("StepSimulation", steps=3).result.result == Result.RESULT_INCORRECT_STATE
+    pause = SimulationState(state=SimulationState.STATE_PAUSED)
+    assert world.call("SetSimulationState", state=pause).result.result == Result.RESULT_OK
+    stood = physics.tick
+    for _ in range(10):
+        world.step()
+    assert physics.tick == stood
+    assert world.call("StepSimulation", steps=7).result.result == Result.RESULT_OK
+    assert physics.tick == stood + 7
+    assert world.call("GetSimulationState").state.state == SimulationState.STATE_PAUSED
+    play = SimulationState(state=SimulationState.STATE_PLAYING)
+    world.call("SetSimulationState", state=play)
+    wait_until(lambda: physics.tick > stood + 20, world.step, "the simulation to play")
+    stop = SimulationState(state=SimulationState.STATE_STOPPED)
+    refused = world.call("SetSimulationState", state=stop).result
+    assert (refused.result, "plays and pauses" in refused.error_message) == (Result.RESULT_FEATURE_UNSUPPORTED, True)
+
+
+def test_entities_and_their_states(world: SimulationInRos) -> None:
+    from simulation_interfaces.msg import EntityCategory, EntityFilters, Result
+
+    assert "robot" in world.call("GetEntities").entities
+    of_robots = EntityFilters(filter="^ro", categories=[EntityCategory(category=EntityCategory.CATEGORY_ROBOT)])
+    found = world.call("GetEntitiesStates", filters=of_robots)
+    assert found.entities == ["robot"]
+    pose = found.states[0].pose.position
+    expected = world.client.robot.rigid.base_state("robot")[0]
+    assert (pose.x, pose.y) == pytest.approx(tuple(expected[:2]), abs=1e-6)
+    assert found.states[0].header.frame_id == "map"
+    state = world.call("GetEntityState", entity="robot")
+    assert state.state.pose.orientation.w == pytest.approx(expected[6], abs=1e-6)
+    missing = world.call("GetEntityState", entity="nobody").result
+    assert (missing.result, missing.error_message) == (
+        Result.RESULT_NOT_FOUND, "no entity 'nobody'; get_entities lists them",
+    )  # fmt: skip
+    wrong = world.call("GetEntities", filters=EntityFilters(filter="(")).result
+    assert "no regular expression" in wrong.error_message
+
+
+def test_what_is_not_supported_says_so(world: SimulationInRos) -> None:
+    from simulation_interfaces.msg import Result
+
+    for service in ("SpawnEntity", "DeleteEntity", "ResetSimulation"):
+        result = world.call(service).result
+        assert result.result == Result.RESULT_FEATURE_UNSUPPORTED
+        assert "not supported by vinesim" in result.error_message
+    assert 26 in world.call("GetSimulatorFeatures").features.features  # pause
+
+
+def test_a_client_of_a_shared_world_does_not_pause(world: SimulationInRos) -> None:
+    from simulation_interfaces.msg import Result, SimulationState
+
+    world.client.world_time.is_shared = True
+    try:
+        pause = SimulationState(state=SimulationState.STATE_PAUSED)
+        refused = world.call("SetSimulationState", state=pause).result
+        assert (refused.result, "cannot pause" in refused.error_message) == (Result.RESULT_INCORRECT_STATE, True)
+    finally:
+        world.client.world_time.is_shared = False

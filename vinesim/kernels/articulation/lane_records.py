@@ -1,0 +1,178 @@
+"""Records of eight trees: for each body 8 x :data:`RECORD` numbers, in which a number of all eight lies side by side.
+
+One lane of a record is one tree. What is known of a tree is copied into its lane before a walk, and results out of it
+afterwards; see :mod:`vinesim.kernels.articulation.eight_trees`.
+"""
+
+import warp as wp
+
+from vinesim.kernels.articulation.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    Factors,
+    JointState,
+    Prediction,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+LANES = 8
+"""Trees in a vector."""
+
+# Where the numbers of a record begin. Kinematics: 20 of them.
+POSE = wp.constant(LANES * 0)
+MOTION = wp.constant(LANES * 7)
+AXES = wp.constant(LANES * 13)
+LEVER = wp.constant(LANES * 17)
+# Implicit inertia and bias of a subtree: 30. Of symmetric matrices the upper triangle.
+TERMS = wp.constant(LANES * 20)
+# Factors: 27.
+FACTORS = wp.constant(LANES * 50)
+# End of the step: 15.
+END = wp.constant(LANES * 77)
+# What is given: model, joints, forces.
+OFFSET = wp.constant(LANES * 92)
+REST = wp.constant(LANES * 95)
+JOINT_Q = wp.constant(LANES * 99)
+JOINT_QD = wp.constant(LANES * 103)
+MASS = wp.constant(LANES * 106)
+COM = wp.constant(LANES * 107)
+INERTIA = wp.constant(LANES * 110)
+PRODUCT = wp.constant(LANES * 113)
+DRAG = wp.constant(LANES * 116)
+LOAD = wp.constant(LANES * 117)
+CONTACT = wp.constant(LANES * 123)
+STIFFNESS = wp.constant(LANES * 126)
+DAMPING = wp.constant(LANES * 129)
+RECORD = 132
+"""Numbers of one body of one tree."""
+STRIDE = wp.constant(LANES * RECORD)
+
+Floats = wp.array(dtype=float)
+
+
+@wp.func_native("a.data += at; a.strides[0] = sizeof(*a.data); return a;")
+def record(a: wp.array(dtype=float), at: int) -> wp.array(dtype=float):
+    """The same array from number ``at`` on."""
+    ...
+
+
+@wp.func
+def vec3_at(a: Floats, i: int):
+    """A vector of one lane, its first number at i."""
+    return wp.vec3(a[i], a[i + 8], a[i + 16])
+
+
+@wp.func
+def quat_at(a: Floats, i: int):
+    """A rotation of one lane."""
+    return wp.quat(a[i], a[i + 8], a[i + 16], a[i + 24])
+
+
+@wp.func
+def spatial_at(a: Floats, i: int):
+    """A spatial vector of one lane."""
+    return wp.spatial_vector(a[i], a[i + 8], a[i + 16], a[i + 24], a[i + 32], a[i + 40])
+
+
+@wp.func
+def mat33_at(a: Floats, i: int):
+    """A matrix of one lane."""
+    return wp.mat33(a[i], a[i + 8], a[i + 16], a[i + 24], a[i + 32], a[i + 40], a[i + 48], a[i + 56], a[i + 64])
+
+
+@wp.func
+def symmetric_at(a: Floats, i: int):
+    """A symmetric matrix of one lane, of which the upper triangle is kept."""
+    return wp.mat33(a[i], a[i + 8], a[i + 16], a[i + 8], a[i + 24], a[i + 32], a[i + 16], a[i + 32], a[i + 40])
+
+
+@wp.func
+def upper_triangle(m: wp.mat33):
+    """The six numbers of a symmetric matrix that are kept."""
+    return wp.spatial_vector(m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2])
+
+
+@wp.func
+def put_vec3(a_out: Floats, i: int, v: wp.vec3):
+    """Write a vector of one lane."""
+    for c in range(3):
+        a_out[i + 8 * c] = v[c]
+
+
+@wp.func
+def put_quat(a_out: Floats, i: int, q: wp.quat):
+    """Write a rotation of one lane."""
+    for c in range(4):
+        a_out[i + 8 * c] = q[c]
+
+
+@wp.func
+def put_spatial(a_out: Floats, i: int, v: wp.spatial_vector):
+    """Write a spatial vector of one lane."""
+    for c in range(6):
+        a_out[i + 8 * c] = v[c]
+
+
+@wp.func
+def parent_record(model: ArticulationModel, k: int, first: int, records: Floats):
+    """The record of the parent of body k, or that of what roots stand on."""
+    return record(records, wp.max(model.body_parent[k] - first + 1, 0) * STRIDE)
+
+
+@wp.func
+def load_tree(
+    lane: int, tree: int, model: ArticulationModel, joints: JointState, forces: AppliedForces, records_out: Floats
+):
+    """Copy what the walk needs of one tree into its lane; record 0 is what roots stand on."""
+    pose = model.tree_pose[tree]
+    put_vec3(records_out, POSE + lane, wp.transform_get_translation(pose))
+    put_quat(records_out, POSE + 24 + lane, wp.transform_get_rotation(pose))
+    put_spatial(records_out, MOTION + lane, wp.spatial_vector())
+    first = model.tree_first[tree]
+    for i in range(model.tree_moving[tree]):
+        k = first + i
+        own = record(records_out, (i + 1) * STRIDE + lane)
+        put_vec3(own, OFFSET, model.body_offset[k])
+        put_quat(own, REST, model.body_rest[k])
+        put_quat(own, JOINT_Q, joints.joint_q[k])
+        put_vec3(own, JOINT_QD, joints.joint_qd[k])
+        own[MASS] = model.body_mass[k]
+        put_vec3(own, COM, model.body_com[k])
+        put_vec3(own, INERTIA, model.body_inertia[k])
+        put_vec3(own, PRODUCT, model.body_product[k])
+        own[DRAG] = model.body_drag[k]
+        put_spatial(own, LOAD, forces.body_load[k])
+        put_vec3(own, CONTACT, wp.spatial_top(forces.body_wrench[k]))
+        put_vec3(own, STIFFNESS, model.joint_stiffness[k])
+        put_vec3(own, DAMPING, model.joint_damping[k])
+
+
+@wp.func
+def store_tree(
+    lane: int,
+    tree: int,
+    model: ArticulationModel,
+    records: Floats,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    prediction_out: Prediction,
+):
+    """Copy one tree's results out of its lane."""
+    first = model.tree_first[tree]
+    for i in range(model.tree_moving[tree]):
+        k = first + i
+        own = record(records, (i + 1) * STRIDE + lane)
+        bodies_out.body_q[k] = wp.transform(vec3_at(own, POSE), quat_at(own, POSE + 24))
+        bodies_out.body_qd[k] = spatial_at(own, MOTION)
+        factors_out.axes[k] = quat_at(own, AXES)
+        factors_out.lever[k] = vec3_at(own, LEVER)
+        factors_out.D[k] = symmetric_at(own, FACTORS)
+        factors_out.DJ[k] = mat33_at(own, FACTORS + 8 * 6)
+        factors_out.DH[k] = mat33_at(own, FACTORS + 8 * 15)
+        if model.body_parent[k] < 0:
+            factors_out.root_inverse_mass[k] = wp.mat33()
+        prediction_out.body_acceleration[k] = spatial_at(own, END)
+        prediction_out.body_qd_free[k] = spatial_at(own, END + 8 * 6)
+        prediction_out.joint_qd_free[k] = vec3_at(own, END + 8 * 12)

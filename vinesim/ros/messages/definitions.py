@@ -1,0 +1,53 @@
+"""Definitions of message types as text with all that they refer to, as recordings embed them (encoding ``ros2msg``)."""
+
+from __future__ import annotations
+
+import functools
+import os
+import pathlib
+import re
+import sys
+
+from vinesim.ros.messages.message_packages import DEFINITIONS
+
+_SEPARATOR = "=" * 80
+_FIELD = re.compile(r"^\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]", re.MULTILINE)
+_PRIMITIVES = {"bool", "byte", "char", "string", "wstring"}
+
+
+class UnknownTypeError(LookupError):
+    """A message type whose definition is nowhere installed; the text names it."""
+
+
+def message_definition(type_name: str) -> str:
+    """The definition of ``package/msg/Name`` and, after it, those of all types in it; :class:`UnknownTypeError`."""
+    package, _, name = type_name.split("/")
+    parts, known, open_types = [_text(package, name)], {(package, name)}, [(package, name)]
+    while open_types:
+        inside, of = open_types.pop(0)
+        for reference in _references(_text(inside, of), inside):
+            if reference not in known:
+                known.add(reference)
+                open_types.append(reference)
+                parts.append(f"{_SEPARATOR}\nMSG: {'/'.join(reference)}\n{_text(*reference)}")
+    return "\n".join(parts)
+
+
+def _references(text: str, package: str) -> list[tuple[str, str]]:
+    """Package and name of the message types in a definition, in order."""
+    found = []
+    for kind in _FIELD.findall(re.sub(r"#.*", "", text)):
+        *path, name = kind.split("/")
+        if path or not (kind in _PRIMITIVES or re.fullmatch(r"u?int\d+|float\d+", kind)):
+            found.append((path[0] if path else package, name))
+    return found
+
+
+@functools.cache
+def _text(package: str, name: str) -> str:
+    prefixes = [sys.prefix, *os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
+    places = [pathlib.Path(prefix) / "share" / package / "msg" for prefix in prefixes if prefix]
+    for place in (*places, DEFINITIONS / package / "msg"):
+        if (file := place / f"{name}.msg").is_file():
+            return file.read_text()
+    raise UnknownTypeError(f"no definition of {package}/msg/{name} is installed")
