@@ -187,13 +187,25 @@ class Arm:
 
 
 def drive(robot: Robot, place: np.ndarray | None, heading: float | None) -> None:
-    """Turn towards a place [2] m, drive there, and turn to a heading [rad]."""
+    """Turn towards a place [2] m, drive there, and turn to a heading [rad]; RuntimeError if something is in the way."""
+    seen: list[np.ndarray] = []
 
     def command(linear: float, angular: float) -> None:
         twist = TwistStamped()
         twist.twist.linear.x, twist.twist.angular.z = linear, angular
         robot.velocity.publish(twist)
-        rclpy.spin_once(robot.node, timeout_sec=0.05)
+        end = time.monotonic() + 0.04
+        while time.monotonic() < end:
+            rclpy.spin_once(robot.node, timeout_sec=0.01)
+        seen.append(robot.base())
+        if linear == 0.0:
+            seen.clear()
+        if len(seen) > 100 and np.linalg.norm(seen[-1][:2] - seen[-100][:2]) < 0.01:
+            for _ in range(40):
+                twist.twist.linear.x, twist.twist.angular.z = -0.3, 0.0
+                robot.velocity.publish(twist)
+                rclpy.spin_once(robot.node, timeout_sec=0.05)
+            raise RuntimeError("something is in the way of the base")
 
     def turn_to(course: float) -> None:
         while abs(error := wrap(course - yaw_of(robot.base()))) > 0.01:
@@ -315,7 +327,11 @@ def main() -> int:
         print(f"{name}: {side} hand, from ({place[0]:.2f}, {place[1]:.2f})", flush=True)
         try:
             pick(robot, name, side, place, heading)
-            put_into_box(robot, side)
+            try:
+                put_into_box(robot, side)
+            except RuntimeError as failure:
+                print(f"{name}: {failure}; once more", flush=True)
+                put_into_box(robot, side)
         except RuntimeError as failure:
             print(f"{name}: {failure}", flush=True)
             if len(tried) == 6:
