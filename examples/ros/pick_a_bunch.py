@@ -198,7 +198,9 @@ def drive(robot: Robot, place: np.ndarray | None, heading: float | None) -> None
         while time.monotonic() < end:
             rclpy.spin_once(robot.node, timeout_sec=0.01)
         seen.append(robot.base())
-        if len(seen) > 100 and linear > 0.0 and np.linalg.norm(seen[-1][:2] - seen[-100][:2]) < 0.01:
+        if linear == 0.0:
+            seen.clear()
+        if len(seen) > 100 and np.linalg.norm(seen[-1][:2] - seen[-100][:2]) < 0.01:
             for _ in range(40):
                 twist.twist.linear.x, twist.twist.angular.z = -0.3, 0.0
                 robot.velocity.publish(twist)

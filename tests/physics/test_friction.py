@@ -98,10 +98,15 @@ def test_plants_feel_the_friction_of_a_link() -> None:
     assert max(ratio) < 0.25  # the normal is that of the step's end, the contact's is that of its middle
 
 
-@pytest.mark.parametrize("text", ["-0.1", "rubber", "", "nan", "1e9"])
+def test_what_never_slips_holds_a_crate_on_a_steep_slope(tmp_path: pathlib.Path) -> None:
+    """Files write coefficients of 500 to 1e14 for it. A crate as low as this one tips on no slope below 1.5."""
+    assert not slides(tray(tmp_path, gazebo=GAZEBO.replace("0.3", "1e14")), 1.0)
+
+
+@pytest.mark.parametrize("text", ["-0.1", "rubber", "", "nan", "inf"])
 def test_a_coefficient_that_is_none_is_refused_in_one_line(text: str, tmp_path: pathlib.Path) -> None:
     file = tray(tmp_path, gazebo=GAZEBO.replace("<mu1>0.3", f"<mu1>{text}"))
-    with pytest.raises(DescriptionError, match=r"mu1 of 'tray'.*0 to 100") as caught:
+    with pytest.raises(DescriptionError, match=r"mu1 of 'tray'.*0 or more") as caught:
         load_description(file)
     assert "\n" not in str(caught.value)
 

@@ -44,6 +44,7 @@ from vinesim.scene.values import (
     ControllerKind,
     ControllerSpec,
     JointSample,
+    LevelLaser,
     LidarScan,
     RobotSample,
 )
@@ -66,7 +67,18 @@ def robot_sample(t: float, actor: str = "vinebot", contacts: tuple[Contact, ...]
     zeros = np.zeros(len(JOINTS))
     joints = JointSample(t, JOINTS, zeros + t, zeros, zeros, zeros)
     base = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(np.pi / 2))
-    return RobotSample(actor, joints, base, np.zeros(6), REST, FRAMES, np.tile(REST, (len(FRAMES), 1)), contacts)
+    return RobotSample(
+        actor,
+        joints,
+        base,
+        np.zeros(6),
+        REST,
+        np.zeros(6),
+        np.zeros((2, 3, 3)),
+        FRAMES,
+        np.tile(REST, (len(FRAMES), 1)),
+        contacts,
+    )
 
 
 def camera_frame(t: float, width: int = 640, height: int = 480, name: str = "head_front_camera") -> CameraFrame:
@@ -88,6 +100,7 @@ def lidar_scan(t: float, count: int) -> LidarScan:
         zeros.astype(np.uint16),
         zeros,
         zeros.astype(int),
+        LevelLaser(0, 1, 0.0, 0.1, 0.0, 0.1, 100.0),
     )
 
 
@@ -204,6 +217,8 @@ TYPES = {
     "/vine/markers": "visualization_msgs/msg/MarkerArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/lidar/points": "sensor_msgs/msg/PointCloud2",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/head_front_camera/depth/image_raw/compressedDepth": "sensor_msgs/msg/CompressedImage",
     "/head_front_camera/rgb/image_raw": "sensor_msgs/msg/Image",
     "/head_front_camera/rgb/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
     "/head_front_camera/rgb/camera_info": "sensor_msgs/msg/CameraInfo",

@@ -45,6 +45,15 @@ class ScheduledSensor:
     wanted: DemandQuery = lambda: CameraOutput.ALL
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
+    present_rate: Callable[[], float] | None = None
+    """The same where it may change, asked before every frame."""
+
+    @property
+    def period(self) -> float:
+        """Time between two frames [s]."""
+        if self.present_rate is not None:
+            return 1.0 / self.present_rate()
+        return 1.0 / (self.rate or self.sensor.rate)
 
     @property
     def name(self) -> str:
@@ -141,6 +150,7 @@ class SensorScheduler:
             yield frame
             return
         scan = self._scans[scheduled.name]
+        scan.set_period(scheduled.period)
         missed = scan.dropped
         yield from scan.advance(self.primitives, now)
         self.dropped[scheduled.name] += scan.dropped - missed
@@ -156,7 +166,7 @@ class SensorScheduler:
             return False
         if name in self._scans:
             return self._scans[name].is_due(now)
-        due, period = self._next_time[name], 1.0 / (scheduled.rate or scheduled.sensor.rate)
+        due, period = self._next_time[name], scheduled.period
         if now < due - 2.0 * period:  # time was set back
             due = -np.inf
         if now < due - 1e-6:

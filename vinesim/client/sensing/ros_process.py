@@ -29,8 +29,6 @@ from vinesim.scene.values import ComponentStatus, JointReference, RigidVisual
 
 START_TIMEOUT = 120.0
 """How long the process may take to start; a first run builds message packages [s]."""
-TRUTH_PERIOD = 10
-"""Ticks between two messages of true poses: 10 Hz."""
 TRUTH_ORGANS = (Organ.BOX, Organ.BUNCH, Organ.HUMAN)
 """Rigid bodies whose true poses are published; robots have their own transforms."""
 
@@ -127,7 +125,8 @@ class RosProcess:
                 else:
                     now = physics.time + client.world_time.offset
                     self._contacts_left_out += self._records.write(record, now, sample)
-        if physics.tick % TRUTH_PERIOD == 0 and channel.wanted["truth"][0]:
+        truth_period = float(channel.wanted["truth_period"][0])
+        if truth_period and physics.tick % max(round(truth_period / physics.dt), 1) == 0:
             self._write_truth(client)
 
     def _write_truth(self, client: Client) -> None:

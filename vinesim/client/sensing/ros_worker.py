@@ -83,9 +83,10 @@ class RosChannel:
             context,
         )  # fmt: skip
         self.wanted = SharedArrays(
-            {"steps": ((len(config.step_topics),), "?"), "truth": ((1,), "?"), "goals": ((1,), "?")}
+            {"steps": ((len(config.step_topics),), "?"), "truth_period": ((1,), "f8"), "goals": ((1,), "?")}
         )
-        """Whether topics have subscribers, and actions goals; written by the process."""
+        """Whether topics have subscribers, and actions goals, and how often true poses are wanted [s], 0 for never;
+        written by the process."""
 
     def close(self) -> None:
         """Release the memory."""
@@ -180,7 +181,7 @@ class RosWorker:
         wanted = self.channel.wanted
         wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
         wanted["goals"][0] = self.node.has_goals
-        wanted["truth"][0] = self.node.has_subscribers(TRUTH_TOPIC)
+        wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
         now = time.monotonic()
         if now >= self._next_statistics:
             self._next_statistics = now + STATISTICS_PERIOD

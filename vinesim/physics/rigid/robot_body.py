@@ -19,8 +19,9 @@ from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, link_f
 from vinesim.scene.triangles import to_stl
 from vinesim.scene.values import RobotSpec
 
-MIN_FRICTION = 1e-5
-"""[1] Least coefficient that MuJoCo takes."""
+MIN_FRICTION, MAX_FRICTION = 1e-5, 10.0
+"""[1] Bounds of a link's own coefficient: the least that MuJoCo takes, and what hardly slips. Files give up to 1e14 for
+what never does."""
 MAX_HULL_VERTICES = 64
 """Most vertices of a mesh's convex hull, so that contacts with it have a bounded cost. TUNED."""
 CONTACT_IMPEDANCE = (0.95, 0.99)
@@ -248,7 +249,7 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
     for geom in child.geoms:
         geom.contype, geom.conaffinity = code, ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
         own = own_friction.get(geom.parent.name)
-        geom.friction = contact_friction(friction if own is None else max(own, MIN_FRICTION))
+        geom.friction = contact_friction(friction if own is None else min(max(own, MIN_FRICTION), MAX_FRICTION))
         geom.priority = int(own is not None)  # or MuJoCo would take the larger coefficient of the two in contact
         geom.solimp[:2] = CONTACT_IMPEDANCE
     for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume

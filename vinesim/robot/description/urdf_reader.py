@@ -28,8 +28,6 @@ NUMBER_COUNTS = {
 
 MAX_NUMBER = 1e6
 """Largest number of a URDF [m, kg, kg m2, rad]: more makes the numbers of all that touches the robot inexact."""
-MAX_FRICTION = 100.0
-"""[1] Largest friction coefficient of a link."""
 MAX_LIMIT = 1e17
 """Largest limit: files give 1e16 where there is none."""
 
@@ -52,22 +50,20 @@ def read_xml(file: pathlib.Path) -> etree._Element:
 
 
 def check_friction(root: etree._Element, file: pathlib.Path) -> None:
-    """Raise :class:`DescriptionError` unless the coefficients that links are given are numbers from 0 to 100."""
+    """Raise :class:`DescriptionError` unless the coefficients that links are given are finite numbers of 0 or more."""
     given = [
         (element, element.get("value") if element.get("value") is not None else element.text)
         for element in (*root.iterfind("gazebo/mu1"), *root.iterfind("link/contact/lateral_friction"))
     ]
     for element, text in given:
         try:
-            fits = 0.0 <= float(text or "") <= MAX_FRICTION
+            fits = 0.0 <= float(text or "") < math.inf
         except ValueError:
             fits = False
         if not fits:
             owner = next(up for up in element.iterancestors() if up.tag in ("gazebo", "link"))
             where = f"{element.tag} of {owner.get('reference') or owner.get('name')!r}"
-            raise description_error(
-                file, f"{where} is {text!r}", f"give a friction coefficient from 0 to {MAX_FRICTION:g}"
-            )
+            raise description_error(file, f"{where} is {text!r}", "give a friction coefficient of 0 or more")
 
 
 def set_friction(root: etree._Element, friction: Mapping[str, float], file: pathlib.Path) -> None:

@@ -27,6 +27,7 @@ from vinesim.scene.values.sensors import (
     CameraFrame,
     CameraInfo,
     CameraOutput,
+    LevelLaser,
     LidarScan,
 )
 from vinesim.scene.values.status import ComponentStatus
@@ -56,6 +57,7 @@ __all__ = [
     "Imu",
     "JointReference",
     "JointSample",
+    "LevelLaser",
     "LidarScan",
     "Measurement",
     "Mesh",

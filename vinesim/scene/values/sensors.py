@@ -156,6 +156,29 @@ class CameraFrame:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class LevelLaser:
+    """The laser of a spinning lidar that looks least up or down, and its shots of one revolution.
+
+    The head turns clockwise seen from above: shot k looks at ``azimuth - 2 pi k / count``.
+    """
+
+    ring: int
+    """Its number in :attr:`LidarScan.ring`."""
+    count: int
+    """Shots of a revolution."""
+    delay: float
+    """Time of its first shot after the first firing [s]."""
+    period: float
+    """Between two shots [s]."""
+    azimuth: float
+    """Of its first shot, counter-clockwise from ahead [rad]."""
+    nearest: float
+    """Ranges that the lidar can measure [m]: least."""
+    farthest: float
+    """Greatest [m]."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class LidarScan:
     """One revolution of a lidar; shots that returned nothing are left out."""
 
@@ -175,6 +198,8 @@ class LidarScan:
     """[point] float32 s after ``time``."""
     labels: np.ndarray
     """[point] int32"""
+    level: LevelLaser | None = None
+    """The laser nearest to the horizontal, None if unknown."""
     returned: np.ndarray | None = None
     """[point] uint8: 1 the strongest echo of its shot, 2 another; None if each shot reports one at most."""
 
