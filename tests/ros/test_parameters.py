@@ -21,13 +21,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
 
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.ros.messages import message_packages
 from vinesim.ros.names import ros_name
 from vinesim.ros.robot_node import RobotNode
-from vinesim.scene.values import ComponentStatus, JointSample, RobotSample
+from vinesim.ros.sensor_node import SensorNode
+from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput, ComponentStatus, JointSample, RobotSample
 
 REST = frames.pose(np.zeros(3))
 NONE = np.zeros(0)
@@ -125,6 +126,39 @@ def test_a_robot_without_truth_and_bad_values():
             assert reason, (name, value)
             assert "\n" not in reason
         assert node.environment_rate == 20.0
+
+
+def test_depth_labels_and_rates_of_sensors():
+    info = CameraInfo(8, 6, 8.0, 8.0, 3.5, 2.5, "optical")
+    depth, exact = np.full((6, 8), 1.5, np.float32), np.full((6, 8), 1.25, np.float32)
+    labels = np.ones((6, 8), np.int32)
+    frame = CameraFrame(1.0, "camera", info, REST, np.zeros((6, 8, 3), np.uint8), depth, labels, exact)
+    images: list[Image] = []
+    with SensorNode("r_sensors", cameras=["camera"], rates={"camera": 30.0}) as node, StockNode() as peer:
+        peer.node.create_subscription(Image, "camera/depth/image_raw", images.append, 10)
+        peer.node.create_subscription(Image, "camera/labels", lambda _: None, 10)
+
+        def tick() -> None:
+            node.publish_camera(frame)
+            peer.spin(0.01)
+
+        def last() -> tuple[str, float]:
+            kind = np.float32 if images[-1].encoding == "32FC1" else np.uint16
+            return images[-1].encoding, float(np.frombuffer(images[-1].data, kind)[0])
+
+        wait_until(lambda: images and last() == ("32FC1", 1.5), tick, "depth")
+        assert node.camera_outputs_wanted("camera") == CameraOutput.DEPTH | CameraOutput.LABELS
+        put = Setter(peer, "/r_sensors", tick)
+        for name, value in (
+            ("camera.exact_depth", True), ("camera.depth_encoding_16uc1", True), ("publish_truth", False),
+            ("camera.rate", 5.0), ("camera.jpeg_quality", 40),
+        ):  # fmt: skip
+            assert put(name, value) == ""
+        wait_until(lambda: last() == ("16UC1", 1250.0), tick, "exact depth in millimetres")
+        assert node.camera_outputs_wanted("camera") == CameraOutput.EXACT_DEPTH
+        assert node.rate("camera") == 5.0
+        for name, value in (("camera.rate", 0.0), ("camera.jpeg_quality", 101), ("camera.exact_depth", "yes")):
+            assert put(name, value), name
 
 
 @pytest.mark.parametrize(
