@@ -2,6 +2,7 @@
 
     python benchmarks/gpu.py --reference cpu.npz        # on a machine whose Warp has CPU kernels
     python benchmarks/gpu.py --compare cpu.npz          # on one with an NVIDIA GPU
+    python benchmarks/gpu.py --peer --trees 65536       # beside mujoco-warp, which must be installed
 
 Trees are the canes of ``vinesim bench plants``: 16 bodies and a bunch. *resident*: joints and bodies stay on the
 device for all ticks; *visible*: every tick the host may read bodies and add forces, as a client does.
@@ -102,6 +103,31 @@ def seconds(work: Callable[[], None], rounds: int = 5) -> float:
     return float(np.median(took))
 
 
+def peer_milliseconds(count: int) -> float:
+    """One step of so many worlds in mujoco-warp, each with the same cane, captured into a graph; no contacts."""
+    import mujoco
+    import mujoco_warp  # pyright: ignore[reportMissingImports]
+
+    from vinesim.bench.mujoco_reference import compile_plants
+
+    spec = compile_plants(assemble([cane(0.0)]))
+    spec.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # it has no ``discrete``
+    data = mujoco.MjData(spec)
+    mujoco.mj_forward(spec, data)
+    model, worlds = mujoco_warp.put_model(spec), mujoco_warp.put_data(spec, data, nworld=count)
+    mujoco_warp.step(model, worlds)
+    wp.synchronize()
+    with wp.ScopedCapture() as capture:
+        mujoco_warp.step(model, worlds)
+
+    def steps() -> None:
+        for _ in range(TICKS):
+            wp.capture_launch(capture.graph)  # pyright: ignore[reportArgumentType]  (captured above)
+        wp.synchronize()
+
+    return 1e3 * seconds(steps) / TICKS
+
+
 def say(about: dict, case: str, value: float, unit: str) -> None:
     sys.stdout.write(json.dumps({"bench": "gpu", "case": case, "value": value, "unit": unit} | about) + "\n")
     sys.stdout.flush()
@@ -111,6 +137,7 @@ def main() -> None:
     ask = argparse.ArgumentParser()
     ask.add_argument("--reference")
     ask.add_argument("--compare")
+    ask.add_argument("--peer", action="store_true", help="also measure mujoco-warp")
     ask.add_argument("--device", default="cuda")
     ask.add_argument("--trees", type=int, nargs="*", default=[64, 1024, 4096, 16384, 65536, 131072])
     given = ask.parse_args()
@@ -138,6 +165,12 @@ def main() -> None:
         assert np.isfinite(plants.state.body_q).all()
         say(about, f"{count} trees of {PER_TREE} bodies, resident", 1e3 * took, "ms/tick")
         say(about, f"{count} trees of {PER_TREE} bodies, resident", bodies / took / 1e9, "G body-steps/s")
+        if given.peer:
+            theirs = peer_milliseconds(count)
+            also = {"peer": "mujoco-warp implicitfast", "peer_value": theirs, "ratio": theirs / (1e3 * took)}
+            say(
+                about | also, f"{count} trees of {PER_TREE} bodies, resident, beside mujoco-warp", 1e3 * took, "ms/tick"
+            )
         if count <= 16384:
 
             def visible(plants: ArticulationSolver = plants) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,9 +27,12 @@ INERTIA = MASS * ARM**2 / 3.0
 
 def row_of_shoots(
     along: tuple[float, ...] = ALONG, *, tie: float = 2000.0, tension: float = TENSION, beta: float = 0.02,
-    spring: float = SPRING, others: int = 0,
+    spring: float = SPRING, others: int = 0, beyond: float = 0.1,
 ) -> Model:  # fmt: skip
-    """Level rods along y whose tips are tied to a wire along x; ``others`` are tied to another wire behind it."""
+    """Level rods along y whose tips are tied to a wire along x; ``others`` are tied to another wire behind it.
+
+    The geoms of both wires are ``beyond`` [m] the tips, out of reach; the ties are what this is about.
+    """
     trees = []
     for x in (*along, *np.linspace(0.2, 1.8, others)):
         tree = TreeBuilder(frames.pose(np.array([x, 0.0, 1.0]), frames.from_yaw(np.pi / 2)))
@@ -38,18 +42,18 @@ def row_of_shoots(
         )  # fmt: skip
         trees.append(tree)
     count = len(trees)
-    beyond = 0.1 + ARM  # the shoots do not touch the wire that they are tied to
+    there = ARM + beyond
     return assemble(
         trees, tie_body=np.arange(count), tie_point=np.tile([ARM, 0.0, 0.0], (count, 1)),
         tie_anchor=[[tree.pose[0], tree.pose[1] + ARM, 1.0] for tree in trees], tie_stiffness=np.full(count, tie),
         tie_damping=np.full(count, 0.5 * beta * tie), tie_wire=np.repeat([0, 1], [len(along), others]),
-        fixed_start=[[0.0, beyond, 1.0]] * 2, fixed_end=[[LENGTH, beyond, 1.0]] * 2,
+        fixed_start=[[0.0, there, 1.0]] * 2, fixed_end=[[LENGTH, there, 1.0]] * 2,
         fixed_radius=np.full((2, 2), 0.0014), fixed_organ=[int(Organ.WIRE)] * 2, fixed_index=[0, 1],
         fixed_tension=[tension] * 2,
     )  # fmt: skip
 
 
-def world(model: Model, **parameters: object) -> Physics:
+def world(model: Model, **parameters: Any) -> Physics:
     physics = Physics(model, parameters=PhysicsParameters(**{"gravity": 0.0, "sleep": False} | parameters))
     if not physics.parameters.sleep:
         physics.plants.wake(np.arange(len(model.tree_first)))
@@ -177,7 +181,8 @@ def test_shoots_on_a_wire_gain_no_energy(tie: float, tension: float, phi: float)
             seen.append(energy(physics.plants, 0.0).total + 0.5 * tip @ added @ tip)
         physics.step()
     if phi == 0.5:
-        np.testing.assert_allclose(seen, seen[0], rtol=0.02)
+        # 50 kN/m: a unit in the last place of a position is a thousandth of the stretch, and so walks the energy
+        np.testing.assert_allclose(seen, seen[0], rtol=0.05 if tie > 1e4 else 0.02)
     else:
         assert max(seen) <= 1.001 * seen[0]
         assert seen[-1] < 0.5 * seen[0]
@@ -224,3 +229,20 @@ def test_a_shoot_that_another_client_lays_aside_moves_the_wire_here() -> None:
     physics.step()
     assert physics.wires.deflection[1, 2] > 1e-3
     assert physics.plants.awake.tolist() == [0, 2, 3]
+
+
+def test_a_shoot_does_not_bear_on_the_wire_that_its_tie_is_bound_to() -> None:
+    """On the wire below it, pressed down: the tie alone holds it. A shoot that is not tied to the wire bears on it."""
+    model = row_of_shoots(beyond=-0.02)
+    model.fixed_start[:, 2] = model.fixed_end[:, 2] = [1.0 - 0.0054, 0.5]
+    for is_tied in (True, False):
+        if not is_tied:
+            model.tie_wire[:] = -1
+        physics = world(model)
+        assert physics.rigid.mj_model.geom("fixed/0").id == 1
+        push(physics, 1, np.array([0.0, 0.0, -20.0]))
+        for _ in range(100):
+            physics.step()
+            assert not (physics.contacts and is_tied)
+        assert bool(physics.contacts) is not is_tied
+        assert bool(tips(physics)[1, 2] < -0.015) is is_tied

@@ -452,7 +452,9 @@ def test_boxes_at_rest_sleep_until_they_are_pushed():
     assert rigid.mj_data.joint("box/0").qvel[0] == 0.0
 
 
-def test_a_faulty_robot_stops_and_the_others_continue():
+@pytest.mark.parametrize("rate", [np.nan, 1e6, -1e6])
+def test_a_faulty_robot_stops_and_the_others_continue(rate: float):
+    """One of its joint rates is not finite, or beyond what any body reaches in a stable simulation [rad/s]."""
     rigid, undisturbed = RigidWorld(yard()), RigidWorld(yard())
     for world in (rigid, undisturbed):
         world.add_robot(arm())
@@ -462,7 +464,7 @@ def test_a_faulty_robot_stops_and_the_others_continue():
     step(undisturbed, 20)
     pose_before = rigid.base_state("anna")[0]
     rigid.predict()
-    rigid.mj_data.qvel[rigid.robot("anna").v[1]] = np.nan
+    rigid.mj_data.qvel[rigid.robot("anna").v[1]] = rate
     rigid.integrate()
     step(rigid, 30)
     step(undisturbed, 31)

@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
+import struct
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,13 +29,13 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from vinesim.ros.commands import convert as commands
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.messages.transforms import SerializedTransforms, split_time
-from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import (
     CameraFrame,
     CameraInfo,
     ComponentStatus,
     Imu,
     JointSample,
+    LevelLaser,
     LidarScan,
     RobotSample,
     Wrench,
@@ -169,13 +170,6 @@ def test_compressed_image_shows_the_same_colours():
     assert np.abs(decoded.astype(int) - plain.rgb).max() <= 4
 
 
-def test_label_map_takes_labels_apart():
-    known = json.loads(convert.label_map().data)
-    value = label(Organ.BUNCH, 4711)
-    assert known["organs"][str(value // known["stride"])] == "bunch"
-    assert value % known["stride"] == 4711
-
-
 def test_camera_info_projects_like_the_camera():
     message = over_the_wire(convert.camera_info(INFO, 3.0))
     projection = np.array(message.p).reshape(3, 4)
@@ -246,13 +240,22 @@ def test_joint_state_round_trip_is_exact():
     assert list(message.effort) == (3 * np.array([0.1, -0.2])).tolist()
 
 
-def test_odometry_velocity_is_in_the_axes_of_the_base():
-    turned = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(math.pi / 2))
-    ahead = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.3])  # it looks along world y, and drives there
-    sample = RobotSample("r", joint_sample(), turned, ahead, turned, (), np.zeros((0, 7)))
-    twist = over_the_wire(convert.odometry(sample, "base_footprint")).twist.twist
-    assert (twist.linear.x, twist.linear.y) == pytest.approx((0.5, 0.0), abs=1e-12)
-    assert twist.angular.z == pytest.approx(0.3)
+def test_odometry_is_what_was_measured_with_its_covariances():
+    at, measured = (frames.pose(np.array([x, 2.0, 0.0]), frames.from_yaw(math.pi / 2)) for x in (1.0, 3.0))
+    actual, odom_qd = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.3]), np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.4])
+    covariance = np.arange(18.0).reshape(2, 3, 3)
+    sample = RobotSample(
+        "r", joint_sample(), at, actual, measured, odom_qd, covariance, (), np.zeros((0, 7)),
+    )  # fmt: skip
+    message = over_the_wire(convert.odometry(sample, "base_footprint"))
+    assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_footprint")
+    assert message.pose.pose.position.x == 3.0
+    twist = message.twist.twist
+    assert (twist.linear.x, twist.linear.y, twist.angular.z) == (0.6, 0.0, 0.4)
+    for part, expected in zip((message.pose, message.twist), covariance, strict=True):
+        found = np.reshape(part.covariance, (6, 6))
+        assert np.array_equal(found[np.ix_((0, 1, 5), (0, 1, 5))], expected)
+        assert found[2:5, 2:5].tolist() == np.diag([convert.UNMEASURED] * 3).tolist()
 
 
 def test_wrench_and_imu_keep_their_frames():
@@ -322,7 +325,7 @@ def trajectory(*points: tuple[float, list[float], list[float]]) -> JointTrajecto
     message = JointTrajectory(joint_names=["a", "b"])
     for time, positions, velocities in points:
         point = JointTrajectoryPoint(positions=positions, velocities=velocities)
-        point.time_from_start.sec, point.time_from_start.nanosec = int(time), round(time % 1 * 1e9)
+        point.time_from_start.sec, point.time_from_start.nanosec = math.floor(time), round(time % 1 * 1e9)
         message.points.append(point)
     return message
 
@@ -353,6 +356,69 @@ def test_joint_trajectory_comes_back():
 def test_bad_trajectories_are_refused_in_words(message, words):
     with pytest.raises(commands.CommandError, match=words):
         commands.joint_trajectory(message, "arm_left_controller", ("a", "b"))
+
+
+@pytest.mark.parametrize("dual", [False, True])
+def test_a_scan_equals_the_cloud_of_the_same_revolution(dual):
+    """Each point of the level laser, at its bearing and its time as laser_geometry computes them; +Inf elsewhere."""
+    count, period, delay = 720, 1e-4, 2e-5
+    level = LevelLaser(7, count, delay, period, -0.02, 0.5, 100.0)
+    rng = np.random.default_rng(3)
+    shot = np.sort(rng.choice(count, 500, replace=dual))
+    ring = np.where(rng.uniform(size=500) < 0.7, 7, 3).astype(np.uint16)
+    bearing, reach = level.azimuth - 2.0 * np.pi * shot / count, rng.uniform(0.5, 90.0, 500)
+    xyz = np.stack([reach * np.cos(bearing), reach * np.sin(bearing), 0.02 * reach], 1).astype(np.float32)
+    offset = (delay + period * shot).astype(np.float32)
+    scan = LidarScan(
+        2.0, "lidar", "lidar_link", frames.pose(np.zeros(3)), xyz, reach.astype(np.float32), ring, offset,
+        np.zeros(500, np.int32), level,
+    )  # fmt: skip
+    cloud = points(over_the_wire(convert.lidar_cloud(scan))).ravel()
+    message = over_the_wire(convert.laser_scan(scan))
+    assert message.header.frame_id == "lidar_link"
+    assert len(message.ranges) == len(message.intensities) == count
+    assert message.angle_increment > 0.0
+    assert message.angle_max == pytest.approx(message.angle_min + (count - 1) * message.angle_increment, abs=1e-5)
+    assert (message.range_min, message.range_max) == (0.5, 100.0)
+    assert message.scan_time == pytest.approx(count * period)
+    expected = np.full(count, np.inf)
+    start = convert.seconds(message.header.stamp)
+    for point in cloud[cloud["ring"] == 7]:
+        angle = np.arctan2(point["y"], point["x"])
+        ray = round((angle - message.angle_min) % (2.0 * np.pi) / message.angle_increment) % count
+        expected[ray] = min(expected[ray], np.hypot(point["x"], point["y"]))
+        assert start + ray * message.time_increment == pytest.approx(2.0 + point["time"], abs=1e-6)
+    np.testing.assert_allclose(message.ranges, expected, rtol=1e-6)
+    known = np.isfinite(expected)
+    np.testing.assert_allclose(np.array(message.intensities)[known], expected[known], rtol=1e-5)
+    assert not np.array(message.intensities)[~known].any()
+    with pytest.raises(ValueError, match="level"):
+        convert.laser_scan(dataclasses.replace(scan, level=None))
+
+
+def test_compressed_depth_is_decoded_as_its_transport_does():
+    """By the parameters in the header: format 0, then depth = a / (q - b), NaN for q = 0."""
+    frame = camera_frame()
+    frame.depth[1, :3] = 0.05, 9.99, 20.0
+    message = over_the_wire(convert.compressed_depth(frame))
+    assert message.format == "32FC1; compressedDepth png"
+    kind, a, b = struct.unpack_from("<iff", bytes(message.data))
+    pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8)[12:], cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    assert (kind, pixels.dtype, pixels.shape) == (0, np.uint16, frame.depth.shape)
+    found = np.where(pixels > 0, a / (np.maximum(pixels, 1) - np.float32(b)), np.nan)
+    known = np.isfinite(frame.depth) & (frame.depth < 10.0) & (frame.depth > 0.16)
+    assert np.isnan(found[~known]).all()
+    step = frame.depth[known] ** 2 / a  # of the inverse, in depth
+    assert (np.abs(found[known] - frame.depth[known]) <= 1.05 * step + 1e-6).all()
+
+    message = over_the_wire(convert.compressed_depth(frame, is_millimetres=True))
+    assert message.format == "16UC1; compressedDepth png"
+    assert bytes(message.data[:12]) == bytes(12)
+    pixels = cv2.imdecode(np.frombuffer(message.data, np.uint8)[12:], cv2.IMREAD_UNCHANGED)
+    assert pixels is not None
+    raw = np.frombuffer(convert.depth_image_millimetres(frame).data, np.uint16).reshape(pixels.shape)
+    assert np.array_equal(pixels, np.where(raw > 10_000, 0, raw))
 
 
 def test_diagnostics_carry_the_figures():

@@ -44,6 +44,7 @@ from vinesim.scene.values import (
     ControllerKind,
     ControllerSpec,
     JointSample,
+    LevelLaser,
     LidarScan,
     RobotSample,
 )
@@ -66,14 +67,25 @@ def robot_sample(t: float, actor: str = "vinebot", contacts: tuple[Contact, ...]
     zeros = np.zeros(len(JOINTS))
     joints = JointSample(t, JOINTS, zeros + t, zeros, zeros, zeros)
     base = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(np.pi / 2))
-    return RobotSample(actor, joints, base, np.zeros(6), REST, FRAMES, np.tile(REST, (len(FRAMES), 1)), contacts)
+    return RobotSample(
+        actor,
+        joints,
+        base,
+        np.zeros(6),
+        REST,
+        np.zeros(6),
+        np.zeros((2, 3, 3)),
+        FRAMES,
+        np.tile(REST, (len(FRAMES), 1)),
+        contacts,
+    )
 
 
 def camera_frame(t: float, width: int = 640, height: int = 480, name: str = "head_front_camera") -> CameraFrame:
     info = CameraInfo(width, height, width, width, width / 2, height / 2, f"{name}_optical")
     rgb = np.full((height, width, 3), 7, np.uint8)
     depth = np.full((height, width), 1.5, np.float32)
-    return CameraFrame(t, name, info, REST, rgb, depth, np.ones((height, width), np.int32))
+    return CameraFrame(t, name, info, REST, rgb, depth, np.ones((height, width), np.int32), bunches=())
 
 
 def lidar_scan(t: float, count: int) -> LidarScan:
@@ -88,6 +100,7 @@ def lidar_scan(t: float, count: int) -> LidarScan:
         zeros.astype(np.uint16),
         zeros,
         zeros.astype(int),
+        LevelLaser(0, 1, 0.0, 0.1, 0.0, 0.1, 100.0),
     )
 
 
@@ -190,11 +203,10 @@ def test_every_topic_is_heard_with_its_official_type():
     assert received["/tf"]["type_hash"] == "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 
 
-LATCHED = ("robot_description", "label_map", "tf_static", "tf_environment_static")
+LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static")
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/robot_description": "std_msgs/msg/String",
-    "/label_map": "std_msgs/msg/String",
     "/joint_states": "sensor_msgs/msg/JointState",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -202,8 +214,11 @@ TYPES = {
     "/tf_environment_static": "tf2_msgs/msg/TFMessage",
     "/mobile_base_controller/odom": "nav_msgs/msg/Odometry",
     "/vine/contacts": "sensor_msgs/msg/PointCloud2",
+    "/vine/markers": "visualization_msgs/msg/MarkerArray",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/lidar/points": "sensor_msgs/msg/PointCloud2",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/head_front_camera/depth/image_raw/compressedDepth": "sensor_msgs/msg/CompressedImage",
     "/head_front_camera/rgb/image_raw": "sensor_msgs/msg/Image",
     "/head_front_camera/rgb/image_raw/compressed": "sensor_msgs/msg/CompressedImage",
     "/head_front_camera/rgb/camera_info": "sensor_msgs/msg/CameraInfo",
@@ -211,6 +226,10 @@ TYPES = {
     "/head_front_camera/depth/camera_info": "sensor_msgs/msg/CameraInfo",
     "/head_front_camera/depth/points": "sensor_msgs/msg/PointCloud2",
     "/head_front_camera/labels": "sensor_msgs/msg/Image",
+    "/head_front_camera/label_info": "vision_msgs/msg/LabelInfo",
+    "/head_front_camera/detections": "vision_msgs/msg/Detection2DArray",
+    "/head_front_camera/detections_3d": "vision_msgs/msg/Detection3DArray",
+    "/head_front_camera/bunches": "sensor_msgs/msg/PointCloud2",
 }
 
 
@@ -250,7 +269,7 @@ def test_subscribers_are_counted_by_family_and_knows_its_topics():
         assert not node.has_subscribers("left")  # a name that the other begins with
         peer.node.destroy_subscription(subscription)
         wait_until(lambda: not node.has_subscribers("left_arm"))
-        with pytest.raises(ValueError, match=r"no topic 'right'; there are: left/depth/camera_info"):
+        with pytest.raises(ValueError, match=r"no topic 'right'; there are: left/bunches, left/depth/camera_info"):
             node.has_subscribers("right")
 
 

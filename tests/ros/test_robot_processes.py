@@ -179,7 +179,7 @@ def test_a_record_holds_a_sample_exactly(robot):
     row = np.zeros(1, records.dtype)[0]
     assert records.write(row, client.physics.time, sample) == 0
     copy = records.read(row)
-    for name in ("base_q", "base_qd", "odom_q", "transform_q"):
+    for name in ("base_q", "base_qd", "odom_q", "odom_qd", "odom_covariance", "transform_q"):
         assert np.array_equal(getattr(copy, name), getattr(sample, name)), name
     for name in ("position", "velocity", "effort", "contact"):
         assert np.array_equal(getattr(copy.joints, name), getattr(sample.joints, name)), name

@@ -70,6 +70,13 @@ def test_rings_offsets_and_angles_follow_the_table(lidar: Lidar) -> None:
     assert elevation == pytest.approx(-15.0 + 2.0 * scan.ring, abs=1e-3)
     azimuth = np.unwrap(np.arctan2(scan.xyz[:, 1], scan.xyz[:, 0]).astype(float))
     assert azimuth - azimuth[0] == pytest.approx(-2.0 * np.pi * 10.0 * scan.offset, abs=1e-4)
+    level = scan.level
+    assert abs(-15.0 + 2.0 * level.ring) == 1.0
+    shot = np.arange(level.count)
+    at = scan.ring == level.ring
+    assert scan.offset[at] == pytest.approx(level.delay + shot * level.period, abs=1e-7)
+    turned = azimuth[at] - level.azimuth + 2.0 * np.pi * shot / level.count
+    assert np.abs((turned + np.pi) % (2.0 * np.pi) - np.pi).max() < 2e-3
     assert (np.diff(scan.offset) > 0).all()
     assert scan.offset[16] == pytest.approx(55.296e-6, rel=1e-5)
     assert scan.offset[-1] < 0.1

@@ -44,6 +44,18 @@ def test_frames_come_at_the_sensors_rate_of_simulation_time(view) -> None:
     assert scheduler.dropped == {"head": 0}
 
 
+def test_a_rate_that_changes_holds_from_the_next_frame_on(view) -> None:
+    inbox, rates = Inbox(), [10.0]
+    sensor = ScheduledSensor(_camera(), inbox, present_rate=lambda: rates[-1])
+    scheduler = SensorScheduler(sensor_scenes.empty(), [sensor])
+    for tick in range(21):
+        if tick == 11:
+            rates.append(5.0)
+        scheduler.advance(dataclasses.replace(view, time=0.05 * tick), {"head": sensor_scenes.AHEAD})
+    assert [round(f.time, 3) for f in inbox] == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0]
+    assert scheduler.dropped == {"head": 0}
+
+
 def test_frames_that_were_due_in_skipped_snapshots_are_counted_but_not_beside_the_first(view) -> None:
     inbox = Inbox()
     scheduler = SensorScheduler(sensor_scenes.empty(), [ScheduledSensor(_camera(), inbox, rate=10.0)])

@@ -23,6 +23,7 @@ from rclpy.validate_node_name import validate_node_name
 from rclpy.validate_topic_name import validate_topic_name
 
 from vinesim.ros import middleware
+from vinesim.ros.parameters import Parameters
 from vinesim.ros.topic import RELIABLE, Topic
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,7 @@ class Node:
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         try:
             self._node = rclpy.create_node(name, context=self._context, namespace=namespace or None)
+            self._parameters = Parameters(self._node)
             self._open()
         except BaseException:
             self._context.shutdown()

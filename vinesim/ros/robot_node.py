@@ -27,6 +27,8 @@ from vinesim.scene.values import ComponentStatus, ControllerSpec, RobotSample
 
 FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
+MAP_TO_ODOM, TRUTH, ENVIRONMENT_RATE = "publish_map_to_odom", "publish_truth", "environment_rate"
+"""Names of parameters."""
 OWN_MESSAGES = ("tf2_msgs", "control_msgs")
 """Message packages that no wheel has."""
 
@@ -36,8 +38,8 @@ class RobotNode(Node):
 
     ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
     sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none. All topics but /clock
-    stand under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether this node may publish it,
-    which one node of a ROS domain does.
+    and /diagnostics stand under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether
+    this node may publish it, which one node of a ROS domain does.
     """
 
     def __init__(
@@ -70,7 +72,7 @@ class RobotNode(Node):
         self._clock = ClockPublisher(self._node, self._advertise, self._withdraw) if self._has_clock else None
         self._robot = RobotPublisher(self._advertise, TFMessage, self._urdf, self._static_transforms, self._base)
         self._ground_truth = GroundTruthPublisher(self._advertise, TFMessage)
-        self._diagnostics = self._advertise(DiagnosticArray, "diagnostics", RELIABLE)
+        self._diagnostics = self._advertise(DiagnosticArray, "/diagnostics", RELIABLE)
         self._proprioception = ProprioceptionPublisher(self._advertise, self._imus, self._wrenches)
         self._control = ControlPublisher(self._advertise, self._controllers)
         links = ElementTree.fromstring(self._urdf).iterfind("link")
@@ -78,6 +80,35 @@ class RobotNode(Node):
         self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers)
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
         CommandSubscriptions(self._node, self._controllers, self._commands)
+
+        self._declare_parameters()
+
+    def _declare_parameters(self) -> None:
+        """Parameters that can be set while the node runs."""
+        declare = self._parameters.declare
+        declare(
+            MAP_TO_ODOM,
+            True,
+            "Publish the true pose of odom in the map on /tf; off for a localisation of your own.",
+            changed=self._apply_parameters,
+        )
+        declare(
+            TRUTH,
+            True,
+            "Publish what no robot could measure: tf_environment, vine/contacts, vine/markers.",
+            changed=self._apply_parameters,
+        )
+        declare(ENVIRONMENT_RATE, 10.0, "Messages a second of tf_environment [Hz].", (0.1, 50.0))
+
+    def _apply_parameters(self) -> None:
+        self._robot.publishes_map_to_odom = self._parameters[MAP_TO_ODOM]
+        for publisher in (self._ground_truth, self._contacts):
+            publisher.mute(not self._parameters[TRUTH])
+
+    @property
+    def environment_rate(self) -> float:
+        """Messages of true poses a second [Hz] that are asked for."""
+        return self._parameters[ENVIRONMENT_RATE]
 
     def has_subscribers(self, family: str) -> bool:
         return self.has_clock_subscribers if family == CLOCK else super().has_subscribers(family)
@@ -107,7 +138,7 @@ class RobotNode(Node):
             self._actions.publish_feedback(sample)
 
     def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish true poses [name, 7] m, 1 in the map of what moves; 10 to 30 Hz will do.
+        """Publish true poses [name, 7] m, 1 in the map of what moves, at :attr:`environment_rate`.
 
         Pass the same tuple object as long as the names stay: the serialised message is then patched, not built.
         """

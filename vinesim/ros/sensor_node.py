@@ -10,12 +10,15 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TypeVar
 
+from vinesim.ros.messages import message_packages
 from vinesim.ros.node import Node
 from vinesim.ros.publishers.camera import CameraPublisher
 from vinesim.ros.publishers.lidar import LidarPublisher
 from vinesim.ros.topic import Build, PendingMessage, Topic
 from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan
 
+TRUTH = "publish_truth"
+"""Name of a parameter."""
 SensorPublisher = TypeVar("SensorPublisher", CameraPublisher, LidarPublisher)
 
 
@@ -23,9 +26,19 @@ class SensorNode(Node):
     """The topics of ``cameras`` and ``lidars``, the names under which they publish."""
 
     def __init__(
-        self, name: str, *, namespace: str = "", cameras: Sequence[str] = (), lidars: Sequence[str] = ()
+        self,
+        name: str,
+        *,
+        namespace: str = "",
+        cameras: Sequence[str] = (),
+        lidars: Sequence[str] = (),
+        rates: Mapping[str, float] | None = None,
     ) -> None:
+        """``rates``: those of sensors [Hz], with which their parameters start; others have none."""
+        if cameras:
+            message_packages.ensure_importable(["vision_msgs"])
         self._camera_names, self._lidar_names = cameras, lidars
+        self._rates = rates or {}
         self._pending: dict[Topic, Build] = {}
         """The newest message of each topic; the one that waits longest is the first."""
         self._changed = threading.Condition()
@@ -33,8 +46,25 @@ class SensorNode(Node):
         super().__init__(name, namespace, (*cameras, *lidars))
 
     def _open(self) -> None:
-        self._cameras = {camera: CameraPublisher(self._advertise, camera) for camera in self._camera_names}
-        self._lidars = {lidar: LidarPublisher(self._advertise, lidar) for lidar in self._lidar_names}
+        parameters = self._parameters
+        self._cameras = {one: CameraPublisher(self._advertise, one, parameters) for one in self._camera_names}
+        self._lidars = {  # Nav2 expects /scan
+            one: LidarPublisher(self._advertise, one, f"{one}/scan" if i else "scan")
+            for i, one in enumerate(self._lidar_names)
+        }
+        for sensor, rate in self._rates.items():
+            parameters.declare(
+                f"{sensor}.rate", rate, "Pictures or revolutions a second [Hz].", (0.1, max(rate, 100.0))
+            )
+        parameters.declare(TRUTH, True, "Publish labels of pictures, and detections.", changed=self._mute_truth)
+
+    def _mute_truth(self) -> None:
+        for camera in self._cameras.values():
+            camera.mute_truth(not self._parameters[TRUTH])
+
+    def rate(self, sensor: str) -> float:
+        """Rate [Hz] that is asked for of a sensor of ``rates``."""
+        return self._parameters[f"{sensor}.rate"]
 
     def _own_threads(self, name: str) -> list[threading.Thread]:
         return [threading.Thread(target=self._send, name=f"ros send {name}", daemon=True)]
@@ -54,6 +84,10 @@ class SensorNode(Node):
     def camera_outputs_wanted(self, camera: str) -> CameraOutput:
         """What subscribers need of the frames of one of ``cameras``; :class:`ValueError` if there is no such camera."""
         return self._publisher(self._cameras, "camera", camera).wanted()
+
+    def lidar_wanted(self, lidar: str) -> bool:
+        """Whether one of ``lidars`` has subscribers; :class:`ValueError` if there is no such lidar."""
+        return self._publisher(self._lidars, "lidar", lidar).wanted()
 
     @property
     def has_pending(self) -> bool:

@@ -38,12 +38,19 @@ class Topic:
         self.dropped = 0
         """Messages that were replaced by newer ones before their turn, or that could not be built or sent."""
         self.publisher = publisher
+        self._is_muted = False
         self._lock, self._is_closed = threading.Lock(), False
 
     def update_subscription_count(self) -> None:
         """Query the middleware for the number of subscribers."""
-        if not self._is_closed:
+        if not self._is_closed and not self._is_muted:
             self.subscription_count = self.publisher.get_subscription_count()
+
+    def mute(self, is_muted: bool) -> None:
+        """Whether nothing is sent, as if there were no subscribers; for the thread that counts them."""
+        self._is_muted = is_muted
+        self.subscription_count = 0
+        self.update_subscription_count()
 
     def close(self) -> None:
         """Send nothing any more; returns when nothing is being sent."""

@@ -21,6 +21,7 @@ from vinesim.sensors.camera.camera import Camera, load_camera_kernels
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import SpinningScan
 from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.truth.ground_truth import visible_bunches
 
 
 def load_kernels() -> None:
@@ -44,6 +45,15 @@ class ScheduledSensor:
     wanted: DemandQuery = lambda: CameraOutput.ALL
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
+    present_rate: Callable[[], float] | None = None
+    """The same where it may change, asked before every frame."""
+
+    @property
+    def period(self) -> float:
+        """Time between two frames [s]."""
+        if self.present_rate is not None:
+            return 1.0 / self.present_rate()
+        return 1.0 / (self.rate or self.sensor.rate)
 
     @property
     def name(self) -> str:
@@ -112,24 +122,35 @@ class SensorScheduler:
         due = [m for m in self.sensors if self._is_due(m, snapshot.time, poses)]
         if not due:
             return
-        self._update_primitives(snapshot, poses)
+        seen = self._update_primitives(snapshot, poses)
         for scheduled in due:
-            for result in self._results(scheduled, snapshot.time, poses[scheduled.name]):
+            for result in self._results(scheduled, seen, poses[scheduled.name]):
                 scheduled.deliver(result)
                 self.frames[scheduled.name] += 1
 
-    def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> None:
+    def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> Snapshot:
+        """Pose the primitives; the snapshot as it is drawn, good until the next call."""
         eye = next((pose[:3] for pose in poses.values()), None)
         seen = self._sway.apply(snapshot, np.flatnonzero(self._moved), eye)
         self.primitives.update(seen, seen.moved_trees)
         self._moved[:] = False
+        return seen
 
-    def _results(self, scheduled: ScheduledSensor, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:
-        """Render what a sensor has to deliver at simulation time ``now`` [s]."""
+    def _results(
+        self, scheduled: ScheduledSensor, snapshot: Snapshot, pose: np.ndarray
+    ) -> Iterator[CameraFrame | LidarScan]:
+        """Render what a sensor has to deliver of a snapshot that the primitives show."""
+        now = snapshot.time
         if isinstance(scheduled.sensor, Camera):
-            yield scheduled.sensor.render(self.primitives, pose, now, outputs=scheduled.wanted())
+            camera, outputs = scheduled.sensor, scheduled.wanted()
+            frame = camera.render(self.primitives, pose, now, outputs=outputs)
+            if CameraOutput.BUNCHES in outputs:
+                bunches = visible_bunches(self.primitives, snapshot, camera.info, frame.pose, camera.rasterizer)
+                frame = dataclasses.replace(frame, bunches=bunches)
+            yield frame
             return
         scan = self._scans[scheduled.name]
+        scan.set_period(scheduled.period)
         missed = scan.dropped
         yield from scan.advance(self.primitives, now)
         self.dropped[scheduled.name] += scan.dropped - missed
@@ -145,7 +166,7 @@ class SensorScheduler:
             return False
         if name in self._scans:
             return self._scans[name].is_due(now)
-        due, period = self._next_time[name], 1.0 / (scheduled.rate or scheduled.sensor.rate)
+        due, period = self._next_time[name], scheduled.period
         if now < due - 2.0 * period:  # time was set back
             due = -np.inf
         if now < due - 1e-6:

@@ -12,10 +12,11 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, run_ros_worker
 from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
-from vinesim.client.sensing.worker_process import WorkerProcess
+from vinesim.client.sensing.worker_process import Run, WorkerProcess
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.simulation_control import SimulationControl
 from vinesim.robot.description.description import RobotDescription
@@ -24,12 +25,12 @@ from vinesim.robot.drives.joint_servos import series_stiffness
 from vinesim.ros.commands.types import Command
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.values import ComponentStatus, JointReference
+from vinesim.scene.values import ComponentStatus, JointReference, RigidVisual
 
 START_TIMEOUT = 120.0
 """How long the process may take to start; a first run builds message packages [s]."""
-TRUTH_PERIOD = 10
-"""Ticks between two messages of true poses: 10 Hz."""
+TRUTH_ORGANS = (Organ.BOX, Organ.BUNCH, Organ.HUMAN)
+"""Rigid bodies whose true poses are published; robots have their own transforms."""
 
 
 class RosProcess:
@@ -57,11 +58,18 @@ class RosProcess:
         self._records = StepRecords(name, description, series_stiffness(description.drives))
         config = RosConfig(
             name, description.urdf, description.base, namespace, clock, tuple((p, c, q) for (p, c), q in fixed),
-            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body), len(model.box_size),
+            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
             model.bunch_of_body(),
             description.controllers, tuple(mount.name for mount in description.imus),
             tuple(mount.name for mount in description.wrenches),
         )  # fmt: skip
+        self._visuals: tuple[RigidVisual, ...] | None = None
+        """All rigid bodies when the list of those in the truth was made."""
+        self._truth_rows = np.zeros(0, np.intp)
+        self._truth_visuals: tuple[RigidVisual, ...] = ()
+        self._truth_list = VisualListSender()
+        self._run: Run[RosChannel] | None = None
+        """The run of the process that :attr:`_truth_list` belongs to."""
         self._step_topics = config.step_topics
         self._lost = np.zeros(len(self._step_topics), np.int64)
         """[topic] messages of steps that found no room on the way to the process."""
@@ -117,18 +125,34 @@ class RosProcess:
                 else:
                     now = physics.time + client.world_time.offset
                     self._contacts_left_out += self._records.write(record, now, sample)
-        if physics.tick % TRUTH_PERIOD == 0 and channel.wanted["truth"][0]:
-            physics.update_kinematics()
-            with channel.truth.writing() as truth:
-                if truth is None:
-                    self._missed_truth += 1
-                else:
-                    truth["time"][0] = physics.time + client.world_time.offset
-                    truth["attached"][:] = physics.state.bunch_attached
-                    truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
-                    names = {visual.name: i for i, visual in enumerate(physics.rigid.visuals())}
-                    boxes = [names[f"box/{i}"] for i in range(len(self._model.box_size))]
-                    truth["box_q"][:] = physics.rigid.visual_q()[boxes]
+        truth_period = float(channel.wanted["truth_period"][0])
+        if truth_period and physics.tick % max(round(truth_period / physics.dt), 1) == 0:
+            self._write_truth(client)
+
+    def _write_truth(self, client: Client) -> None:
+        """Pass true poses to the process: of bunches, boxes and people."""
+        physics, run = client.physics, self.worker.current()
+        if run is not self._run:  # a new run knows nothing yet
+            self._run, self._visuals = run, None
+            self._truth_list.close()
+            self._truth_list = VisualListSender()
+        physics.update_kinematics()
+        visuals = physics.visuals()
+        if visuals is not self._visuals:
+            self._visuals = visuals
+            self._truth_rows = np.array([i for i, one in enumerate(visuals) if one.organ in TRUTH_ORGANS], np.intp)
+            self._truth_visuals = tuple(dataclasses.replace(visuals[i], shapes=()) for i in self._truth_rows)
+        if (message := self._truth_list.update(self._truth_visuals)) is not None:
+            run.send("truth", message)
+        with run.shared.truth.writing() as truth:
+            if truth is None:
+                self._missed_truth += 1
+                return
+            truth["time"][0] = physics.time + client.world_time.offset
+            truth["attached"][:] = physics.state.bunch_attached
+            truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
+            truth["version"][0] = self._truth_list.version
+            self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
 
     def _wake(self) -> None:
         channel = self.worker.current().shared
@@ -173,6 +197,7 @@ class RosProcess:
     def close(self) -> None:
         """End the process."""
         self.worker.close()
+        self._truth_list.close()
 
     def __enter__(self) -> Self:
         return self

@@ -16,13 +16,15 @@ from typing import Any
 
 import numpy as np
 
+from vinesim.client.sensing.rigid_visual_list import VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import report_ready, serve
 from vinesim.ros.commands.types import SimulationRequest
 from vinesim.ros.names import ros_name
-from vinesim.scene.values import ControllerKind, ControllerSpec
+from vinesim.scene.ids import Organ
+from vinesim.scene.values import ControllerKind, ControllerSpec, RigidVisual
 
 STATE_TOPICS = ("joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "vine/markers")
 """Topics that need a robot's state after a step, whatever robot it is."""
@@ -54,7 +56,6 @@ class RosConfig:
     """Poses [pole, 7] m, 1."""
     records: StepRecords
     bunch_count: int
-    box_count: int
     bunch_of_body: np.ndarray
     """[body] -1 for wood."""
     controllers: tuple[ControllerSpec, ...]
@@ -77,14 +78,15 @@ class RosChannel:
         self.truth = SharedSnapshot(
             {
                 "time": ((1,), "f8"), "attached": ((config.bunch_count,), "?"),
-                "bunch_q": ((config.bunch_count, 7), "f4"), "box_q": ((config.box_count, 7), "f8"),
+                "bunch_q": ((config.bunch_count, 7), "f4"), "version": ((1,), "i8"),  # of the list of rigid bodies
             },
             context,
         )  # fmt: skip
         self.wanted = SharedArrays(
-            {"steps": ((len(config.step_topics),), "?"), "truth": ((1,), "?"), "goals": ((1,), "?")}
+            {"steps": ((len(config.step_topics),), "?"), "truth_period": ((1,), "f8"), "goals": ((1,), "?")}
         )
-        """Whether topics have subscribers, and actions goals; written by the process."""
+        """Whether topics have subscribers, and actions goals, and how often true poses are wanted [s], 0 for never;
+        written by the process."""
 
     def close(self) -> None:
         """Release the memory."""
@@ -120,8 +122,10 @@ class RosWorker:
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
-        self._box_names = tuple(f"box_{i}" for i in range(config.box_count))
+        self._rigid = VisualListReceiver()
         self._truth_names: tuple[str, ...] = ()
+        self._named: tuple[int, bytes] = 0, b""
+        """Version of the list of rigid bodies, and attached bunches, that :attr:`_truth_names` belong to."""
         self._next_statistics = 0.0
 
     def run(self) -> None:
@@ -150,6 +154,8 @@ class RosWorker:
                 return False
             if kind == "diagnose":
                 self.node.publish_diagnostics(*value)
+            elif kind == "truth":
+                self._rigid.take(value)
             elif kind == "finish":
                 self.node.finish_goal(value)
             elif kind == "simulated" and self.simulation is not None:
@@ -157,12 +163,17 @@ class RosWorker:
         return True
 
     def _publish_truth(self) -> None:
-        """True poses of the boxes, and of the bunches that hang on their plants."""
+        """True poses of rigid bodies, and of the bunches that hang on their plants."""
         with self.channel.truth.reading() as truth:
+            version, memory = int(truth["version"][0]), self._rigid.memory
+            if memory is None or version != self._rigid.version:  # the list has not arrived: the next poses will do
+                return
             now, attached = float(truth["time"][0]), np.flatnonzero(truth["attached"])
-            poses = np.concatenate([truth["box_q"], truth["bunch_q"][attached]])
-        if len(poses) != len(self._truth_names):
-            self._truth_names = (*self._box_names, *(self._bunch_names[i] for i in attached))
+            rigid_q = memory["visual_q"][: len(self._rigid.visuals)]
+            poses = np.concatenate([rigid_q, truth["bunch_q"][attached]])
+        if (named := (version, attached.tobytes())) != self._named:
+            rigid = map(truth_frame, self._rigid.visuals)
+            self._named, self._truth_names = named, (*rigid, *(self._bunch_names[i] for i in attached))
         self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:
@@ -170,9 +181,16 @@ class RosWorker:
         wanted = self.channel.wanted
         wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
         wanted["goals"][0] = self.node.has_goals
-        wanted["truth"][0] = self.node.has_subscribers(TRUTH_TOPIC)
+        wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
         now = time.monotonic()
         if now >= self._next_statistics:
             self._next_statistics = now + STATISTICS_PERIOD
             statistics: dict[str, Any] = {"sent": self.node.sent, "dropped": self.node.dropped}
             self.pipe.send(("statistics", statistics))
+
+
+def truth_frame(visual: RigidVisual) -> str:
+    """Frame of a box, a picked bunch or a part of a person: ``box_3``, ``picked_bunch_00017``, ``anna/head``."""
+    if visual.organ == Organ.BUNCH:
+        return f"picked_bunch_{visual.index:05d}"
+    return f"box_{visual.index}" if visual.organ == Organ.BOX else visual.name

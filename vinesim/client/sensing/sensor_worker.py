@@ -10,6 +10,7 @@ import sys
 import time
 import zlib
 from collections.abc import Callable, Mapping
+from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
 from typing import TYPE_CHECKING, Any
@@ -156,8 +157,22 @@ class SensorWorker:
             SensorNode(
                 f"{ros_name(config.name)}_sensors", namespace=config.namespace,
                 cameras=[m.name for m in description.cameras], lidars=[m.name for m in description.lidars],
+                rates=self._rates(),
             )
         )  # fmt: skip
+
+    def _rates(self) -> dict[str, float]:
+        """Rates of all sensors at the start [Hz]."""
+        from vinesim.sensors.camera.camera import CameraSpec
+        from vinesim.sensors.lidar.lidar import LidarSpec
+
+        given, description = self.config.sensor_hz, self.config.description
+        cameras = {m.name: given or m.rate or CameraSpec.load(m.type).rate.value for m in description.cameras}
+        return cameras | {m.name: given or LidarSpec.load(m.type).rate.value for m in description.lidars}
+
+    def _present_rate(self, name: str) -> Callable[[], float] | None:
+        """The rate of a sensor that its parameter says."""
+        return None if self.node is None else partial(self.node.rate, name)
 
     def _open_sensors(self) -> SensorScheduler:
         from vinesim.sensors.camera.camera import Camera, CameraSpec
@@ -176,11 +191,13 @@ class SensorWorker:
             camera = Camera(spec, info, mount.name, config.sun, quality=mount.quality, seed=seed, device=device)
             always = config.keep_pictures and i == 0
             wanted = self._camera_demand(mount.name, always)
-            sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, config.sensor_hz or mount.rate))
+            rate, present = config.sensor_hz or mount.rate, self._present_rate(mount.name)
+            sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, rate, present))
         for mount in config.description.lidars:
             lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed, device=device)
             wanted = self._lidar_demand(mount.name)
-            sensors.append(ScheduledSensor(lidar, self._deliver_lidar, wanted, config.sensor_hz))
+            present = self._present_rate(mount.name)
+            sensors.append(ScheduledSensor(lidar, self._deliver_lidar, wanted, config.sensor_hz, present))
         primitives = Primitives(config.model, renderer=config.renderer, device=device)
         return SensorScheduler(config.model, sensors, primitives=primitives)
 
@@ -194,16 +211,15 @@ class SensorWorker:
         return device
 
     def _camera_demand(self, name: str, always: bool) -> Callable[[], CameraOutput]:
-        """The outputs of a camera that its subscribers need now; all but the exact depth if ``always``."""
-        if always:
-            return lambda: CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
+        """The outputs of a camera that its subscribers need now; if ``always``, also a whole picture."""
+        kept = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS if always else CameraOutput.NONE
         node = self.node
-        return lambda: CameraOutput.NONE if node is None else node.camera_outputs_wanted(name)
+        return lambda: kept if node is None else kept | node.camera_outputs_wanted(name)
 
     def _lidar_demand(self, name: str) -> Callable[[], CameraOutput]:
         """Whether a lidar has subscribers now."""
         return lambda: (
-            CameraOutput.DEPTH if self.node is not None and self.node.has_subscribers(name) else CameraOutput.NONE
+            CameraOutput.DEPTH if self.node is not None and self.node.lidar_wanted(name) else CameraOutput.NONE
         )
 
     # ------------------------------------------------------------------ loop

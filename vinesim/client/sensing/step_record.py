@@ -38,6 +38,7 @@ class StepRecords:
                 *((name, "f8", (joints,)) for name in (*_JOINT_ROWS, "desired", "desired_velocity")),
                 ("imu", "f8", (len(self._imus), 10)), ("wrench", "f8", (len(self._wrenches), 6)),
                 ("base_q", "f8", (7,)), ("base_qd", "f8", (6,)), ("odom_q", "f8", (7,)),
+                ("odom_qd", "f8", (6,)), ("odom_covariance", "f8", (2, 3, 3)),
                 ("transform_q", "f8", (transforms, 7)), ("contacts", _CONTACT, (MAX_CONTACTS,)),
             ]
         )  # fmt: skip
@@ -51,6 +52,7 @@ class StepRecords:
         record["position"], record["velocity"] = joints.position, joints.velocity
         record["effort"], record["contact"] = joints.effort, joints.contact
         record["base_q"], record["base_qd"], record["odom_q"] = sample.base_q, sample.base_qd, sample.odom_q
+        record["odom_qd"], record["odom_covariance"] = sample.odom_qd, sample.odom_covariance
         record["transform_q"] = sample.transform_q
         if (reference := sample.reference) is not None:
             record["desired"], record["desired_velocity"] = reference.position, reference.velocity
@@ -84,8 +86,8 @@ class StepRecords:
         )  # fmt: skip
         now, deflection = joints.time, joints.effort / self.series_stiffness
         return RobotSample(
-            self.actor, joints, record["base_q"], record["base_qd"], record["odom_q"], self.transforms,
-            record["transform_q"], contacts,
+            self.actor, joints, record["base_q"], record["base_qd"], record["odom_q"], record["odom_qd"],
+            record["odom_covariance"], self.transforms, record["transform_q"], contacts,
             elements=ElasticSample(
                 now, self.joints, self.series_stiffness, joints.position + deflection, deflection, joints.effort
             ),

@@ -260,6 +260,15 @@ def contact_ends(
 
 
 @wp.func
+def is_tied(capsule: int, geom: int, capsules: Capsules):
+    """Whether a tie holds a capsule at a geom, by MuJoCo's number: then they do not collide."""
+    tied = bool(False)
+    for k in range(capsules.tied_geom.shape[1]):
+        tied = tied or capsules.tied_geom[capsule, k] == geom
+    return tied
+
+
+@wp.func
 def clear_slots(row: int, count: int, candidates_out: Candidates):
     """Mark the slots of a row beyond its candidates as empty."""
     slots = candidates_out.feature.shape[1]
@@ -324,7 +333,7 @@ def find_rigid_contacts(
                 if overlap and wp.dot(between, between) < limit * limit:
                     rotation = rigid.xmat[geoms.id[g]]
                     nearest = segment_geom_distance(geoms, hulls, g, rotation, center, a, b, radius + margin)
-                    if nearest[3] - radius < margin:
+                    if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules):
                         ends = contact_ends(parameters, geoms, hulls, g, rotation, center, a, b, nearest)
                         pair = Pair()
                         pair.capsule = s

@@ -123,6 +123,8 @@ class Capsules:
     rest_start: wp.array(dtype=wp.vec3)
     """[capsule] m, in the world while all plants rest as they were generated."""
     rest_end: wp.array(dtype=wp.vec3)
+    tied_geom: wp.array2d(dtype=wp.int32)
+    """[capsule, k] MuJoCo's numbers of wires that it does not collide with, being tied to them; -1 for none."""
 
 
 @wp.struct

@@ -33,7 +33,7 @@ from vinesim.scene.triangles import is_digest
 log = logging.getLogger(__name__)
 
 LISTEN = "tcp/127.0.0.1:7447"
-"""Default endpoint: all interfaces, Zenoh's port."""
+"""Default endpoint: this machine alone, Zenoh's port."""
 
 LEASE = 1000
 """A server that is silent for this long is taken to be gone [ms]: half of what actors are granted."""

@@ -14,7 +14,9 @@ from vinesim.physics.contact.plant_capsules import PlantCapsules
 from vinesim.physics.contact.warp_arrays import SharedArrays
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.berry_clusters import spans
 from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.physics.rigid.static_world import FIRST_FIXED_GEOM
 from vinesim.scene.model import Model
 
 
@@ -73,8 +75,28 @@ class PlantArrays:
             extent=(ends + capsules.radius).astype(np.float32),
             rest_start=rest_start,
             rest_end=rest_end,
+            tied_geom=_tied_geoms(model)[capsules.body],
         )
         self.capsule_states = SharedArrays.zeros(structs.CapsuleStates, len(capsules.body))
+
+
+def _tied_geoms(model: Model) -> np.ndarray:
+    """Wires that each body does not collide with [body, k], MuJoCo's numbers or -1: those to which it, its parent or a
+    child of it is tied. Such a tie is a spring both ways; the geom of the wire stands where the wire is when straight.
+    """
+    bound = model.tie_wire >= 0
+    body, geom = model.tie_body[bound], model.tie_wire[bound] + FIRST_FIXED_GEOM
+    parent = model.body_parent
+    first, end = np.searchsorted(body, parent), np.searchsorted(body, parent, side="right")
+    count = np.where(parent >= 0, end - first, 0)
+    of_parent = spans(first, count)
+    above = parent[body] >= 0
+    bodies = np.concatenate([body, parent[body][above], np.repeat(np.arange(len(parent)), count)])
+    pairs = np.unique(np.stack([bodies, np.concatenate([geom, geom[above], geom[of_parent]])], -1), axis=0)
+    place = np.arange(len(pairs)) - np.searchsorted(pairs[:, 0], pairs[:, 0])
+    table = np.full((len(parent), place.max(initial=-1) + 1), -1, np.int32)
+    table[pairs[:, 0], place] = pairs[:, 1]
+    return table
 
 
 _GEOM_FIELDS = tuple(field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link"))

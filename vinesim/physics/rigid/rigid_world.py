@@ -43,7 +43,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         super().__init__(model, parameters=parameters)
         self.faults = 0
-        """Number of kinematic trees that were stopped because one of their numbers was not finite."""
+        """Number of kinematic trees that were stopped: one of their numbers was not finite, or a rate too high."""
         self.last_fault = ""
         """Time and names of the last ones; empty if there was none."""
 

@@ -22,6 +22,9 @@ CRATE_BED_DEPTH = 0.08
 deeper after a step; in the middle of a bottom as thin as it looks it would be pushed out below."""
 CRATE_COLOR = (0.75, 0.15, 0.12, 1.0)
 
+FIRST_FIXED_GEOM = 1
+"""MuJoCo's number of the geom of the first fixed piece; the ground has 0, and the other pieces follow."""
+
 GROUND, FIXED, BOX, CRATE_FLOOR, FREE_BUNCH, REMOTE_HAND = (1 << bit for bit in range(6))
 """Collision bits. Free bunches touch the deep bed of a crate, all others its thin floor. Robots do not touch hands of
 remote people: the person's own client computes with what force they push."""

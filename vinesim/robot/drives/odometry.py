@@ -1,10 +1,19 @@
-"""Odometry of tracks that slip: pose of the base as its track encoders measure it."""
+"""Odometry of tracks that slip: pose and velocity of the base as its track encoders measure them.
+
+Tracks measure travel ahead and turns, never motion sideways. Of both the ground loses a constant share, which odometry
+does not know: that share is the standard deviation of what it measures. The covariance of the pose follows to first
+order, by the derivative of the measured pose in the two shares.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from vinesim import frames
+
+LEAST_VARIANCE = 1e-6
+"""[m2, rad2, m2/s2, rad2/s2] Added to every variance, so that filters can invert covariances. GUESSED: of encoders that
+resolve a millimetre."""
 
 
 class TrackOdometry:
@@ -13,9 +22,14 @@ class TrackOdometry:
     def __init__(self, linear_slip: float, angular_slip: float, pose: np.ndarray) -> None:
         """``linear_slip``, ``angular_slip``: shares of the travel that are lost, 0 to below 1; ``pose`` [7] at
         start."""
+        self._slip = linear_slip, angular_slip
         self._gain = 1.0 / (1.0 - linear_slip), 1.0 / (1.0 - angular_slip)
         self._actual = float(pose[0]), float(pose[1]), frames.to_yaw(pose[3:])
         self._measured = 0.0, 0.0, 0.0
+        self._by_linear = 0.0, 0.0
+        """Derivative of the measured x and y in the share of the travel that is lost."""
+        self._by_angular = 0.0, 0.0, 0.0
+        """Derivative of the measured x, y and yaw in the share of turns that is lost."""
 
     def update(self, base_q: np.ndarray) -> np.ndarray:
         """Add the motion to ``base_q`` [7], the actual pose, and return the measured pose [7] since the start."""
@@ -23,10 +37,31 @@ class TrackOdometry:
         self._actual = float(base_q[0]), float(base_q[1]), frames.to_yaw(base_q[3:])
         turn = (self._actual[2] - yaw + np.pi) % (2.0 * np.pi) - np.pi
         c, s = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
-        travel = self._actual[0] - x, self._actual[1] - y
-        ahead, left = self._gain[0] * (c * travel[0] + s * travel[1]), c * travel[1] - s * travel[0]
+        ahead = self._gain[0] * (c * (self._actual[0] - x) + s * (self._actual[1] - y))
         turn *= self._gain[1]
         x, y, yaw = self._measured
         c, s = np.cos(yaw + 0.5 * turn), np.sin(yaw + 0.5 * turn)
-        self._measured = x + c * ahead - s * left, y + s * ahead + c * left, yaw + turn
+        self._measured = x + c * ahead, y + s * ahead, yaw + turn
+        linear, (across, along, angle) = self._by_linear, self._by_angular
+        middle = angle + 0.5 * turn
+        self._by_linear = linear[0] + c * ahead, linear[1] + s * ahead
+        self._by_angular = across - s * ahead * middle, along + c * ahead * middle, angle + turn
         return frames.pose([*self._measured[:2], 0.0], frames.from_yaw(self._measured[2]))
+
+    def velocity(self, base_q: np.ndarray, base_qd: np.ndarray) -> np.ndarray:
+        """Velocity [6] in the base's axes as the tracks measure it, at the pose [7] and velocity [6] in the world."""
+        back = frames.conjugate(np.asarray(base_q, float)[3:])
+        measured = np.zeros(6)
+        measured[0] = self._gain[0] * frames.rotate(back, base_qd[:3])[0]
+        measured[5] = self._gain[1] * frames.rotate(back, base_qd[3:])[2]
+        return measured
+
+    def covariance(self, velocity: np.ndarray) -> np.ndarray:
+        """Covariances [2, 3, 3] in x, y and yaw: of the measured pose, and of the measured ``velocity`` [6]."""
+        linear = self._slip[0] * np.array([*self._by_linear, 0.0])
+        angular = self._slip[1] * np.array(self._by_angular)
+        found = np.zeros((2, 3, 3))
+        found[0] = np.outer(linear, linear) + np.outer(angular, angular)
+        found[1, 0, 0], found[1, 2, 2] = (self._slip[0] * velocity[0]) ** 2, (self._slip[1] * velocity[5]) ** 2
+        found[:, range(3), range(3)] += LEAST_VARIANCE
+        return found

@@ -54,12 +54,15 @@ class RobotInstance:
         """State of the robot at ``time`` [s]; of ``contacts`` only its own are kept."""
         position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
+        odom_q, odom_qd = self._odometry(base_q), self._track_odometry.velocity(base_q, base_qd)
         return RobotSample(
             actor=self.name,
             joints=JointSample(time, self.description.joints, position, velocity, effort, contact),
             base_q=base_q,
             base_qd=base_qd,
-            odom_q=self._odometry(base_q),
+            odom_q=odom_q,
+            odom_qd=odom_qd,
+            odom_covariance=self._track_odometry.covariance(odom_qd),
             transforms=self.description.moving_joints.frames,
             transform_q=self.description.moving_joints.poses(position),
             contacts=tuple(c for c in contacts if c.actor == self.name),

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import array
 import functools
-import json
+import struct
 import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -21,12 +21,11 @@ from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo as CameraInfoMessage
-from sensor_msgs.msg import CompressedImage, Image, JointState, PointCloud2, PointField
+from sensor_msgs.msg import CompressedImage, Image, JointState, LaserScan, PointCloud2, PointField
 from sensor_msgs.msg import Imu as ImuMessage
-from std_msgs.msg import Header, String
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from vinesim import frames
 from vinesim.ros.messages.transforms import split_time
 from vinesim.scene.camera_geometry import (
     DISTORTION,
@@ -36,7 +35,6 @@ from vinesim.scene.camera_geometry import (
     intrinsic_matrix,
     write_points,
 )
-from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.values import (
     CameraFrame,
     CameraInfo,
@@ -112,15 +110,24 @@ def joint_state(sample: JointSample) -> JointState:
     )
 
 
+_PLANAR = (0, 1, 5)
+"""x, y and yaw in a covariance of 6 rows."""
+UNMEASURED = 1e6
+"""Variance of z, roll and pitch in odometry, which tracks do not measure."""
+
+
 def odometry(sample: RobotSample, base: str) -> Odometry:
-    """Odometry of the base: pose in ``odom``, velocity in its own axes."""
+    """Odometry of the base: pose in ``odom``, velocity in its own axes, both as measured, and their covariances."""
     message = Odometry(header=header(sample.joints.time, "odom"), child_frame_id=base)
     pose = message.pose.pose
     _set_vector(pose.position, sample.odom_q[:3])
     _set_quaternion(pose.orientation, sample.odom_q[3:])
-    into_base = frames.conjugate(np.asarray(sample.base_q, float)[3:])
-    _set_vector(message.twist.twist.linear, frames.rotate(into_base, sample.base_qd[:3]))
-    _set_vector(message.twist.twist.angular, frames.rotate(into_base, sample.base_qd[3:]))
+    _set_vector(message.twist.twist.linear, sample.odom_qd[:3])
+    _set_vector(message.twist.twist.angular, sample.odom_qd[3:])
+    for target, planar in zip((message.pose, message.twist), sample.odom_covariance, strict=True):
+        covariance = np.diag([0.0, 0.0, UNMEASURED, UNMEASURED, UNMEASURED, 0.0])
+        covariance[np.ix_(_PLANAR, _PLANAR)] = planar
+        target.covariance = covariance.ravel()
     return message
 
 
@@ -173,7 +180,7 @@ robot's link by its number in the URDF or -1."""
 
 def contact_cloud(sample: RobotSample, links: Mapping[str, int], bunch_of_body: np.ndarray, frame: str) -> PointCloud2:
     """All contacts of one step, in the world's ``frame``; ``links``: numbers by name, ``bunch_of_body`` [body]."""
-    message, points = _cloud(sample.joints.time, frame, CONTACT_POINT, 1, len(sample.contacts))
+    message, points = cloud(sample.joints.time, frame, CONTACT_POINT, 1, len(sample.contacts))
     for row, contact in zip(points[0], sample.contacts, strict=True):
         row["x"], row["y"], row["z"] = contact.position
         row["force_x"], row["force_y"], row["force_z"] = contact.force
@@ -198,15 +205,39 @@ def depth_image_millimetres(frame: CameraFrame) -> Image:
     return _image(frame, depth_millimetres(frame.depth), "16UC1", np.uint16)
 
 
+QUANTIZATION, MAX_COMPRESSED_DEPTH = 100.0, 10.0
+"""Of compressed depth, [1] and [m]: the defaults of compressed_depth_image_transport."""
+
+
+def compressed_depth(frame: CameraFrame, *, is_millimetres: bool = False) -> CompressedImage:
+    """Depth as compressed_depth_image_transport encodes it: a header of 12 bytes, then a PNG of 16 bits.
+
+    Millimetres, or the inverse of depth: q = a / depth + b, 0 where there is none and from 10 m on; a and b stand in
+    the header. Nearer than 0.152 m 16 bits cannot hold q, which then is 0.
+    """
+    import cv2  # here, as a process that sends no pictures should not load it
+
+    scale = offset = 0.0
+    if is_millimetres:
+        encoding, pixels = "16UC1", depth_millimetres(frame.depth)
+        pixels[pixels > 1000.0 * MAX_COMPRESSED_DEPTH] = 0
+    else:
+        encoding, scale = "32FC1", QUANTIZATION * (QUANTIZATION + 1.0)
+        offset = 1.0 - scale / MAX_COMPRESSED_DEPTH
+        is_known = np.isfinite(frame.depth) & (frame.depth < MAX_COMPRESSED_DEPTH) & (frame.depth > 0.0)
+        inverse = scale / np.where(is_known, frame.depth, np.float32(MAX_COMPRESSED_DEPTH)) + offset
+        pixels = np.where(is_known & (inverse <= np.iinfo(np.uint16).max), inverse, 0.0).astype(np.uint16)
+    encoded, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not encoded:
+        raise ValueError(f"camera {frame.name}: could not encode depth of shape {frame.depth.shape}")
+    message = CompressedImage(header=header(frame.time, frame.info.frame_id), format=f"{encoding}; compressedDepth png")
+    message.data = _bytes(np.frombuffer(struct.pack("<iff", 0, scale, offset) + data.tobytes(), np.uint8))
+    return message
+
+
 def label_image(frame: CameraFrame) -> Image:
     """Label of every pixel (:func:`vinesim.scene.ids.label`), 32SC1."""
     return _image(frame, frame.labels, "32SC1", np.int32)
-
-
-def label_map() -> String:
-    """The meaning of labels as JSON: ``label // stride`` is an organ, ``label % stride`` which one of them."""
-    organs = {str(int(organ)): organ.name.lower() for organ in Organ}
-    return String(data=json.dumps({"stride": LABEL_STRIDE, "organs": organs}))
 
 
 def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
@@ -234,7 +265,7 @@ def camera_info(info: CameraInfo, time: float) -> CameraInfoMessage:
 
 def depth_cloud(frame: CameraFrame) -> PointCloud2:
     """Depth and colour as an organised cloud in the optical frame; NaN where there is no depth."""
-    message, points = _cloud(frame.time, frame.info.frame_id, POINT_DTYPE, frame.info.height, frame.info.width)
+    message, points = cloud(frame.time, frame.info.frame_id, POINT_DTYPE, frame.info.height, frame.info.width)
     write_points(frame, points)
     message.is_dense = False
     return message
@@ -246,7 +277,7 @@ def lidar_cloud(scan: LidarScan) -> PointCloud2:
     Raw, as drivers publish it: each point in the frame that the lidar had at that point's time.
     """
     point = LIDAR_POINT if scan.returned is None else DUAL_LIDAR_POINT
-    message, points = _cloud(scan.time, scan.frame_id, point, 1, len(scan.xyz))
+    message, points = cloud(scan.time, scan.frame_id, point, 1, len(scan.xyz))
     points = points[0]
     for axis, name in enumerate("xyz"):
         points[name] = scan.xyz[:, axis]
@@ -259,16 +290,49 @@ def lidar_cloud(scan: LidarScan) -> PointCloud2:
     return message
 
 
+def laser_scan(scan: LidarScan) -> LaserScan:
+    """The laser nearest to the horizontal as a scan in its plane: the nearest return of each shot, +Inf for none.
+
+    Angles rise, as most programs expect, while the head turns clockwise: the first ray is the last that was fired,
+    which the stamp is of, and ``time_increment`` is negative.
+    """
+    level = scan.level
+    if level is None:
+        raise ValueError(f"lidar {scan.name}: no laser is named that looks level; give LidarScan.level")
+    message = LaserScan(header=header(scan.time + level.delay + (level.count - 1) * level.period, scan.frame_id))
+    step = 2.0 * np.pi / level.count
+    message.angle_min, message.angle_increment = level.azimuth + step, step
+    message.angle_max = level.azimuth + 2.0 * np.pi
+    message.time_increment, message.scan_time = -level.period, level.count * level.period
+    message.range_min, message.range_max = level.nearest, level.farthest
+    ranges = np.full(level.count, np.inf, np.float32)
+    intensities = np.zeros(level.count, np.float32)
+    points = np.flatnonzero(scan.ring == level.ring)
+    shot = np.rint((scan.offset[points] - level.delay) / level.period).astype(int)
+    found = np.hypot(scan.xyz[points, 0], scan.xyz[points, 1])
+    far_first = np.argsort(-found, kind="stable")  # of two returns the nearer is written last
+    rays = level.count - 1 - shot[far_first]
+    ranges[rays], intensities[rays] = found[far_first], scan.intensity[points][far_first]
+    message.ranges, message.intensities = _floats(ranges), _floats(intensities)
+    return message
+
+
 _LEVELS = {"ok": DiagnosticStatus.OK, "warning": DiagnosticStatus.WARN, "error": DiagnosticStatus.ERROR}
 
 
 def diagnostics(time: float, prefix: str, components: Iterable[ComponentStatus]) -> DiagnosticArray:
-    """States of the components of a client; their names get the ``prefix``."""
+    """States of the components of a client; their names get the ``prefix``, which names the hardware, too."""
     statuses = []
     for one in components:
         values = [KeyValue(key=key, value=str(value)) for key, value in one.values.items()]
         statuses.append(
-            DiagnosticStatus(name=f"{prefix}: {one.name}", level=_LEVELS[one.level], message=one.message, values=values)
+            DiagnosticStatus(
+                name=f"{prefix}: {one.name}",
+                hardware_id=prefix,
+                level=_LEVELS[one.level],
+                message=one.message,
+                values=values,
+            )
         )
     return DiagnosticArray(header=header(time, ""), status=statuses)
 
@@ -288,7 +352,7 @@ def _image(frame: CameraFrame, pixels: np.ndarray, encoding: str, dtype: type) -
     return message
 
 
-def _cloud(time: float, frame: str, point: np.dtype, height: int, width: int) -> tuple[PointCloud2, np.ndarray]:
+def cloud(time: float, frame: str, point: np.dtype, height: int, width: int) -> tuple[PointCloud2, np.ndarray]:
     """A cloud without values, and its points [height, width] to write them into."""
     message = PointCloud2(header=header(time, frame), height=height, width=width)
     message.fields = list(_fields(point))
@@ -317,6 +381,12 @@ def _bytes(values: np.ndarray) -> array.array:
 def _doubles(values: np.ndarray) -> array.array:
     data = array.array("d")
     data.frombytes(np.ascontiguousarray(values, np.float64).view(np.uint8).data)
+    return data
+
+
+def _floats(values: np.ndarray) -> array.array:
+    data = array.array("f")
+    data.frombytes(np.ascontiguousarray(values, np.float32).view(np.uint8).data)
     return data
 
 

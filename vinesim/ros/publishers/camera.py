@@ -2,48 +2,94 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from functools import partial
 
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from vinesim.ros.messages import convert
-from vinesim.ros.topic import SENSOR_DATA, Advertise, PendingMessage
+from vinesim.ros.parameters import Parameters
+from vinesim.ros.topic import SENSOR_DATA, TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values import CameraFrame, CameraOutput
+
+RGB, DEPTH, LABELS = CameraOutput.RGB, CameraOutput.DEPTH, CameraOutput.LABELS
 
 
 class CameraPublisher:
-    """``<name>/{rgb,depth}/{image_raw,camera_info}``, ``rgb/image_raw/compressed``, ``depth/points``, ``labels``."""
+    """``<name>/{rgb,depth}/{image_raw,camera_info}``, ``rgb/image_raw/compressed``,
+    ``depth/image_raw/compressedDepth``, ``depth/points``; and the truth: ``labels``, ``label_info`` (latched),
+    ``detections``, ``detections_3d``, ``bunches``.
 
-    def __init__(self, advertise: Advertise, name: str) -> None:
+    Its parameters: ``<name>.exact_depth``, ``<name>.depth_encoding_16uc1``, ``<name>.jpeg_quality``.
+    """
+
+    def __init__(self, advertise: Advertise, name: str, parameters: Parameters) -> None:
+        # vision_msgs can be imported once the node has seen to it
+        from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
+
+        from vinesim.ros.messages import bunches
+
+        self._name, self._parameters = name, parameters
+        advertise(LabelInfo, f"{name}/label_info", TRANSIENT_LOCAL).send(bunches.label_info())
+        declare = parameters.declare
+        declare(f"{name}.exact_depth", False, "Exact depth instead of depth with the errors of the sensor.")
+        declare(
+            f"{name}.depth_encoding_16uc1", False, "Images of depth in millimetres (16UC1) instead of metres (32FC1)."
+        )
+        declare(f"{name}.jpeg_quality", 85, "Of rgb/image_raw/compressed.", (1, 100))
         self._infos = [advertise(CameraInfo, f"{name}/{kind}/camera_info", SENSOR_DATA) for kind in ("rgb", "depth")]
-        rgb, depth, labels = CameraOutput.RGB, CameraOutput.DEPTH, CameraOutput.LABELS
-        self._built = (
-            (advertise(Image, f"{name}/rgb/image_raw", SENSOR_DATA), rgb, convert.rgb_image),
-            (advertise(Image, f"{name}/depth/image_raw", SENSOR_DATA), depth, convert.depth_image),
-            (advertise(Image, f"{name}/labels", SENSOR_DATA), labels, convert.label_image),
-            (
-                advertise(CompressedImage, f"{name}/rgb/image_raw/compressed", SENSOR_DATA), rgb,
-                convert.compressed_image,
-            ),
-            (advertise(PointCloud2, f"{name}/depth/points", SENSOR_DATA), rgb | depth, convert.depth_cloud),
-        )  # fmt: skip
+        self._rgb = advertise(Image, f"{name}/rgb/image_raw", SENSOR_DATA)
+        self._depth = advertise(Image, f"{name}/depth/image_raw", SENSOR_DATA)
+        self._labels = advertise(Image, f"{name}/labels", SENSOR_DATA)
+        self._jpeg = advertise(CompressedImage, f"{name}/rgb/image_raw/compressed", SENSOR_DATA)
+        self._png = advertise(CompressedImage, f"{name}/depth/image_raw/compressedDepth", SENSOR_DATA)
+        self._points = advertise(PointCloud2, f"{name}/depth/points", SENSOR_DATA)
+        self._bunches = {
+            advertise(Detection2DArray, f"{name}/detections", SENSOR_DATA): bunches.detections_2d,
+            advertise(Detection3DArray, f"{name}/detections_3d", SENSOR_DATA): bunches.detections_3d,
+            advertise(PointCloud2, f"{name}/bunches", SENSOR_DATA): bunches.bunch_cloud,
+        }
+        self._needs = {
+            self._rgb: RGB, self._depth: DEPTH, self._labels: LABELS, self._jpeg: RGB, self._png: DEPTH,
+            self._points: RGB | DEPTH, **dict.fromkeys(self._bunches, CameraOutput.BUNCHES),
+        }  # fmt: skip
+
+    def mute_truth(self, is_muted: bool) -> None:
+        """Whether labels and detections are kept back."""
+        for topic in (self._labels, *self._bunches):
+            topic.mute(is_muted)
 
     def wanted(self) -> CameraOutput:
         """The outputs that the present subscribers need; a picture if there are none but of camera_info."""
         outputs = CameraOutput.NONE
-        for topic, needs, _ in self._built:
+        for topic, needs in self._needs.items():
             if topic.subscription_count:
                 outputs |= needs
         if not outputs and any(topic.subscription_count for topic in self._infos):
-            return CameraOutput.RGB
+            return RGB
+        if DEPTH in outputs and self._parameters[f"{self._name}.exact_depth"]:
+            outputs = outputs & ~DEPTH | CameraOutput.EXACT_DEPTH
         return outputs
 
     def pending(self, frame: CameraFrame) -> Iterator[PendingMessage]:
         """All messages that can be made of one picture, the cheap ones first."""
+        if self._parameters[f"{self._name}.exact_depth"] and CameraOutput.EXACT_DEPTH in frame.outputs:
+            assert frame.exact_depth is not None
+            frame = dataclasses.replace(frame, depth=frame.exact_depth)
+        is_millimetres = self._parameters[f"{self._name}.depth_encoding_16uc1"]
+        quality = self._parameters[f"{self._name}.jpeg_quality"]
+        builds = {
+            self._rgb: partial(convert.rgb_image, frame),
+            self._depth: partial(convert.depth_image_millimetres if is_millimetres else convert.depth_image, frame),
+            self._labels: partial(convert.label_image, frame),
+            self._jpeg: partial(convert.compressed_image, frame, quality),
+            self._png: partial(convert.compressed_depth, frame, is_millimetres=is_millimetres),
+            self._points: partial(convert.depth_cloud, frame),
+        } | {topic: partial(build, frame) for topic, build in self._bunches.items()}
         made = frame.outputs
         for topic in self._infos:
             yield topic, partial(convert.camera_info, frame.info, frame.time)
-        for topic, needs, build in self._built:
+        for topic, needs in self._needs.items():
             if needs in made:
-                yield topic, partial(build, frame)
+                yield topic, builds[topic]

@@ -32,6 +32,11 @@ class ContactPublisher:
         self._bunch_of_body, self._links = bunch_of_body, links or {}
         self._steps = 0
 
+    def mute(self, is_muted: bool) -> None:
+        """Whether nothing is sent."""
+        for topic in (self._contacts, self._markers):
+            topic.mute(is_muted)
+
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """All messages of one step."""
         yield self._contacts, partial(convert.contact_cloud, sample, self._links, self._bunch_of_body, MAP_FRAME)

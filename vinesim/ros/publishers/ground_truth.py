@@ -1,4 +1,4 @@
-"""Topics of ground truth: true poses apart from the robot's own tf, and the meaning of label images."""
+"""Topics of true poses apart from the robot's own tf."""
 
 from __future__ import annotations
 
@@ -6,21 +6,19 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
-from std_msgs.msg import String
 
-from vinesim.ros.messages import convert
 from vinesim.ros.messages.transforms import SerializedTransforms
 from vinesim.ros.publishers.robot import MAP_FRAME
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
 
 
 class GroundTruthPublisher:
-    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles) in the map; ``label_map``, latched."""
+    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles) in the map."""
 
     def __init__(self, advertise: Advertise, tf_message: type) -> None:
         self._moving = advertise(tf_message, "tf_environment", RELIABLE)
         self._static = advertise(tf_message, "tf_environment_static", TRANSIENT_LOCAL)
-        advertise(String, "label_map", TRANSIENT_LOCAL).send(convert.label_map())
+        self._poles: tuple[Sequence[str], np.ndarray] = (), np.zeros((0, 7))
         self._names: Sequence[str] | None = None
         self._transforms = SerializedTransforms([])
 
@@ -30,8 +28,15 @@ class GroundTruthPublisher:
 
     def pending_static(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
         """The message of true poses [name, 7] of what never moves."""
+        self._poles = names, poses
         transforms = SerializedTransforms([(MAP_FRAME, name) for name in names])
         yield self._static, partial(transforms.message, 0.0, poses)
+
+    def mute(self, is_muted: bool) -> None:
+        """Whether true poses are kept back; late subscribers then receive an empty message of what never moves."""
+        self._moving.mute(is_muted)
+        names, poses = ((), np.zeros((0, 7))) if is_muted else self._poles
+        self._static.send(SerializedTransforms([(MAP_FRAME, name) for name in names]).message(0.0, poses))
 
     def _message(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> bytes:
         if names is not self._names:

@@ -31,7 +31,9 @@ class RobotPublisher:
         base: str,
     ) -> None:
         self._base = base
-        self._pairs: tuple[tuple[str, str], ...] | None = None
+        self.publishes_map_to_odom = True
+        """Whether ``tf`` holds the true pose of ``odom`` in the map, which else a localisation publishes."""
+        self._pairs: tuple[bool, tuple[tuple[str, str], ...]] | None = None
         self._transforms = SerializedTransforms([])
 
         self._joints = advertise(JointState, "joint_states", RELIABLE)
@@ -50,12 +52,12 @@ class RobotPublisher:
         yield self._odometry, partial(convert.odometry, sample, self._base)
 
     def _frames(self, sample: RobotSample) -> bytes:
-        if sample.transforms is not self._pairs:
-            self._transforms = SerializedTransforms(
-                [(MAP_FRAME, ODOM_FRAME), (ODOM_FRAME, self._base), *sample.transforms]
-            )
-            self._pairs = sample.transforms
+        has_map = self.publishes_map_to_odom
+        if self._pairs is None or self._pairs[0] != has_map or self._pairs[1] is not sample.transforms:
+            above = [(MAP_FRAME, ODOM_FRAME)] * has_map
+            self._transforms = SerializedTransforms([*above, (ODOM_FRAME, self._base), *sample.transforms])
+            self._pairs = has_map, sample.transforms
         base, odom = np.asarray(sample.base_q, float), np.asarray(sample.odom_q, float)
-        drift = frames.compose(base, frames.inverse(odom))
-        poses = np.concatenate([[drift, odom], np.reshape(sample.transform_q, (-1, 7))])
+        above = [frames.compose(base, frames.inverse(odom))] * has_map
+        poses = np.concatenate([[*above, odom], np.reshape(sample.transform_q, (-1, 7))])
         return self._transforms.message(sample.joints.time, poses)

@@ -20,12 +20,24 @@ from vinesim.scene.values.robot import (
     RobotSpec,
     Wrench,
 )
-from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
+from vinesim.scene.values.sensors import (
+    MIN_BERRY_PIXELS,
+    Box,
+    BunchTruth,
+    CameraFrame,
+    CameraInfo,
+    CameraOutput,
+    LevelLaser,
+    LidarScan,
+)
 from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
 __all__ = [
+    "MIN_BERRY_PIXELS",
     "POINT_NAMES",
+    "Box",
+    "BunchTruth",
     "CameraFrame",
     "CameraInfo",
     "CameraOutput",
@@ -45,6 +57,7 @@ __all__ = [
     "Imu",
     "JointReference",
     "JointSample",
+    "LevelLaser",
     "LidarScan",
     "Measurement",
     "Mesh",

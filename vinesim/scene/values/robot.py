@@ -172,6 +172,10 @@ class RobotSample:
     """[6] its velocity, world axes."""
     odom_q: np.ndarray
     """[7] base_footprint by odometry, in ``odom``."""
+    odom_qd: np.ndarray
+    """[6] velocity by odometry, in the axes of base_footprint; 0 along what odometry does not measure."""
+    odom_covariance: np.ndarray
+    """[2, 3, 3] covariances of odometry in x, y and yaw: of ``odom_q`` in ``odom``, of ``odom_qd``; m and rad."""
     transforms: tuple[tuple[str, str], ...]
     """(parent frame, child frame) of every moving joint, the same tuple object every tick."""
     transform_q: np.ndarray

@@ -12,8 +12,8 @@ import numpy as np
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import DISTORTION, DISTORTION_MODEL, intrinsic_matrix
 from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
-from vinesim.scene.values import CameraInfo
-from vinesim.sensors.truth.ground_truth import MIN_BERRY_PIXELS, Box, BunchTruth, PixelBuffers
+from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
+from vinesim.sensors.truth.ground_truth import PixelBuffers
 
 _EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
 """Fields of a bunch in annotations beside those of COCO."""

@@ -23,7 +23,7 @@ from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.sensing import lidar_echoes
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.plant_parameters import Number
-from vinesim.scene.values import LidarScan
+from vinesim.scene.values import LevelLaser, LidarScan
 from vinesim.sensors import spec_file
 from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer
 from vinesim.sensors.scene.primitives import Primitives
@@ -184,6 +184,12 @@ class Lidar:
         # the head turns clockwise seen from above; the first shot looks forward
         beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
         azimuth = beside - 2.0 * np.pi * spec.rate.value * within
+        flat = int(np.argmin(np.abs(elevation)))
+        self.level = LevelLaser(
+            int(order[flat]), self.firings, float(within[flat]), spec.firing_period.value, float(azimuth[flat]),
+            spec.nearest.value, spec.farthest.value,
+        )  # fmt: skip
+        """The laser nearest to the horizontal."""
         across, up = self._footprint()
         self.ray_grid = grid(
             (elevation[:, None] + up).ravel(),
@@ -312,5 +318,6 @@ class Lidar:
             ring=self.ring[shot],
             offset=self.offset[shot],
             labels=labels[shot, which],
+            level=self.level,
             returned=(which + 1).astype(np.uint8) if self.spec.returns == "dual" else None,
         )

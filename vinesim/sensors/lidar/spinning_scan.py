@@ -60,10 +60,13 @@ class SpinningScan:
         self.pose_history = PoseHistory()
         self.dropped = 0
         """Revolutions that ended before their first firing could be computed."""
-        self._revolution_period = 1.0 / lidar.rate
-        self._period = max(self._revolution_period, 1.0 / rate if rate else 0.0)
+        self.set_period(1.0 / rate if rate else 0.0)
         self._start: float | None = None
         self._next_column = 0
+
+    def set_period(self, period: float) -> None:
+        """Time from one revolution to the next [s], never less than the lidar takes for one."""
+        self._period = max(1.0 / self.lidar.rate, period)
 
     def cancel(self, now: float) -> None:
         """Abandon the present revolution at ``now`` [s]."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -17,17 +18,11 @@ from vinesim.kernels.raster.primitives import FAR
 from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
+from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraFrame, CameraInfo, Snapshot
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.ray_caster import RayCaster
-
-MIN_BERRY_PIXELS = 4
-"""A berry is seen if at least so many pixels show it."""
-
-Box = tuple[int, int, int, int]
-"""First column, first row, last column, last row (inclusive)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -119,72 +114,6 @@ def _berry_numbers(primitives: Primitives) -> np.ndarray:
     return numbers
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class BunchTruth:
-    """One bunch in one picture, be it seen or hidden. Berries, rachis and pedicels belong to it, the peduncle not.
-
-    What lies outside the picture counts nowhere but in ``berries``, ``frame`` and ``size``.
-    """
-
-    bunch: int
-    """Index in the model."""
-    variety: int
-    """Index into :data:`vinesim.scene.berries.VARIETIES`."""
-    tree: int
-    """The tree on which it grew."""
-    attached: bool
-    """Whether it still hangs there."""
-    amodal_box: Box
-    """Of the pixels that would show it if there were nothing else."""
-    amodal: np.ndarray
-    """Those pixels, bool [rows, columns] of ``amodal_box``."""
-    visible: np.ndarray
-    """The pixels that do show it, bool, in the same window."""
-    visible_box: Box | None
-    """Of the pixels that show it; None if none does."""
-    berries_seen: int
-    """Berries of which at least :data:`BERRY_PIXELS` pixels are seen."""
-    berries: int
-    """All its berries."""
-    frame: np.ndarray
-    """[7] pose of the 3D box's middle in the world; x runs down the rachis."""
-    size: np.ndarray
-    """[3] m, edges of the 3D box around all its parts, in that frame."""
-    cut: np.ndarray | None
-    """[3] m, where to cut: the middle of the peduncle, in the world; None for a bunch that has been picked."""
-    cut_pixel: np.ndarray | None
-    """[2] column and row of that point, whether inside the picture or not; None behind the camera."""
-    cut_seen: bool
-    """Whether the point is in the picture and the ray to it meets its own peduncle first."""
-
-    @property
-    def label(self) -> int:
-        """Its value in label images."""
-        return label(Organ.BUNCH, self.bunch)
-
-    @property
-    def pixels(self) -> int:
-        """How many pixels show it."""
-        return int(self.visible.sum())
-
-    @property
-    def amodal_pixels(self) -> int:
-        """How many pixels would show it if there were nothing else."""
-        return int(self.amodal.sum())
-
-    @property
-    def occlusion(self) -> float:
-        """Share of its amodal pixels that show something else, 0..1."""
-        return 1.0 - self.pixels / self.amodal_pixels
-
-    def mask(self, window: np.ndarray, info: CameraInfo) -> np.ndarray:
-        """``visible`` or ``amodal`` as a mask [height, width] of the whole picture."""
-        whole = np.zeros((info.height, info.width), bool)
-        left, top, right, bottom = self.amodal_box
-        whole[top : bottom + 1, left : right + 1] = window
-        return whole
-
-
 def bunch_truths(
     primitives: Primitives, snapshot: Snapshot, seen: PixelBuffers, caster: RayCaster | None = None
 ) -> tuple[BunchTruth, ...]:
@@ -192,49 +121,87 @@ def bunch_truths(
 
     ``primitives`` as posed by ``snapshot`` when ``seen`` was taken; ``caster`` saves building one.
     """
-    model, info = primitives.model, seen.info
-    alone, lens = CameraRasterizer(info.width, info.height, primitives.device), pinhole(info, seen.pose)
-    caster = caster or RayCaster(primitives)
-    named = primitives.label[primitives.cluster_first]
-    fruit = np.flatnonzero(named // LABEL_STRIDE == int(Organ.BUNCH))
-    fruit = fruit[np.isin(named[fruit], named[fruit][alone.cluster_distances(primitives, lens)[fruit] < float(FAR)])]
-    fruit = fruit[primitives.clusters_shown()[fruit]]
-    count = np.bincount(seen.primitive[seen.berries >= 0], minlength=primitives.count)
-    a, b = primitives.shapes.a.numpy(), primitives.shapes.b.numpy()
-    loose = {one.index: k for k, one in enumerate(snapshot.visuals) if one.organ == Organ.BUNCH}
-    cuts = {
-        int(bunch): cut_point(model, snapshot.body_q, int(bunch))
-        for bunch in np.unique(named[fruit] % LABEL_STRIDE)
-        if snapshot.bunch_attached[bunch]
-    }
-    clear = _visible_cut_points(caster, seen.pose[:3], cuts)
-    found = []
-    for bunch in np.unique(named[fruit] % LABEL_STRIDE).tolist():
-        mine = fruit[named[fruit] % LABEL_STRIDE == bunch]
-        whole = alone.coverage(primitives, lens, mine)
-        rows, columns = np.flatnonzero(whole.any(1)), np.flatnonzero(whole.any(0))
-        if not len(rows):
-            continue
-        box = int(columns[0]), int(rows[0]), int(columns[-1]), int(rows[-1])
-        window = np.s_[box[1] : box[3] + 1, box[0] : box[2] + 1]
-        visible = seen.labels[window] == label(Organ.BUNCH, bunch)
-        parts = np.concatenate(
-            [
-                first + np.arange(size)
-                for first, size in zip(primitives.cluster_first[mine], primitives.cluster_size[mine], strict=True)
-            ]
-        )
-        attached = bool(snapshot.bunch_attached[bunch])
-        turn = (snapshot.body_q[model.bunch_body[bunch]] if attached else snapshot.visual_q[loose[bunch]])[3:]
-        frame, size = _box_around(
-            a[parts], b[parts], np.repeat(primitives.cluster_kind[mine], primitives.cluster_size[mine]), turn
-        )
-        pixel = None
-        if attached:
-            local = frames.rotate(frames.conjugate(seen.pose[3:]), cuts[bunch] - seen.pose[:3])
-            pixel = project_points(local, info) if local[2] > 0.0 else None
-        found.append(
-            BunchTruth(
+    info, lens = seen.info, pinhole(seen.info, seen.pose)
+    alone = CameraRasterizer(info.width, info.height, primitives.device)
+    near = primitives.label[primitives.cluster_first][alone.cluster_distances(primitives, lens) < float(FAR)]
+    bunches = np.unique(near[near // LABEL_STRIDE == int(Organ.BUNCH)]) % LABEL_STRIDE
+    cuts = _cut_points(primitives.model, snapshot, bunches)
+    clear = _visible_cut_points(caster or RayCaster(primitives), seen.pose[:3], cuts)
+    look = _Look(primitives, snapshot, info, seen.pose, alone, seen.primitive, seen.labels)
+    return tuple(look.bunches(bunches, cuts, clear))
+
+
+def visible_bunches(
+    primitives: Primitives, snapshot: Snapshot, info: CameraInfo, pose: np.ndarray, drawn: CameraRasterizer
+) -> tuple[BunchTruth, ...]:
+    """Every bunch of which at least one pixel is seen, by index, at the cost that a live picture may have.
+
+    ``drawn`` holds what was seen from ``pose`` [7] of ``primitives`` as posed by ``snapshot``; its keys are drawn anew.
+    A cut point counts as seen if the pixel that it is in shows its own peduncle, which takes no rays.
+    """
+    primitive, labels = (a.numpy().reshape(info.height, info.width) for a in (drawn.primitive, drawn.labels))
+    shown = np.unique(labels)
+    bunches = shown[shown // LABEL_STRIDE == int(Organ.BUNCH)] % LABEL_STRIDE
+    cuts = _cut_points(primitives.model, snapshot, bunches)
+    look = _Look(primitives, snapshot, info, np.asarray(pose, float), drawn, primitive, labels)
+    clear = {bunch for bunch, cut in cuts.items() if look.shows_peduncle(bunch, cut)}
+    return tuple(look.bunches(bunches, cuts, clear))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Look:
+    """What one camera sees from where it is; ``rasterizer`` draws bunches alone."""
+
+    primitives: Primitives
+    snapshot: Snapshot
+    info: CameraInfo
+    pose: np.ndarray
+    rasterizer: CameraRasterizer
+    primitive: np.ndarray
+    labels: np.ndarray
+
+    def pixel(self, point: np.ndarray) -> np.ndarray | None:
+        """Column and row [2] of a point [3] m in the world; None behind the camera."""
+        local = frames.rotate(frames.conjugate(self.pose[3:]), point - self.pose[:3])
+        return project_points(local, self.info) if local[2] > 0.0 else None
+
+    def shows_peduncle(self, bunch: int, point: np.ndarray) -> bool:
+        """Whether the pixel that ``point`` [3] m is in shows the peduncle of a bunch."""
+        pixel = self.pixel(point)
+        if pixel is None or not _inside(pixel, self.info):
+            return False
+        column, row = np.clip(np.rint(pixel).astype(int), 0, (self.info.width - 1, self.info.height - 1))
+        return bool(self.labels[row, column] == label(Organ.PEDUNCLE, bunch))
+
+    def bunches(self, bunches: np.ndarray, cuts: dict[int, np.ndarray], clear: set[int]) -> Iterator[BunchTruth]:
+        """Those of some bunches [k] of which a pixel would be seen if they were alone.
+
+        ``cuts``: points [3] m by bunch; ``clear``: bunches whose cut point nothing hides.
+        """
+        p, snapshot, model = self.primitives, self.snapshot, self.primitives.model
+        lens = pinhole(self.info, self.pose)
+        named = p.label[p.cluster_first]
+        fruit = np.flatnonzero((named // LABEL_STRIDE == int(Organ.BUNCH)) & p.clusters_shown())
+        fruit = fruit[np.isin(named[fruit] % LABEL_STRIDE, bunches)]
+        count = np.bincount(self.primitive[self.primitive >= 0], minlength=p.count)
+        a, b = p.shapes.a.numpy(), p.shapes.b.numpy()
+        loose = {one.index: k for k, one in enumerate(snapshot.visuals) if one.organ == Organ.BUNCH}
+        for bunch in np.unique(named[fruit] % LABEL_STRIDE).tolist():
+            mine = fruit[named[fruit] % LABEL_STRIDE == bunch]
+            whole = self.rasterizer.coverage(p, lens, mine)
+            box = _box_of(whole, (0, 0, 0, 0))
+            if box is None:
+                continue
+            window = np.s_[box[1] : box[3] + 1, box[0] : box[2] + 1]
+            visible = self.labels[window] == label(Organ.BUNCH, bunch)
+            clusters = zip(p.cluster_first[mine], p.cluster_size[mine], strict=True)
+            parts = np.concatenate([first + np.arange(size) for first, size in clusters])
+            kind = np.repeat(p.cluster_kind[mine], p.cluster_size[mine])
+            attached = bool(snapshot.bunch_attached[bunch])
+            turn = (snapshot.body_q[model.bunch_body[bunch]] if attached else snapshot.visual_q[loose[bunch]])[3:]
+            frame, size = _box_around(a[parts], b[parts], kind, turn)
+            pixel = self.pixel(cuts[bunch]) if attached else None
+            yield BunchTruth(
                 bunch=bunch,
                 variety=int(model.bunch_variety[bunch]),
                 tree=int(model.body_tree[model.bunch_body[bunch]]),
@@ -243,16 +210,20 @@ def bunch_truths(
                 amodal=whole[window].copy(),
                 visible=visible,
                 visible_box=_box_of(visible, box),
-                berries_seen=int((count[parts] >= MIN_BERRY_PIXELS).sum()),
+                berries_seen=int((count[parts[kind == SPHEROID]] >= MIN_BERRY_PIXELS).sum()),
                 berries=int(model.bunch_berries[bunch]),
                 frame=frame,
                 size=size,
                 cut=cuts.get(bunch),
                 cut_pixel=pixel,
-                cut_seen=pixel is not None and _inside(pixel, info) and bunch in clear,
+                cut_seen=pixel is not None and _inside(pixel, self.info) and bunch in clear,
             )
-        )
-    return tuple(found)
+
+
+def _cut_points(model: Model, snapshot: Snapshot, bunches: np.ndarray) -> dict[int, np.ndarray]:
+    """Cut points [3] m of those of some bunches [k] that still hang."""
+    hanging = bunches[snapshot.bunch_attached[bunches]].tolist()
+    return {bunch: cut_point(model, snapshot.body_q, bunch) for bunch in hanging}
 
 
 def cut_point(model: Model, body_q: np.ndarray, bunch: int) -> np.ndarray:

@@ -1,0 +1,55 @@
+"""Finds bunches in a robot's colour and depth pictures, and prints where they are.
+
+    vinesim client --role robot --scene demo             # in one terminal
+    python examples/ros/find_bunches.py                  # in another
+
+A stock ROS 2 node: what has the colour of fruit and hangs together in one place is a bunch. Places are metres in the
+camera's optical frame.
+"""
+
+import cv2
+import numpy as np
+import rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, Image
+
+
+class BunchFinder(Node):
+    def __init__(self, camera: str = "/head_front_camera") -> None:
+        super().__init__("find_bunches")
+        self.parts: dict[str, Image | CameraInfo] = {}
+        for kind, topic in ((Image, "rgb/image_raw"), (Image, "depth/image_raw"), (CameraInfo, "rgb/camera_info")):
+            self.create_subscription(kind, f"{camera}/{topic}", lambda m, t=topic: self.take(t, m), 5)
+
+    def take(self, topic: str, message: Image | CameraInfo) -> None:
+        """Search a picture once its colours, depth and intrinsics are there: all have the same stamp."""
+        self.parts = {t: m for t, m in self.parts.items() if m.header.stamp == message.header.stamp} | {topic: message}
+        if len(self.parts) == 3:
+            rgb, depth, info = (self.parts[t] for t in ("rgb/image_raw", "depth/image_raw", "rgb/camera_info"))
+            picture = np.frombuffer(rgb.data, np.uint8).reshape(rgb.height, rgb.width, 3)
+            metres = np.frombuffer(depth.data, np.float32).reshape(depth.height, depth.width)
+            for x, y, z in find(picture, metres, np.reshape(info.k, (3, 3))):
+                print(f"{rgb.header.frame_id}: bunch at x {x:.2f} y {y:.2f} z {z:.2f} m", flush=True)
+
+
+def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndarray]:
+    """Places [3] m of the bunches in a picture [height, width, 3] with depth [height, width] m."""
+    red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
+    amber = (abs(red - green) < 0.1 * green) & (blue < 0.65 * green)
+    fruit = (amber | ((red > 1.3 * green) & (blue > green - 8))) & (metres > 0.0) & (metres < 3.0)
+    fruit = cv2.morphologyEx(fruit.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    count, pieces = cv2.connectedComponents(fruit)
+    places = []
+    for piece in range(1, count):
+        rows, columns = np.nonzero((pieces == piece) & np.isfinite(metres))
+        if len(rows) > 150:
+            z, (near, far) = np.median(metres[rows, columns]), np.percentile(metres[rows, columns], (10, 90))
+            size = np.ptp([columns, rows], axis=1) * z / k[0, 0]
+            if size.max() < 0.3 and far - near < 0.1:  # grass and soil stretch into the distance
+                places.append(np.linalg.inv(k) @ [np.median(columns) * z, np.median(rows) * z, z])
+    return places
+
+
+if __name__ == "__main__":
+    rclpy.init()
+    rclpy.spin(BunchFinder())

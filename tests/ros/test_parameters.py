@@ -1,0 +1,171 @@
+"""Parameters of the nodes, set at run time by a stock node as ``ros2 param set`` does."""
+
+# ruff: noqa: E402 (messages are imported only where ROS is installed)
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.ros import middleware
+
+pytestmark = pytest.mark.ros
+if middleware.unavailable_reason() is not None:
+    pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Image, PointCloud2
+
+from tests.support.stock_node import StockNode, wait_until
+from vinesim.ros.messages import message_packages
+from vinesim.ros.names import ros_name
+from vinesim.ros.robot_node import RobotNode
+from vinesim.ros.sensor_node import SensorNode
+from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput, ComponentStatus, JointSample, RobotSample
+
+REST = frames.pose(np.zeros(3))
+NONE = np.zeros(0)
+
+
+@pytest.fixture(autouse=True)
+def own_domain(monkeypatch, tmp_path_factory):
+    """No other ROS on this machine or network hears these tests."""
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path_factory.mktemp("log")))
+
+
+class Setter:
+    """Sets parameters of one node from another one."""
+
+    def __init__(self, peer: StockNode, node: str, tick: Callable[[], None]) -> None:
+        self._client = peer.node.create_client(SetParameters, f"{node}/set_parameters")
+        self._tick = tick
+        wait_until(self._client.service_is_ready, tick, "the service")
+
+    def __call__(self, name: str, value: Any) -> str:
+        """The reason why the value was refused; empty if it was set."""
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+        future = self._client.call_async(request)
+        wait_until(future.done, self._tick, f"{name} = {value}")
+        response = future.result()
+        assert response is not None
+        (result,) = response.results
+        assert result.successful == (not result.reason)
+        return result.reason
+
+
+def test_a_robot_without_truth_and_bad_values():
+    message_packages.ensure_importable(["tf2_msgs"])
+    from tf2_msgs.msg import TFMessage
+
+    base, drifted = frames.pose([1.0, 2.0, 0.0]), frames.pose([1.5, 2.0, 0.0])
+    joints = JointSample(1.0, (), NONE, NONE, NONE, NONE)
+    sample = RobotSample(
+        "r", joints, base, np.zeros(6), drifted, np.zeros(6), np.zeros((2, 3, 3)), (), np.zeros((0, 7))
+    )
+    heard: dict[str, list] = {"tf": [], "truth": [], "contacts": [], "poles": [], "diagnostics": []}
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    with RobotNode("r", "<robot name='r'/>", namespace="space") as node, StockNode() as peer:
+        node.publish_environment_static(("pole_0",), REST[None])
+        for message, topic, name, qos in (
+            (TFMessage, "space/tf", "tf", 10), (TFMessage, "space/tf_environment", "truth", 10),
+            (PointCloud2, "space/vine/contacts", "contacts", 10),
+            (TFMessage, "space/tf_environment_static", "poles", latched),
+            (DiagnosticArray, "/diagnostics", "diagnostics", 10),
+        ):  # fmt: skip
+            peer.node.create_subscription(message, topic, heard[name].append, qos)
+
+        def tick() -> None:
+            node.publish_robot_state(sample)
+            node.publish_environment(1.0, ("bunch",), REST[None])
+            node.publish_diagnostics(1.0, [ComponentStatus("simulation")])
+            peer.spin(0.01)
+
+        def parents() -> list[str]:
+            return [t.header.frame_id for t in heard["tf"][-1].transforms]
+
+        wait_until(lambda: all(heard.values()), tick, "all topics")
+        assert parents() == ["map", "odom"]
+        (status, *_) = heard["diagnostics"][-1].status
+        assert (status.name, status.hardware_id) == ("/space/r: simulation", "/space/r")
+
+        put = Setter(peer, "/space/r", tick)
+        assert put("publish_map_to_odom", False) == ""
+        assert put("publish_truth", False) == ""
+        wait_until(lambda: parents() == ["odom"], tick, "tf without the map")
+        wait_until(lambda: not heard["poles"][-1].transforms, tick, "no poles")
+        assert not node.has_subscribers("tf_environment")
+        assert not node.has_subscribers("vine")
+        seen = {name: len(heard[name]) for name in heard}
+        wait_until(lambda: len(heard["tf"]) > seen["tf"] + 30, tick, "more of tf")
+        (only,) = heard["tf"][-1].transforms
+        assert (only.child_frame_id, only.transform.translation.x) == ("base_footprint", 1.5)
+        late: list = []
+        peer.node.create_subscription(TFMessage, "space/tf_environment_static", late.append, latched)
+        wait_until(lambda: late, tick, "the latched message")
+        assert not late[0].transforms
+        assert len(heard["contacts"]) - seen["contacts"] <= 10  # what was under way
+
+        assert put("publish_truth", True) == ""
+        wait_until(lambda: len(heard["truth"]) > seen["truth"] + 20 and heard["poles"][-1].transforms, tick, "truth")
+
+        assert put("environment_rate", 20.0) == ""
+        for name, value in (
+            ("environment_rate", 0.0), ("environment_rate", 1e9), ("environment_rate", float("nan")),
+            ("environment_rate", "fast"), ("publish_truth", 3),
+        ):  # fmt: skip
+            reason = put(name, value)
+            assert reason, (name, value)
+            assert "\n" not in reason
+        assert node.environment_rate == 20.0
+
+
+def test_depth_labels_and_rates_of_sensors():
+    info = CameraInfo(8, 6, 8.0, 8.0, 3.5, 2.5, "optical")
+    depth, exact = np.full((6, 8), 1.5, np.float32), np.full((6, 8), 1.25, np.float32)
+    labels = np.ones((6, 8), np.int32)
+    frame = CameraFrame(1.0, "camera", info, REST, np.zeros((6, 8, 3), np.uint8), depth, labels, exact)
+    images: list[Image] = []
+    with SensorNode("r_sensors", cameras=["camera"], rates={"camera": 30.0}) as node, StockNode() as peer:
+        peer.node.create_subscription(Image, "camera/depth/image_raw", images.append, 10)
+        peer.node.create_subscription(Image, "camera/labels", lambda _: None, 10)
+
+        def tick() -> None:
+            node.publish_camera(frame)
+            peer.spin(0.01)
+
+        def last() -> tuple[str, float]:
+            kind = np.float32 if images[-1].encoding == "32FC1" else np.uint16
+            return images[-1].encoding, float(np.frombuffer(images[-1].data, kind)[0])
+
+        wait_until(lambda: images and last() == ("32FC1", 1.5), tick, "depth")
+        assert node.camera_outputs_wanted("camera") == CameraOutput.DEPTH | CameraOutput.LABELS
+        put = Setter(peer, "/r_sensors", tick)
+        for name, value in (
+            ("camera.exact_depth", True), ("camera.depth_encoding_16uc1", True), ("publish_truth", False),
+            ("camera.rate", 5.0), ("camera.jpeg_quality", 40),
+        ):  # fmt: skip
+            assert put(name, value) == ""
+        wait_until(lambda: last() == ("16UC1", 1250.0), tick, "exact depth in millimetres")
+        assert node.camera_outputs_wanted("camera") == CameraOutput.EXACT_DEPTH
+        assert node.rate("camera") == 5.0
+        for name, value in (("camera.rate", 0.0), ("camera.jpeg_quality", 101), ("camera.exact_depth", "yes")):
+            assert put(name, value), name
+
+
+@pytest.mark.parametrize(
+    ("actor", "name"), [("picker", "picker"), ("my-robot 2", "my_robot_2"), ("7", "_7"), ("Zoë", "Zo_"), ("", "_")]
+)
+def test_names_of_actors_become_names_of_nodes(actor: str, name: str):
+    from rclpy.validate_node_name import validate_node_name
+
+    assert ros_name(actor) == name
+    assert validate_node_name(name)

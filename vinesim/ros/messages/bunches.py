@@ -1,0 +1,107 @@
+"""Messages of what is true of the bunches in a picture; import it when vision_msgs can be imported.
+
+All of one picture have its stamp and its optical frame, and list the same bunches in the same order. The id of a
+detection is the bunch's index, which data sets, label images and ``/tf_environment`` have too.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from geometry_msgs.msg import Pose
+from sensor_msgs.msg import PointCloud2
+from vision_msgs.msg import (
+    BoundingBox2D,
+    BoundingBox3D,
+    Detection2D,
+    Detection2DArray,
+    Detection3D,
+    Detection3DArray,
+    LabelInfo,
+    ObjectHypothesisWithPose,
+    VisionClass,
+)
+
+from vinesim import frames
+from vinesim.ros.messages import convert
+from vinesim.scene.ids import Organ
+from vinesim.scene.values import Box, BunchTruth, CameraFrame
+
+CLASS_ID = str(int(Organ.BUNCH))
+"""Class of all detections; LabelInfo has its name."""
+BUNCH_POINT = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("u", "<f4"), ("v", "<f4"), ("seen", "<i4"), ("bunch", "<i4"),
+        ("berries", "<i4"), ("berries_seen", "<i4"), ("pixels", "<i4"), ("amodal_pixels", "<i4"),
+    ]
+)  # fmt: skip
+"""A bunch as a point of a cloud: where to cut [m], NaN once it is picked; the pixel of that point and whether it is
+seen; the bunch's index; its berries and how many are seen; its pixels and how many it would have if nothing hid it."""
+
+
+def label_info() -> LabelInfo:
+    """Classes of detections; those of a label image are ``label // LABEL_STRIDE`` (:mod:`vinesim.scene.ids`)."""
+    return LabelInfo(class_map=[VisionClass(class_id=int(organ), class_name=organ.name.lower()) for organ in Organ])
+
+
+def detections_2d(frame: CameraFrame) -> Detection2DArray:
+    """Boxes of the pixels that show each bunch."""
+    header = convert.header(frame.time, frame.info.frame_id)
+    detections = []
+    for one in frame.bunches or ():
+        assert one.visible_box is not None, "frames have bunches of which a pixel is seen"
+        box = _box_2d(one.visible_box)
+        detections.append(Detection2D(header=header, id=str(one.bunch), bbox=box, results=[_hypothesis(frame, one)]))
+    return Detection2DArray(header=header, detections=detections)
+
+
+def detections_3d(frame: CameraFrame) -> Detection3DArray:
+    """Boxes around all parts of each bunch, x down the rachis."""
+    header = convert.header(frame.time, frame.info.frame_id)
+    detections = []
+    for one in frame.bunches or ():
+        result = _hypothesis(frame, one)
+        box = BoundingBox3D(center=result.pose.pose)
+        box.size.x, box.size.y, box.size.z = one.size.tolist()
+        detections.append(Detection3D(header=header, id=str(one.bunch), bbox=box, results=[result]))
+    return Detection3DArray(header=header, detections=detections)
+
+
+def bunch_cloud(frame: CameraFrame) -> PointCloud2:
+    """Cut points and berry counts."""
+    bunches = frame.bunches or ()
+    message, points = convert.cloud(frame.time, frame.info.frame_id, BUNCH_POINT, 1, len(bunches))
+    into_camera = frames.conjugate(frame.pose[3:])
+    for row, one in zip(points[0], bunches, strict=True):
+        nowhere = np.full(3, np.nan)
+        cut = nowhere if one.cut is None else frames.rotate(into_camera, one.cut - frame.pose[:3])
+        row["x"], row["y"], row["z"] = cut
+        row["u"], row["v"] = nowhere[:2] if one.cut_pixel is None else one.cut_pixel
+        row["seen"], row["bunch"] = one.cut_seen, one.bunch
+        row["berries"], row["berries_seen"] = one.berries, one.berries_seen
+        row["pixels"], row["amodal_pixels"] = one.pixels, one.amodal_pixels
+    message.is_dense = not np.isnan(points["x"]).any()
+    return message
+
+
+def _hypothesis(frame: CameraFrame, one: BunchTruth) -> ObjectHypothesisWithPose:
+    """Class, pose in the optical frame, and as score the share of the bunch's pixels that nothing hides."""
+    result = ObjectHypothesisWithPose()
+    result.hypothesis.class_id, result.hypothesis.score = CLASS_ID, 1.0 - one.occlusion
+    result.pose.pose = _pose(frames.compose(frames.inverse(frame.pose), one.frame))
+    return result
+
+
+def _pose(values: np.ndarray) -> Pose:
+    message = Pose()
+    message.position.x, message.position.y, message.position.z = values[:3].tolist()
+    turn = message.orientation
+    turn.x, turn.y, turn.z, turn.w = values[3:].tolist()
+    return message
+
+
+def _box_2d(box: Box) -> BoundingBox2D:
+    """Pixel centres are whole numbers, so a box of one pixel has the size 1."""
+    left, top, right, bottom = box
+    message = BoundingBox2D(size_x=float(right - left + 1), size_y=float(bottom - top + 1))
+    message.center.position.x, message.center.position.y = 0.5 * (left + right), 0.5 * (top + bottom)
+    return message
