@@ -345,6 +345,7 @@ def test_two_robots_in_one_process_under_namespaces():
         assert set(states["robot_1"]) == {1.0}
         assert set(states["robot_2"]) == {2.0}
         assert urdfs == {"robot_1": "<robot name='one'/>", "robot_2": "<robot name='two'/>"}
+        wait_until(lambda: peer.node.get_publishers_info_by_topic("/clock"), tick, "the clock")
         topics = {name for name, _ in peer.node.get_topic_names_and_types()}
         assert {"/robot_1/tf", "/robot_2/tf", "/clock"} <= topics
         assert "/tf" not in topics

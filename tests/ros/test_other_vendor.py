@@ -97,7 +97,10 @@ def test_a_peer_of_another_vendor_hears_and_commands(monkeypatch, tmp_path):
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
     names, rest = ("head_1_joint", "head_2_joint"), np.array([0, 0, 0, 0, 0, 0, 1.0])
     joints = JointSample(7.25, names, np.array([0.1, -0.2]), np.zeros(2), np.zeros(2), np.zeros(2))
-    sample = RobotSample("robot", joints, rest, np.zeros(6), rest, (), np.zeros((0, 7)))
+    zeros = np.zeros((2, 3, 3))
+    sample = RobotSample("robot", joints, rest, np.zeros(6), rest, np.zeros(6), zeros, (), np.zeros((0, 7)))
+        "robot", joints, rest, np.zeros(6), rest, np.zeros(6), np.zeros((2, 3, 3)), (), np.zeros((0, 7))
+    )
     spec = ControllerSpec("head_controller", ControllerKind.JOINT_TRAJECTORY, names)
     peer = subprocess.Popen(
         [sys.executable, "-c", PEER, domain, str(TIMEOUT)], env=os.environ | {"CYCLONEDDS_URI": CYCLONE},

@@ -100,7 +100,7 @@ class MujocoScene:
             made[body].add_geom(
                 type=kind, size=[float(radius), 0, 0], contype=FIXED, conaffinity=0, mass=0.0,
                 friction=contact_friction(mine.parameters.friction), solref=[0.02, 1],
-                solimp=[0.95, 0.99, 0.001, 0.5, 2], **place,
+                solimp=[0.95, 0.99, 0.001, 0.5, 2], solmix=1e6, **place,
             )  # fmt: skip
         world = spec.compile()
         if contact_time_constant is not None:

@@ -206,7 +206,8 @@ class TopicMonitor:
 
     def _discover(self) -> None:
         for name, types in self._node.get_topic_names_and_types():
-            is_monitored = name in self._topics if self._topics else name not in EXCLUDED_TOPICS
+            is_hidden = name in EXCLUDED_TOPICS or "/_action/" in name
+            is_monitored = name in self._topics if self._topics else not is_hidden
             if is_monitored and name not in self.stats:
                 self._subscribe(name, types[0])
 
