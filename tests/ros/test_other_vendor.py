@@ -99,8 +99,6 @@ def test_a_peer_of_another_vendor_hears_and_commands(monkeypatch, tmp_path):
     joints = JointSample(7.25, names, np.array([0.1, -0.2]), np.zeros(2), np.zeros(2), np.zeros(2))
     zeros = np.zeros((2, 3, 3))
     sample = RobotSample("robot", joints, rest, np.zeros(6), rest, np.zeros(6), zeros, (), np.zeros((0, 7)))
-        "robot", joints, rest, np.zeros(6), rest, np.zeros(6), np.zeros((2, 3, 3)), (), np.zeros((0, 7))
-    )
     spec = ControllerSpec("head_controller", ControllerKind.JOINT_TRAJECTORY, names)
     peer = subprocess.Popen(
         [sys.executable, "-c", PEER, domain, str(TIMEOUT)], env=os.environ | {"CYCLONEDDS_URI": CYCLONE},

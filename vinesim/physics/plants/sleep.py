@@ -24,6 +24,11 @@ CONTACT_SHARE = 0.05
 """[1] Share of ``sleep_distance`` within which trees that are not moved to rest must be: those in contact, and what was
 cut off. TUNED: 0.01 mm, the thousandth part of a travel of 1 cm."""
 
+STILL_DURATION = 5.0
+"""[s] What is in contact or cut off is at rest, too, if no body of it has moved by that share in so long: what bears it is
+not in the tangent stiffness, so it may be measured far from a rest in which it is. What creeps with a time constant of
+five times as much is then 0.05 mm from where it ends. TUNED."""
+
 _NO_PAIRS = np.zeros((0, 2), np.int32)
 
 
@@ -42,6 +47,11 @@ class SleepMonitor:
         self.quiet_steps = np.zeros(trees, np.int32)
         """For how many steps the joints of each awake tree have been slow [tree]."""
         self._is_at_rest = np.zeros(trees, bool)
+        self._still_steps = parameters.steps(STILL_DURATION)
+        self._seen_tick = np.full(trees, -1, np.int64)
+        """Tick of each tree's :attr:`_seen_x` [tree]; -1: it has none."""
+        self._seen_x = np.zeros((len(plants.model.body_mass), 3), np.float32)
+        """[body, 3] m where bodies were then."""
 
     @property
     def restless(self) -> np.ndarray:
@@ -83,6 +93,7 @@ class SleepMonitor:
         speed, distance, is_free = self._equilibrium.residual_motion(slow)
         tolerance = np.where(is_free, self.distance, CONTACT_SHARE * self.distance)
         self._is_at_rest[slow] = (speed < self.speed) & (distance < tolerance)
+        self._find_still(slow[~is_free & (speed < self.speed)])
         stays = ~self._is_at_rest if keep_awake is None else ~self._is_at_rest | keep_awake
         while len(spread := contact_pairs[stays[contact_pairs[:, 0]] != stays[contact_pairs[:, 1]]]):
             stays[spread] = True
@@ -93,7 +104,23 @@ class SleepMonitor:
         self._forget(asleep)
         return asleep
 
+    def _find_still(self, trees: np.ndarray) -> None:
+        """Of slow trees [k] those that have not moved for :data:`STILL_DURATION` are at rest."""
+        plants, now = self.plants, self.plants.tick
+        due = trees[(self._seen_tick[trees] >= 0) & (now - self._seen_tick[trees] >= self._still_steps)]
+        if len(due):
+            bodies = plants.bodies_of(due)
+            moved = np.linalg.norm(plants.state.body_q[bodies, :3] - self._seen_x[bodies], axis=1)
+            first = np.concatenate([[0], np.cumsum(plants.model.tree_size[due])[:-1]])
+            self._is_at_rest[due] |= np.maximum.reduceat(moved, first) < CONTACT_SHARE * self.distance
+        late = np.concatenate([trees[self._seen_tick[trees] < 0], due[~self._is_at_rest[due]]])
+        if len(late):
+            bodies = plants.bodies_of(late)
+            self._seen_x[bodies] = plants.state.body_q[bodies, :3]
+            self._seen_tick[late] = now
+
     def _forget(self, trees: np.ndarray) -> None:
         """Begin to watch trees anew."""
         self.quiet_steps[trees] = 0
         self._is_at_rest[trees] = False
+        self._seen_tick[trees] = -1
