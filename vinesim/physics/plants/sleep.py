@@ -25,9 +25,9 @@ CONTACT_SHARE = 0.05
 cut off. TUNED: 0.01 mm, the thousandth part of a travel of 1 cm."""
 
 STILL_DURATION = 5.0
-"""[s] What is in contact or cut off is at rest, too, if no body of it has moved by that share in so long: what bears it is
-not in the tangent stiffness, so it may be measured far from a rest in which it is. What creeps with a time constant of
-five times as much is then 0.05 mm from where it ends. TUNED."""
+"""[s] What is in contact or cut off is at rest, too, if no body of it has moved by that share in so long: what bears
+it is not in the tangent stiffness, so it may be measured far from a rest in which it is. What creeps with a time
+constant of five times as much is then 0.05 mm from where it ends. TUNED."""
 
 _NO_PAIRS = np.zeros((0, 2), np.int32)
 
