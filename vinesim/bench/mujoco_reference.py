@@ -65,6 +65,10 @@ def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[
     return made
 
 
+PLANT_IMPEDANCE = (0.925, 0.97, 0.001, 0.5, 2)
+"""Of the contacts of plants (MuJoCo's solimp), whatever they touch: about as soft as vinesim's 2e4 N/m."""
+
+
 class MujocoScene:
     """A scene of plants and robots wholly in MuJoCo: one world, ball joints, a capsule or spheres for every body.
 
@@ -100,7 +104,7 @@ class MujocoScene:
             made[body].add_geom(
                 type=kind, size=[float(radius), 0, 0], contype=FIXED, conaffinity=0, mass=0.0,
                 friction=contact_friction(mine.parameters.friction), solref=[0.02, 1],
-                solimp=[0.95, 0.99, 0.001, 0.5, 2], solmix=1e6, **place,
+                solimp=PLANT_IMPEDANCE, solmix=1e6, **place,
             )  # fmt: skip
         world = spec.compile()
         if contact_time_constant is not None:
