@@ -447,7 +447,7 @@ def test_poses_move_to_the_stream_when_datagrams_stop(caplog, monkeypatch):
             there.reset()
             back.reset()
             wait(lambda: there() and back(), "poses over the stream")
-            assert ada.status_message == ""
+            wait(lambda: ada.status_message == "", "the actor to be served again")
             assert [link.partition(" ")[2] for link in ada.links] == ["reliable"]
             assert len([line for line in caplog.messages if "no datagrams pass" in line and "any more" in line]) == 1
 
