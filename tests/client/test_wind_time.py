@@ -9,7 +9,7 @@ from vinesim.scene.wind import Wind
 
 
 def test_clients_that_joined_at_different_times_draw_the_same_trees(tmp_path, monkeypatch) -> None:
-    """One second after the other one is told of the wind, without a message about it."""
+    """Two clients, the second joined a second later: at the same network time trees sway alike; no message says how."""
     monkeypatch.setenv("VINESIM_CACHE", str(tmp_path))
     model = vineyard()
     model.body_drag[:] = 0.003  # leaves

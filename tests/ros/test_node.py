@@ -233,7 +233,7 @@ TYPES = {
 }
 
 
-def test_nothing_is_built_for_nobody(monkeypatch):
+def test_no_message_is_built_without_a_subscriber(monkeypatch):
     with (
         RobotNode("vinebot", URDF) as robot,
         SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,

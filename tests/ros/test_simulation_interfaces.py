@@ -109,9 +109,9 @@ def test_entities_and_their_states(world: SimulationInRos) -> None:
     assert found.states[0].header.frame_id == "map"
     state = world.call("GetEntityState", entity="robot")
     assert state.state.pose.orientation.w == pytest.approx(expected[6], abs=1e-6)
-    missing = world.call("GetEntityState", entity="nobody").result
+    missing = world.call("GetEntityState", entity="missing").result
     assert (missing.result, missing.error_message) == (
-        Result.RESULT_NOT_FOUND, "no entity 'nobody'; get_entities lists them",
+        Result.RESULT_NOT_FOUND, "no entity 'missing'; get_entities lists them",
     )  # fmt: skip
     wrong = world.call("GetEntities", filters=EntityFilters(filter="(")).result
     assert "no regular expression" in wrong.error_message

@@ -83,7 +83,7 @@ class JointTrajectory:
     goal_time_tolerance: float | None = None
     """[s] Likewise."""
     goal: bytes | None = None
-    """Id of the action's goal; None: it came on a topic, and nobody waits for its end."""
+    """Id of the action's goal; None: it came on a topic, so no client waits for its result."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
