@@ -261,8 +261,10 @@ class SimulationNode(Node):
         from simulation_interfaces.msg import EntityState
 
         state = EntityState(header=convert.header(self._time, MAP_FRAME))
-        fill_pose(state.pose, entity.pose)
-        fill_twist(state.twist, entity.velocity)
+        convert.set_vector(state.pose.position, entity.pose[:3])
+        convert.set_quaternion(state.pose.orientation, entity.pose[3:])
+        convert.set_vector(state.twist.linear, entity.velocity[:3])
+        convert.set_vector(state.twist.angular, entity.velocity[3:])
         return state
 
 
@@ -275,18 +277,3 @@ def _read_pose(header: Any, message: Pose) -> np.ndarray | None:
 def _read_twist(message: Twist) -> np.ndarray:
     """A velocity [6]."""
     return np.array([getattr(part, axis) for part in (message.linear, message.angular) for axis in "xyz"])
-
-
-def fill_pose(message: Pose, pose: np.ndarray) -> None:
-    """Write a pose [7] into a message."""
-    for axis, value in zip("xyz", pose[:3], strict=True):
-        setattr(message.position, axis, float(value))
-    for axis, value in zip("xyzw", pose[3:], strict=True):
-        setattr(message.orientation, axis, float(value))
-
-
-def fill_twist(message: Twist, velocity: np.ndarray) -> None:
-    """Write a velocity [6] into a message."""
-    for axis, linear, angular in zip("xyz", velocity[:3], velocity[3:], strict=True):
-        setattr(message.linear, axis, float(linear))
-        setattr(message.angular, axis, float(angular))
