@@ -185,8 +185,8 @@ class Client:
 
     def _add_replicator(self, name: str, replicator: Replicator) -> None:
         self.replicators[name] = replicator
-        for own, share in self.replicators.items():
-            share.local_actors = self.replicators.keys() - {own}
+        for own in self.replicators.values():
+            own.share_client(other for other in self.replicators.values() if other is not own)
 
     def tick(self) -> None:
         """Simulate one step of ``physics.dt``; none while :attr:`steps_before_pause` is 0."""

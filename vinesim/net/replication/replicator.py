@@ -69,14 +69,13 @@ class Replicator:
         """Interest radius [m]."""
         return self._state.cells.interest_radius
 
-    @property
-    def local_actors(self) -> set[str]:
-        """Other actors of the same client: they share its simulation, so nothing is exchanged with them."""
-        return self._state.peers.local_actors
-
-    @local_actors.setter
-    def local_actors(self, names: set[str]) -> None:
-        self._state.peers.local_actors = set(names)
+    def share_client(self, siblings: Iterable[Replicator]) -> None:
+        """The other actors of the same client: they share its simulation, so nothing is exchanged with them, and of
+        what they own nothing is taken over."""
+        states = tuple(sibling._state for sibling in siblings)
+        self._state.siblings = states
+        self._state.ownership.siblings = tuple(state.ownership for state in states)
+        self._state.peers.local_actors = {state.hello.name for state in states}
 
     def owner(self, object_id: int) -> str | None:
         """Name of the live actor that owns an object now (perhaps this one), or None."""
