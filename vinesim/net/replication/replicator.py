@@ -81,6 +81,10 @@ class Replicator:
         """Name of the live actor that owns an object now (perhaps this one), or None."""
         return self._state.ownership.owner(object_id)
 
+    def is_present(self, name: str) -> bool:
+        """Whether an actor is in this world now, as a peer or before its hello has arrived."""
+        return self._state.peers.may_join(name)
+
     def claim(self, object_id: int) -> Claim:
         """The greatest claim on an object that was made or received."""
         return self._state.ownership.claim(object_id)
@@ -141,6 +145,7 @@ class Replicator:
         wrenches: dict[str, dict[str, np.ndarray]] | None = None,
         has_body: Callable[[int], bool] = lambda _: True,
         couplings: Iterable[Coupling] = (),
+        carried_on: Iterable[int] = (),
     ) -> list[TreeUpdate]:
         """Publish one step; return the states of trees at rest that left, as all copies hold them.
 
@@ -156,6 +161,8 @@ class Replicator:
         ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
         ``wrenches``: wrench [6] of this actor's hands on other clients' robots in this step, by robot and link.
         ``couplings``: of this actor's contacts with trees; sent if other actors touch them, too.
+        ``carried_on``: objects at rest on this actor that it has carried on so far that their records are published
+        again, with the place where they are now.
         """
         state = self._state
         self._follow_clock()
@@ -166,13 +173,13 @@ class Replicator:
             state.counters.force.count_out(payload)
         for payload in state.coupling_sync.publish(self._by_partner(couplings, now), now, time):
             state.counters.force.count_out(payload)
-        touched, moving, grabbed, detached = (
-            {int(object_id) for object_id in ids} for ids in (touched, moving, grabbed, detached)
+        touched, moving, grabbed, detached, carried_on = (
+            {int(object_id) for object_id in ids} for ids in (touched, moving, grabbed, detached, carried_on)
         )
         return self._sender.send(
             LocalStep(
                 now, time, touched, moving, grabbed, detached, read, detached_roots, pose_on_support, is_changed,
-                has_body,
+                has_body, carried_on,
             )
         )  # fmt: skip
 
