@@ -160,4 +160,7 @@ addEventListener("unhandledrejection", (event) => fail(event.reason));
 addEventListener("error", (event) => fail(event.message));
 
 const header = await load("scene");
-page.viewer = new Viewer(new World(header), [...header.arrays.start]);
+const world = new World(header);
+const budget = Number(new URLSearchParams(location.search).get("triangles"));
+if (budget > 0) world.budget = budget;
+page.viewer = new Viewer(world, [...header.arrays.start]);

@@ -46,6 +46,7 @@ export class World {
     this.listedAt = null;
     this.coarser = 1;
     this.triangles = 0;
+    this.budget = TRIANGLE_BUDGET;
     this.makeMeshes(arrays);
     this.poses.needsUpdate = this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
   }
@@ -175,10 +176,10 @@ export class World {
       this.choose(this.plantClusters, 0, true);
       this.choose(this.rigidClusters, this.plants, false);
       this.triangles = this.draws.flat().reduce((sum, level) => sum + level.count * level.faces, 0);
-      if (this.triangles <= TRIANGLE_BUDGET || this.coarser > 30) break;
+      if (this.triangles <= this.budget || this.coarser > 100) break;
       this.coarser *= 1.2;
     }
-    if (this.triangles < 0.6 * TRIANGLE_BUDGET) this.coarser = Math.max(1, this.coarser / 1.2);
+    if (this.triangles < 0.6 * this.budget) this.coarser = Math.max(1, this.coarser / 1.2);
     for (const level of this.draws.flat()) {
       let rows = level.geometry.getAttribute("row");
       if (!rows || rows.array !== level.list) {
