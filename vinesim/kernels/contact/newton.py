@@ -18,9 +18,7 @@ SLIDING_SHARE = wp.constant(wp.float64(0.999999))
 
 
 @wp.func
-def write_block(
-    block: int, island: int, contacts: Contacts, islands: Islands, rows: Rows, scratch_out: SolverScratch
-):
+def write_block(block: int, island: int, contacts: Contacts, islands: Islands, rows: Rows, scratch_out: SolverScratch):
     """Write the linear system of one block: its matrix, and right-hand sides for w = 0 and for each entry of w.
 
     Sticking rows: (B + compliance) x = -velocity - bias - J_r w. Rows of open contacts: x = 0. Friction of sliding

@@ -239,9 +239,7 @@ class HumanBody:
         d.qpos[self._part_q[:, 3:]] = frames.to_wxyz(parts[:, 3:])
 
 
-def _add_geom(
-    body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], friction: float, material: Material
-) -> None:
+def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], friction: float, material: Material) -> None:
     """Add a collision shape; ``bits``: contype and conaffinity."""
     size = [*shape.size, 0.0, 0.0][:3]
     body.add_geom(

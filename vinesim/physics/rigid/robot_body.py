@@ -15,7 +15,14 @@ from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import recompile, self_collision
 from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction, geom_user
-from vinesim.physics.rigid.urdf import RobotError, check, collision_materials, collision_urdf, link_friction, shapes_of_robot
+from vinesim.physics.rigid.urdf import (
+    RobotError,
+    check,
+    collision_materials,
+    collision_urdf,
+    link_friction,
+    shapes_of_robot,
+)
 from vinesim.scene.materials import Material
 from vinesim.scene.triangles import to_stl
 from vinesim.scene.values import RobotSpec
