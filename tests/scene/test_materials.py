@@ -57,7 +57,7 @@ def test_a_file_that_cannot_be_used_is_refused_in_one_line(
 
 def test_a_pair_given_in_both_orders_is_refused(tmp_path: pathlib.Path) -> None:
     twice = "bark-steel = { value = 0.5, " + NUMBER.format(unit="1") + "\nsteel-bark = { value = 0.5, "
-    with pytest.raises(DataError, match="friction.steel-bark is given twice"):
+    with pytest.raises(DataError, match="steel-bark is given twice"):
         pair_table("friction", 0.8, written(tmp_path, twice))
 
 
