@@ -7,7 +7,6 @@ import gc
 import json
 import os
 import pathlib
-import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from typing import Any, Self, TypeVar
 
 from vinesim import allocator
 from vinesim.cli.client_options import ClientOptions, check_options
+from vinesim.cli.signals import stop_at_signals
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
@@ -153,8 +153,7 @@ def run_loop(
     gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
     gc.enable()
     # until here Ctrl-C simply interrupts; from now on it ends the run in order
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop_at_signals(stop)
     limit = None if seconds is None else round(seconds / dt)
     while not (stop.is_set() or loop.ticks == limit or is_done()):
         loop.begin()

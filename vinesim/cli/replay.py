@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import pathlib
-import signal
 import sys
 import threading
 import time
 
 import numpy as np
 
+from vinesim.cli.signals import stop_at_signals
 from vinesim.errors import UsageError, writing
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
@@ -40,9 +40,7 @@ def run(
         raise InvalidRecording(f"{file} holds no message: nothing can be replayed")
     if start >= tape.length or (end is not None and end <= start):
         raise UsageError(f"--from {start:g}{'' if end is None else f' --to {end:g}'}: {file} lasts {tape.length:.1f} s")
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_at_signals(threading.Event())
     who = ", ".join(tape.actors) or "no actors"
     print(f"{file}: {len(tape.messages)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
     if out is not None:

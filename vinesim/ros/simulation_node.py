@@ -12,9 +12,6 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import numpy as np
-from geometry_msgs.msg import Pose, Twist
-
 from vinesim.ros.commands.types import Entity, EntityCategory, SimulationAction, SimulationReply, SimulationRequest
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.node import Node
@@ -184,21 +181,8 @@ class SimulationNode(Node):
         from simulation_interfaces.msg import EntityState
 
         state = EntityState(header=convert.header(self._time, MAP_FRAME))
-        fill_pose(state.pose, entity.pose)
-        fill_twist(state.twist, entity.velocity)
+        convert.set_vector(state.pose.position, entity.pose[:3])
+        convert.set_quaternion(state.pose.orientation, entity.pose[3:])
+        convert.set_vector(state.twist.linear, entity.velocity[:3])
+        convert.set_vector(state.twist.angular, entity.velocity[3:])
         return state
-
-
-def fill_pose(message: Pose, pose: np.ndarray) -> None:
-    """Write a pose [7] into a message."""
-    for axis, value in zip("xyz", pose[:3], strict=True):
-        setattr(message.position, axis, float(value))
-    for axis, value in zip("xyzw", pose[3:], strict=True):
-        setattr(message.orientation, axis, float(value))
-
-
-def fill_twist(message: Twist, velocity: np.ndarray) -> None:
-    """Write a velocity [6] into a message."""
-    for axis, linear, angular in zip("xyz", velocity[:3], velocity[3:], strict=True):
-        setattr(message.linear, axis, float(linear))
-        setattr(message.angular, axis, float(angular))

@@ -20,7 +20,6 @@ from vinesim.ros.commands.types import (
     GoalResult,
     GoalStatus,
     GripperGoal,
-    GripperResult,
     ImpedanceCommand,
     JointTolerances,
     JointTrajectory,
@@ -108,11 +107,6 @@ def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
 
 def _goal_result(result: controller_manager.GoalResult) -> GoalResult:
     """A result as ROS has it. A goal that another one ended is aborted, with the code of ros2_controllers for that."""
-    outcome, gripper = result.outcome, result.gripper
+    outcome = result.outcome
     code = {Outcome.PREEMPTED: Outcome.INVALID_GOAL, Outcome.CANCELED: Outcome.SUCCESSFUL}.get(outcome, outcome)
-    return GoalResult(
-        result.goal, _STATUS.get(outcome, GoalStatus.ABORTED), int(code), result.text,
-        None if gripper is None else GripperResult(
-            gripper.position, gripper.effort, gripper.stalled, gripper.reached_goal
-        ),
-    )  # fmt: skip
+    return GoalResult(result.goal, _STATUS.get(outcome, GoalStatus.ABORTED), int(code), result.text, result.gripper)

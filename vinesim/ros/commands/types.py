@@ -10,6 +10,8 @@ import enum
 
 import numpy as np
 
+from vinesim.scene.values import GripperState
+
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class BaseVelocity:
@@ -117,16 +119,6 @@ class GoalStatus(enum.StrEnum):
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class GripperResult:
-    """Fields of control_msgs/action/GripperCommand's result and feedback."""
-
-    position: float
-    effort: float
-    stalled: bool
-    reached_goal: bool
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
 class GoalResult:
     """How a goal ended, on its way back to the action server."""
 
@@ -135,7 +127,7 @@ class GoalResult:
     code: int
     """Error code of control_msgs/action/FollowJointTrajectory."""
     text: str = ""
-    gripper: GripperResult | None = None
+    gripper: GripperState | None = None
 
 
 class SimulationAction(enum.StrEnum):

@@ -37,7 +37,6 @@ import numpy as np
 
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
-from vinesim.ros.tools.message_types import message_class
 
 DISCOVERY_PERIOD = 0.05
 """Time between two searches for new topics, until all that were named are found [s]."""
@@ -228,20 +227,13 @@ class TopicMonitor:
                 self._subscribe(name, types[0])
 
     def _subscribe(self, name: str, type_name: str) -> None:
-        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+        from vinesim.ros.tools.subscribing import message_class, offered_qos
 
         offered = self._node.get_publishers_info_by_topic(name)
         message = message_class(type_name)
         if not offered or message is None:
             return
-        # The strictest that every publisher offers, as `ros2 topic hz` does.
-        reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in offered)
-        latched = all(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in offered)
-        qos = QoSProfile(
-            depth=self._queue_depth,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
+        qos = offered_qos(offered, self._queue_depth)
         topic = TopicStats(type_name, str(offered[0].topic_type_hash), message, len(offered), self._clock)
         topic.is_clock = name == CLOCK
         topic.arrivals = [] if self._keeps_arrivals else None
