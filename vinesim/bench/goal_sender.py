@@ -20,6 +20,7 @@ import numpy as np
 import rclpy
 from rclpy.action import ActionClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -40,8 +41,8 @@ SPEED_SHARE = 0.4
 """Fastest motion as a share of the joints' limits."""
 TOLERANCE = 0.01
 """Of the goals, for each joint [rad, m]."""
-DELAY = 0.4
-"""From the newest stamp to the start of a trajectory [s]."""
+DELAY = 0.5
+"""From now to the start of a trajectory [s]."""
 RESULT_TIMEOUT = 10.0
 """A server keeps a result for so long [s]; later it knows nothing of the goal."""
 MOMENT = 0.4
@@ -112,6 +113,7 @@ class GoalSender:
 
         self.node = rclpy.create_node("goal_sender")
         self.stamp = 0.0
+        """Time of the robot's world [s]."""
         self.history: list[tuple[float, np.ndarray, np.ndarray]] = []
         """Stamp [s], positions and velocities of all joints, since the last goal was sent."""
         self.names: list[str] = []
@@ -119,7 +121,8 @@ class GoalSender:
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self.node.create_subscription(String, "/robot_description", lambda m: texts.append(m.data), latched)
         self.node.create_subscription(JointState, "/joint_states", self._take, 100)
-        self.until(lambda: texts and self.history, "the robot")
+        self.node.create_subscription(Clock, "/clock", self._take_time, 1)
+        self.until(lambda: texts and self.history and self.stamp, "the robot")
         self.joints = {name: self._joints(texts[0], start) for name, start in CONTROLLERS.items()}
         self.actions = {
             name: ActionClient(self.node, FollowJointTrajectory, f"/{name}/follow_joint_trajectory")
@@ -139,9 +142,12 @@ class GoalSender:
         return found
 
     def _take(self, message: JointState) -> None:
-        self.stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         self.names = list(message.name)
-        self.history.append((self.stamp, np.array(message.position), np.array(message.velocity)))
+        self.history.append((stamp, np.array(message.position), np.array(message.velocity)))
+
+    def _take_time(self, message: Clock) -> None:
+        self.stamp = message.clock.sec + 1e-9 * message.clock.nanosec
 
     def positions(self, joints: list[str]) -> np.ndarray:
         """[joint] The newest."""
@@ -156,9 +162,9 @@ class GoalSender:
                 raise RuntimeError(f"waited {TIMEOUT:.0f} s in vain for {what}")
 
     def wait(self, seconds: float) -> None:
-        """Wait in the robot's time [s]."""
+        """Wait in the robot's time [s], until its joint states have come so far as well."""
         end = self.stamp + seconds
-        self.until(lambda: self.stamp >= end, "the robot's time")
+        self.until(lambda: self.stamp >= end and self.history[-1][0] >= end, "the robot's time")
 
     def send(self, one: Plan) -> tuple[Any, float]:
         """Send a goal; its accepted handle, and the stamp of its start [s]."""
@@ -192,7 +198,7 @@ class GoalSender:
 def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, int, str]) -> dict[str, Any]:
     """Whether a goal that ran to its end did what it says."""
     columns = [sender.names.index(name) for name in one.joints]
-    sender.wait(0.02)
+    sender.wait(0.1)
     wanted, measured = 0.0, 0.0
     first = np.array(sender.feedback[0].desired.positions) if sender.feedback else one.positions[0]
     for told in sender.feedback:
