@@ -21,10 +21,10 @@ def heard(count: int, late: dict[int, float] | None = None, lost: tuple[int, ...
 def test_a_message_is_as_late_as_it_came_after_the_quickest() -> None:
     clock = heard(300)
     delays = delay_ms(heard(300, {50: 4.0, 60: 25.0}), clock)
-    assert delays[[49, 59]].tolist() == [4.0, 25.0]
-    assert np.count_nonzero(delays) == 2
+    np.testing.assert_allclose(delays[[49, 59]], [4.0, 25.0], atol=1e-3)
+    assert np.count_nonzero(delays > 1e-3) == 2
     slow = Arrivals(clock.arrival + 3_000_000, clock.sent, clock.stamp, clock.number)
-    np.testing.assert_allclose(delay_ms(slow, clock), 3.0)
+    np.testing.assert_allclose(delay_ms(slow, clock), 3.0, atol=1e-3)
 
 
 def test_lost_messages_are_not_on_time() -> None:
