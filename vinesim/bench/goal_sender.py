@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import rclpy
-from rclpy.action import ActionClient
+from rclpy.action.client import ActionClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -117,13 +117,13 @@ class GoalSender:
         self.history: list[tuple[float, np.ndarray, np.ndarray]] = []
         """Stamp [s], positions and velocities of all joints, since the last goal was sent."""
         self.names: list[str] = []
-        texts: list[str] = []
+        self.urdf = ""
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.node.create_subscription(String, "/robot_description", lambda m: texts.append(m.data), latched)
+        self.node.create_subscription(String, "/robot_description", self._take_description, latched)
         self.node.create_subscription(JointState, "/joint_states", self._take, 100)
         self.node.create_subscription(Clock, "/clock", self._take_time, 1)
-        self.until(lambda: texts and self.history and self.stamp, "the robot")
-        self.joints = {name: self._joints(texts[0], start) for name, start in CONTROLLERS.items()}
+        self.until(lambda: self.urdf and self.history and self.stamp, "the robot")
+        self.joints = {name: self._joints(start) for name, start in CONTROLLERS.items()}
         self.actions = {
             name: ActionClient(self.node, FollowJointTrajectory, f"/{name}/follow_joint_trajectory")
             for name in CONTROLLERS
@@ -132,14 +132,17 @@ class GoalSender:
             self.until(action.server_is_ready, "the controllers")
         self.feedback: list[Any] = []
 
-    def _joints(self, urdf: str, start: str) -> dict[str, Joint]:
+    def _joints(self, start: str) -> dict[str, Joint]:
         found = {}
-        for element in ElementTree.fromstring(urdf).iterfind("joint"):
+        for element in ElementTree.fromstring(self.urdf).iterfind("joint"):
             name, limit = element.get("name", ""), element.find("limit")
             if name.startswith(start) and name in self.names and limit is not None:
                 lower, upper, velocity = (float(limit.get(key, "0")) for key in ("lower", "upper", "velocity"))
                 found[name] = Joint(lower, upper, velocity, float(self.positions([name])[0]))
         return found
+
+    def _take_description(self, message: String) -> None:
+        self.urdf = message.data
 
     def _take(self, message: JointState) -> None:
         stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
@@ -183,9 +186,10 @@ class GoalSender:
         self.feedback, self.history = [], self.history[-1:]
         future = self.actions[one.controller].send_goal_async(goal, lambda m: self.feedback.append(m.feedback))
         self.until(future.done, "an answer to a goal")
-        if not future.result().accepted:
+        handle = future.result()
+        if handle is None or not handle.accepted:
             raise RuntimeError(f"{one.controller} refused a goal")
-        return future.result(), begin
+        return handle, begin
 
     def result(self, handle: Any) -> tuple[int, int, str]:
         """Status, error code and text of a goal that has ended."""
@@ -251,7 +255,7 @@ def preempt(sender: GoalSender, one: Plan, newer: Plan) -> tuple[dict[str, Any],
 
 def main(arguments: list[str] | None = None) -> int:
     """Send the goals; 0 if all could be sent."""
-    parser = argparse.ArgumentParser(prog="python -m vinesim.bench.goal_sender", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m vinesim.bench.goal_sender", description="Send goals to a robot.")
     for kind, count in (("goals", 50), ("cancels", 10), ("preempts", 10), ("seed", 1)):
         parser.add_argument(f"--{kind}", type=int, default=count)
     given = parser.parse_args(arguments)

@@ -211,7 +211,8 @@ class TopicMonitor:
 
     def save_arrivals(self, path: pathlib.Path) -> None:
         """Write the times of every message: one array [message, 4] int64 a topic: see :attr:`TopicStats.arrivals`."""
-        np.savez(path, **{n: np.array(t.arrivals, np.int64).reshape(-1, 4) for n, t in self.stats.items()})
+        rows: dict[str, Any] = {n: np.array(t.arrivals, np.int64).reshape(-1, 4) for n, t in self.stats.items()}
+        np.savez(path, **rows)
 
     def close(self) -> None:
         """Leave the graph."""
