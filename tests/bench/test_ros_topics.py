@@ -38,7 +38,7 @@ def test_lost_messages_are_not_on_time() -> None:
 def test_every_message_is_in_one_count() -> None:
     topics = {topic: heard(200, lost=(50, 60 + i), first=1 + i) for i, topic in enumerate(TOPICS)}
     rows = {
-        row.case: row.value for row in loss_rows(topics, {topic: 210 for topic in TOPICS}, 0)
+        row.case: row.value for row in loss_rows(topics, dict.fromkeys(TOPICS, 210), 0)
     }  # the last of each were sent and never came
     count = len(TOPICS)
     before, after = sum(range(count)), sum(10 - i for i in range(count))
@@ -51,7 +51,14 @@ def test_every_message_is_in_one_count() -> None:
 
 
 def test_goals_that_ended_wrongly_are_not_counted_as_right() -> None:
-    goal = {"kind": "goal", "off": 0.001, "wanted_velocity_off": 0.0, "velocity_off": 0.01, "waypoints": 2, "fastest": 1.0}
+    goal = {
+        "kind": "goal",
+        "off": 0.001,
+        "wanted_velocity_off": 0.0,
+        "velocity_off": 0.01,
+        "waypoints": 2,
+        "fastest": 1.0,
+    }
     rows = [
         goal | {"right": True}, goal | {"right": False, "off": 0.2}, {"kind": "cancel", "right": True, "drift": 0.0},
         {"kind": "preempt", "right": True, "off": 0.0}, {"kind": "end", "sent": 5, "known": 1},

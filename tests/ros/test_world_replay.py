@@ -91,7 +91,9 @@ def test_a_recorded_world_is_heard_in_ros(tmp_path, monkeypatch) -> None:
                 peer.spin(0.0)
 
         wait_until(lambda: bus.ended, step)
-        wait_until(lambda: all(heard.values()), lambda: (step(), peer.spin(0.05)), str({k: len(v) for k, v in heard.items()}))
+        wait_until(
+            lambda: all(heard.values()), lambda: (step(), peer.spin(0.05)), str({k: len(v) for k, v in heard.items()})
+        )
     times = [m.clock.sec + 1e-9 * m.clock.nanosec for m in heard["/clock"]]
     assert times == sorted(times)
     assert ended - 1.5 < times[-1] <= ended

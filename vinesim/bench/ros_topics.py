@@ -109,7 +109,9 @@ def topic_rows(case: str, heard: Mapping[str, Arrivals], since: float, until: fl
     yield Measurement("ros", f"{case}: from publisher to subscriber, p50", float(p50), "ms")
     yield at_most(f"{case}: from publisher to subscriber, p99", float(p99), "ms", LATENCY)
     intervals = np.abs(1e-6 * np.diff(heard["/joint_states"].between(since, until).arrival) - 1e3 * PERIOD)
-    yield at_most(f"{case}: interval of /joint_states less 10 ms, p99", float(np.percentile(intervals, 99)), "ms", LATENCY)
+    yield at_most(
+        f"{case}: interval of /joint_states less 10 ms, p99", float(np.percentile(intervals, 99)), "ms", LATENCY
+    )
     stock = heard[stock_publisher.TOPIC]
     part = stock.between(since, until)
     peer = share_on_time(delay_ms(part, stock), until - since)
@@ -153,7 +155,10 @@ def action_rows(rows: list[dict[str, Any]]) -> Iterator[Measurement]:
             "ros", "goals: joints' velocity at waypoints less the given, largest", max(measured), "rad/s, m/s"
         )
         yield Measurement(
-            "ros", "goals: joints' velocity at waypoints less the given, median", float(np.median(measured)), "rad/s, m/s"
+            "ros",
+            "goals: joints' velocity at waypoints less the given, median",
+            float(np.median(measured)),
+            "rad/s, m/s",
         )
     yield Measurement("ros", "goals: fastest joint", max(row["fastest"] for row in kinds["goal"]), "rad/s, m/s")
     yield at_most("cancels: motion in the second half of a second after", max(r["drift"] for r in kinds["cancel"]),

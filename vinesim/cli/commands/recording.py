@@ -60,7 +60,9 @@ def replay(
         Pose | None,
         typer.Option(help="With --out: look from X Y [m] along YAW [rad]; unless given, follow a robot."),
     ] = None,
-    scene: Annotated[str | None, typer.Option(help="With --out and --ros: its scene file, if it is none that ships.")] = None,
+    scene: Annotated[
+        str | None, typer.Option(help="With --out and --ros: its scene file, if it is none that ships.")
+    ] = None,
     seed: Seed = None,
 ) -> None:
     """Play a recording again: to a server's clients, as pictures, or as ROS topics.

@@ -165,7 +165,9 @@ class TrajectoryController:
         here = np.where(
             by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active]
         )
-        moving = self._desired_velocity[order] if self.active_goal is not None and began <= time else np.zeros(len(order))
+        moving = (
+            self._desired_velocity[order] if self.active_goal is not None and began <= time else np.zeros(len(order))
+        )
         self._desired[order], self._desired_velocity[order] = here, moving
         self._knot_times, self._knot_positions, self._knot_velocities = (
             trajectory.times,
