@@ -214,9 +214,10 @@ def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, i
     for t, velocity in zip(one.times[:-1], one.velocities[:-1], strict=True):
         found = [np.interp(t, stamps, speeds[:, i]) for i in range(len(columns))]
         measured = max(measured, float(np.abs(found - velocity).max()))
+    off = float(np.abs(sender.positions(one.joints) - one.positions[-1]).max())
     return {
         "kind": "goal", "controller": one.controller, "waypoints": len(one.times), "text": status[2],
-        "right": status[:2] == (SUCCEEDED, 0), "off": float(np.abs(sender.positions(one.joints) - one.positions[-1]).max()),
+        "right": status[:2] == (SUCCEEDED, 0), "off": off,
         "wanted_velocity_off": wanted, "velocity_off": measured, "fastest": float(np.abs(speeds).max()),
     }  # fmt: skip
 

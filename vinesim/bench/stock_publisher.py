@@ -5,6 +5,7 @@ Each message is stamped with the time at which it was due [s since the start of 
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 
@@ -31,10 +32,8 @@ def main(joints: int, period: float) -> int:
         publisher.publish(message)
 
     node.create_timer(period, publish)
-    try:
+    with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     return 0
 
 
