@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.scene.model import Model
-from vinesim.scene.values import Shape
+from vinesim.scene.values import RigidBox, Shape
 
 CRATE_WALL = 0.012
 """[m] Thickness of a crate's bottom and walls. GUESSED."""
@@ -55,8 +56,19 @@ def contact_friction(coefficient: float, rolling_arm: float = 0.0001) -> list[fl
     return [coefficient, 0.005, rolling_arm]
 
 
-def build_static_world(model: Model, parameters: PhysicsParameters) -> mujoco.MjSpec:
-    """A world with ground, poles, wires, trunks, arms and crates, and MuJoCo's options."""
+def boxes_of(model: Model) -> dict[int, RigidBox]:
+    """The boxes of a scene as generated, by number."""
+    rows = zip(model.box_pose.astype(float), model.box_size.astype(float), model.box_mass.tolist(), strict=True)
+    return {number: RigidBox(*row) for number, row in enumerate(rows)}
+
+
+def build_static_world(
+    model: Model, parameters: PhysicsParameters, boxes: Mapping[int, RigidBox] | None = None
+) -> mujoco.MjSpec:
+    """A world with ground, poles, wires, trunks, arms and crates, and MuJoCo's options.
+
+    ``boxes``: the crates by number; those of the model unless given.
+    """
     spec = mujoco.MjSpec()
     _set_options(spec, parameters)
     friction = contact_friction(parameters.friction)
@@ -72,10 +84,11 @@ def build_static_world(model: Model, parameters: PhysicsParameters) -> mujoco.Mj
             size=[float(radius[piece]), 0, 0], contype=FIXED, conaffinity=0, friction=friction,
             margin=max(MIN_STATIC_RADIUS - float(radius[piece]), 0.0),
         )  # fmt: skip
-    for box, pose in enumerate(model.box_pose.astype(float)):
-        body = spec.worldbody.add_body(name=f"box/{box}", pos=pose[:3], quat=frames.to_wxyz(frames.normalize(pose[3:])))
-        body.add_freejoint(name=f"box/{box}")
-        _add_crate(body, model.box_size[box], float(model.box_mass[box]), friction)
+    for number, box in (boxes_of(model) if boxes is None else boxes).items():
+        turn = frames.to_wxyz(frames.normalize(box.pose[3:]))
+        body = spec.worldbody.add_body(name=f"box/{number}", pos=box.pose[:3], quat=turn)
+        body.add_freejoint(name=f"box/{number}")
+        _add_crate(body, box.size, box.mass, friction)
     return spec
 
 
