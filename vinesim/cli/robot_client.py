@@ -50,6 +50,7 @@ def run(options: ClientOptions) -> int:
             publish=lambda values: [one.publish_diagnostics(values) for one in sensors],
         )  # fmt: skip
         if options.out is not None:
+            sensors[0].close_ros()
             report = status.report() | sensors[0].report()
             if task is not None:
                 report["job"] = task.report()
