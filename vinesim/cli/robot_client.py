@@ -51,6 +51,7 @@ def run(options: ClientOptions) -> int:
             publish=lambda values: [one.publish_diagnostics(values) for one in sensors],
         )  # fmt: skip
         if options.out is not None:
+            sensors[0].close_ros()
             report = status.report() | sensors[0].report()
             if task is not None:
                 report["job"] = task.report()
@@ -111,6 +112,8 @@ def _build_client(
 def _add_behaviour(session: ClientSession, client: Client, task: Task | None, approach: float) -> None:
     """Let the robots drive to their start poses, push the bunch of ``--push``, do the ``task``, and look at it."""
     options = session.options
+    given = {"--job": options.job, "--push": options.push, "--watch": options.watch, "--approach": approach or None}
+    client.script = next((name for name, value in given.items() if value is not None), "")
     watched = options.watch if options.watch is not None else options.push
     if watched is not None:
         session.trace(client, watched)
