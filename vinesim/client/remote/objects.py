@@ -276,7 +276,13 @@ class ObjectSync:
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
         """Objects that actor ``name`` detached in the last step; and those of no local actor if ``all_others``."""
         mine = [p for p in self._detachments if p.actor == name or (all_others and p.actor not in self._local_actors)]
-        return [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
+        numbers = [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
+        return [number for number in numbers if is_tree(number) or number in self.physics.support_tracker]
+
+    def forget(self, number: int) -> None:
+        """A box or free bunch has left the world."""
+        self._clear_resting(number)
+        self._remote_updates.pop(number, None)
 
     def with_trees(self, detached: Iterable[int]) -> list[int]:
         """Detached objects and the trees that they were detached from."""

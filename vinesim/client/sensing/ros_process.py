@@ -93,6 +93,7 @@ class RosProcess:
             self.robot, self._take_commands, lambda result: self.worker.send("finish", result), client.world_time
         )
         client.pre_step.insert(0, self._control)
+        client.after_reset.append(self._begin_anew)
         if self._leads:
             self._simulation = SimulationControl(client, lambda reply: self.worker.send("simulated", reply))
             client.between_steps.append(self._simulation)
@@ -105,6 +106,12 @@ class RosProcess:
             self._is_restarted = False
             self.handler.cancel_all(time)
         self.handler(time)
+
+    def _begin_anew(self) -> None:
+        """After a reset: obey no earlier command, and publish the new robot."""
+        self._take_commands()
+        self.robot = self.client.robots[self.robot.name]
+        self.handler.begin_anew(self.robot)
 
     def _after_step(self, client: Client) -> None:
         """Pass the state to the process, as far as its topics have subscribers."""
@@ -195,7 +202,7 @@ class RosProcess:
         self.worker.send("diagnose", (time, list(components)))
 
     def close(self) -> None:
-        """End the process."""
+        """End the process; its counts are complete then. A second call does nothing."""
         self.worker.close()
         self._truth_list.close()
 

@@ -102,8 +102,14 @@ class SensorProcess:
         self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
+        client.after_reset.append(self._begin_anew)
 
     # ------------------------------------------------------------------ in the loop
+
+    def _begin_anew(self) -> None:
+        """After a reset: all plants are elsewhere, and the sensors are on the new robot."""
+        self._moved_trees[:] = True
+        self.robot = self.client.robots[self.robot.name]
 
     def _after_step(self, client: Client) -> None:
         """Write the next snapshot if it is due."""

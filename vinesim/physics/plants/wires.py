@@ -6,13 +6,12 @@ table are the wires' places, so that the trees, the sleep of trees and joint wre
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
 from vinesim.kernels.articulation import wires as kernels
 from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.berry_clusters import spans
@@ -87,11 +86,11 @@ class Wires:
         }  # fmt: skip
         self._solve = bind_launch(
             kernels.deflect_wires,
-            [_fill(kernels.WireNodes, nodes), wake_distance, _share(self._active, wp.int32),
-             _share(state.tree_awake, wp.bool), _share(self._is_placed, wp.bool), _share(state.body_q, wp.transform),
-             _share(state.body_qd, wp.spatial_vector)],
-            [_fill(kernels.WireShape, shape), _fill(kernels.WireTies, table), _share(self._is_moved, wp.bool),
-             _share(self._moved_count, wp.int32)],
+            [SharedArrays(kernels.WireNodes, **nodes).struct, wake_distance, share(self._active, wp.int32),
+             share(state.tree_awake, wp.bool), share(self._is_placed, wp.bool), share(state.body_q, wp.transform),
+             share(state.body_qd, wp.spatial_vector)],
+            [SharedArrays(kernels.WireShape, **shape).struct, SharedArrays(kernels.WireTies, **table).struct,
+             share(self._is_moved, wp.bool), share(self._moved_count, wp.int32)],
         )  # fmt: skip
 
     @property
@@ -138,16 +137,3 @@ class Wires:
         shared = np.bincount(pairs[0], minlength=len(self.pieces)) > 1
         self.is_coupled[:] = False
         self.is_coupled[pairs[1, shared[pairs[0]]]] = True
-
-
-def _fill(struct: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """A kernel argument struct over NumPy arrays, by the names of its fields."""
-    filled = struct()
-    for name, field in struct.vars.items():
-        setattr(filled, name, _share(arrays[name], field.type.dtype))
-    return filled
-
-
-def _share(data: np.ndarray, dtype: Any) -> wp.array:
-    """A Warp array over the memory of a NumPy array."""
-    return wp.array(np.ascontiguousarray(data), dtype=dtype, device="cpu", copy=False)
