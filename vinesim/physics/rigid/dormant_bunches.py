@@ -47,9 +47,7 @@ class DormantBunches:
     def __len__(self) -> int:
         return len(self._bunches)
 
-    def add(
-        self, bunches: list[int], supports: list[str], poses: np.ndarray, places: np.ndarray | None = None
-    ) -> None:
+    def add(self, bunches: list[int], supports: list[str], poses: np.ndarray, places: np.ndarray | None = None) -> None:
         """Add picked bunches, or move them: ``poses`` [k, 7] in the frames of their ``supports`` (names), ``places``
         [k, 7] in the world as long as the support does not exist (None: ``poses``).
 
