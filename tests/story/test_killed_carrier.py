@@ -1,4 +1,4 @@
-"""A robot that is killed while it carries a box and a bunch: both lie on the ground on all clients, whoever was near."""
+"""A robot is killed while it carries a box and a bunch: both lie on the ground on all clients, near or late."""
 
 from __future__ import annotations
 
