@@ -205,7 +205,7 @@ class RosProcess:
         self.worker.send("diagnose", (time, list(components)))
 
     def close(self) -> None:
-        """End the process."""
+        """End the process; its counts are complete then. A second call does nothing."""
         self.worker.close()
         self._truth_list.close()
 

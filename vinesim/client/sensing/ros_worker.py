@@ -149,6 +149,7 @@ class RosWorker:
                 if commands := self.node.commands():
                     self.pipe.send(("commands", commands))
                 self._report()
+        self._send_statistics()  # what was sent last is counted, too
 
     def _take_requests(self) -> bool:
         """Answer the client's requests; False after a "stop"."""
@@ -192,8 +193,11 @@ class RosWorker:
         now = time.monotonic()
         if now >= self._next_statistics:
             self._next_statistics = now + STATISTICS_PERIOD
-            statistics: dict[str, Any] = {"sent": self.node.sent, "dropped": self.node.dropped}
-            self.pipe.send(("statistics", statistics))
+            self._send_statistics()
+
+    def _send_statistics(self) -> None:
+        statistics: dict[str, Any] = {"sent": self.node.sent, "dropped": self.node.dropped}
+        self.pipe.send(("statistics", statistics))
 
 
 def truth_frame(visual: RigidVisual) -> str:
