@@ -8,6 +8,8 @@ import pytest
 from tests.support.browser import browser_page
 from tests.support.waiting import wait
 from vinesim import frames
+from vinesim.avatar.tracked_human import TrackedHuman
+from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -21,15 +23,22 @@ BUNCH = 10
 
 
 class LiveVineyard:
-    """A client that steps in a thread of its own, as in its process."""
+    """A client that steps in a thread of its own, as in its process: a spectator or a person before a bunch."""
 
-    def __init__(self, bus):
-        model = generate(load_scene("demo"))
+    def __init__(self, bus, *, is_person=False):
+        scene = load_scene("demo")
+        model = generate(scene)
         hangs = model.forward_kinematics(model.joint_settled)[model.bunch_body[BUNCH]]
         self.bunch = frames.compose(hangs, frames.pose(np.array([0.06, 0.0, 0.0])))[:3]
-        eye = self.bunch - np.array([0.7, 0.0, 0.0])
-        self.client = Spectator(load_scene("demo"), model, None, bus, name="viewer", pose=frames.pose(eye))
-        self.world = PageWorld(self.client)
+        person = None
+        if is_person:
+            start = frames.pose(np.array([self.bunch[0] - 0.75, self.bunch[1], 0.0]))
+            person = TrackedHuman(start, 1.75)
+            self.client = Client(scene, model, None, bus, name="viewer", pose=start, source=person)
+        else:
+            eye = frames.pose(self.bunch - np.array([0.7, 0.0, 0.0]))
+            self.client = Spectator(scene, model, None, bus, name="viewer", pose=eye)
+        self.world = PageWorld(self.client, person)
         self.server = PageServer(self.world)
         self.client.post_step.append(lambda _: self.world.collect(self.server))
         self.due = []
@@ -54,6 +63,14 @@ class LiveVineyard:
         self.server.__exit__(*exception)
 
 
+def open_page(page, live):
+    """Open the page, and let it draw little: the browser of a test has no graphics card."""
+    page.open(live.server.address + "?triangles=60000")
+    wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
+    assert page.run("vinesim.failure") is None
+    assert page.errors == []
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
 def test_the_live_vineyard_in_a_browser():
@@ -61,7 +78,6 @@ def test_the_live_vineyard_in_a_browser():
         page.open(live.server.address)
         wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
         assert page.run("vinesim.failure") is None
-        assert page.errors == []
         assert 0 < page.run("vinesim.calls") <= MAX_CALLS
         assert 50_000 < page.run("vinesim.triangles") <= MAX_TRIANGLES
         assert len(live.world.scene()) <= MAX_BYTES
@@ -96,4 +112,33 @@ def test_the_live_vineyard_in_a_browser():
         page.key("KeyS", down=True)
         wait(lambda: np.linalg.norm(live.client.pose[:3] - live.bunch) > 1.2, "the eyes have flown away")
         page.key("KeyS", down=False)
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, browser_page() as page:
+        open_page(page, live)
+        physics, body = live.client.physics, live.client.model.bunch_body[BUNCH]
+        here = physics.state.body_q[body, :3].copy()
+        eye = np.array(page.run("vinesim.viewer.eyes.place"))
+        assert np.linalg.norm(eye - live.client.humans["viewer"].pose.head[:3]) < 1e-3, "the person's own eyes"
+        way = live.bunch - eye
+        pitch = np.arctan2(way[2], np.hypot(*way[:2]))
+        page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
+        page.run(f"vinesim.viewer.hand.distance = {np.linalg.norm(way) + 0.02}")
+        page.key("KeyR", down=True)
+        page.key("KeyR", down=False)
+        wait(lambda: physics.hand("viewer", "right").touching, "the hand reaches the bunch")
+        page.key("Space", down=True)
+        page.key("Space", down=False)
+        wait(lambda: page.run("vinesim.haptics.right?.[0] > 0"), "the page is told to vibrate")
+        wait(lambda: np.linalg.norm(physics.state.body_q[body, :3] - here) > 2e-3, "the bunch gives way")
+        wait(lambda: physics.hand("viewer", "right").held is not None, "the hand holds the bunch")
+        page.key("KeyS", down=True)
+        wait(lambda: not physics.state.bunch_attached[BUNCH], "who walks away with it in the hand picks it")
+        page.key("KeyS", down=False)
+        assert np.linalg.norm(physics.hand("viewer", "right").force) <= 100.0 + 1e-6
+        wait(lambda: page.run("vinesim.viewer.world.picked.size") == 1, "the page knows of the picked bunch")
         assert page.errors == []
