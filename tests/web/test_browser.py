@@ -1,5 +1,6 @@
 """The page in a real browser: it draws the live vineyard within its budgets, and what happens there is seen."""
 
+import pathlib
 import threading
 
 import numpy as np
@@ -20,6 +21,8 @@ from vinesim.web.page_server import WINDOW, PageServer
 MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
 """Of one picture for one eye, and of the vineyard that a page loads [B]."""
 BUNCH = 10
+HEADSET = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
+"""Put there by tools/build_page."""
 
 
 class LiveVineyard:
@@ -63,9 +66,9 @@ class LiveVineyard:
         self.server.__exit__(*exception)
 
 
-def open_page(page, live):
+def open_page(page, live, before=""):
     """Open the page, and let it draw little: the browser of a test has no graphics card."""
-    page.open(live.server.address + "?triangles=60000")
+    page.open(live.server.address + "?triangles=60000", before=before)
     wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
     assert page.run("vinesim.failure") is None
     assert page.errors == []
@@ -141,4 +144,42 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
         page.key("KeyS", down=False)
         assert np.linalg.norm(physics.hand("viewer", "right").force) <= 100.0 + 1e-6
         wait(lambda: page.run("vinesim.viewer.world.picked.size") == 1, "the page knows of the picked bunch")
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_a_headset_moves_head_and_hands():
+    """An emulated headset (iwer) at known places: the person in the physics is there, in the world's axes."""
+    device = ";window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
+    device += "device.installRuntime({forceInstall: true});"
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, browser_page() as page:
+        open_page(page, live, HEADSET.read_text() + device)
+        human = live.client.humans["viewer"]
+        start = human.pose.head.copy()
+        page.run("vinesim.viewer.eyes.yaw = 0.5, 0")
+        wait(lambda: page.run("!document.getElementById('enter').hidden"), "the page offers the headset")
+        page.run("device.position.set(0.1, 1.5, -0.2), device.quaternion.set(0, 0, 0, 1), 0")
+        page.run("device.controllers.right.position.set(0.3, 1.2, -0.6), 0")
+        page.run("device.controllers.right.quaternion.set(0, 0, 0, 1), 0")
+        page.run("document.getElementById('enter').click()")
+        wait(lambda: page.run("vinesim.viewer.headset.isWorn"), "the headset is worn")
+        # 0.2 m ahead and 0.1 m to the right of the floor's middle, which looks along 0.5 rad
+        ahead, right = np.array([np.cos(0.5), np.sin(0.5)]), np.array([np.sin(0.5), -np.cos(0.5)])
+        head = np.array([*(start[:2] + 0.2 * ahead + 0.1 * right), 1.5])
+        wait(lambda: np.linalg.norm(human.pose.head[:3] - head) < 5e-3, "the head is where the headset is")
+        assert frames.to_yaw(human.pose.head[3:]) == pytest.approx(0.5, abs=1e-3)
+        palm = np.array([*(start[:2] + 0.6 * ahead + 0.3 * right), 1.2])
+        wait(lambda: np.linalg.norm(human.pose.right[:3] - palm) < 0.1, "the hand is where its controller is")
+        fingers = frames.rotate(human.pose.right[3:], np.array([1.0, 0.0, 0.0]))
+        assert np.dot(fingers[:2], ahead) > 0.7, "it points ahead"
+        page.run("device.controllers.right.updateButtonValue('squeeze', 1), 0")
+        wait(lambda: human.pose.right_closed, "the hand closes")
+        assert human.pose.right_fingers[2:] == (1.0, 1.0, 1.0)
+        page.run("device.controllers.left.updateAxes('thumbstick', 0, -1), 0")
+        wait(lambda: np.dot(human.pose.head[:2] - head[:2], ahead) > 0.5, "the stick walks ahead")
+        page.run("device.controllers.left.updateAxes('thumbstick', 0, 0), 0")
+        page.run("device.controllers.right.updateAxes('thumbstick', 1, 0), 0")
+        wait(lambda: frames.to_yaw(human.pose.head[3:]) < 0.0, "the stick turns to the right")
+        assert page.run("vinesim.calls") <= 2 * MAX_CALLS
         assert page.errors == []

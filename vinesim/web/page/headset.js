@@ -14,8 +14,8 @@ export class Headset {
   constructor(renderer, rig, camera) {
     this.renderer = renderer;
     this.rig = rig;
-    this.camera = camera;
     this.turned = false;
+    this.viewer = new THREE.Matrix4(); // between the eyes, on the rig
     renderer.xr.enabled = true;
     renderer.xr.setReferenceSpaceType("local-floor");
     rig.add(camera);
@@ -38,8 +38,10 @@ export class Headset {
     await this.renderer.xr.setSession(session);
   }
 
-  /** Sticks: left walks where the head looks, right turns by 30 degrees. */
-  update(seconds) {
+  /** Of one XRFrame: where the head is; sticks: left walks where the head looks, right turns by 30 degrees. */
+  update(frame, seconds) {
+    const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
+    if (viewer) this.viewer.fromArray(viewer.transform.matrix);
     for (const source of this.sources) {
       const [x, y] = source?.gamepad?.axes?.slice(-2) ?? [0, 0];
       if (source?.handedness === "left" && Math.hypot(x, y) > DEAD) {
@@ -63,13 +65,16 @@ export class Headset {
 
   /** Turn the floor about the head. */
   turn(angle) {
-    const head = new THREE.Vector3().setFromMatrixPosition(this.camera.matrixWorld);
+    const head = new THREE.Vector3().setFromMatrixPosition(this.viewer).applyMatrix4(this.rig.matrixWorld);
     this.rig.position.sub(head).applyAxisAngle(new THREE.Vector3(0, 1, 0), angle).add(head);
     this.rig.rotation.y += angle;
   }
 
   /** Pose [7] m, 1 of the head in the world. */
-  head() { return worldPose(this.camera.matrixWorld); }
+  head() {
+    this.rig.updateMatrixWorld();
+    return worldPose(new THREE.Matrix4().multiplyMatrices(this.rig.matrixWorld, this.viewer));
+  }
 
   /** Tracked hands by side, for the page's message. */
   hands() {

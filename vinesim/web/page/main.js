@@ -42,7 +42,7 @@ class Viewer {
     addEventListener("keydown", (event) => this.press(event.code));
     this.resize();
     this.connect();
-    this.renderer.setAnimationLoop(() => this.draw());
+    this.renderer.setAnimationLoop((_, frame) => this.draw(frame));
   }
 
   async offerHeadset() {
@@ -100,7 +100,7 @@ class Viewer {
     return [...first].map(([name, k]) => ({ name, carrier: this.world.bodies + 1 + k }));
   }
 
-  draw() {
+  draw(frame) {
     const now = performance.now(), passed = (now - this.lastFrame) / 1000, seconds = Math.min(passed, 0.1);
     this.lastFrame = now;
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
@@ -110,7 +110,7 @@ class Viewer {
       const { carrier } = actors[this.followed];
       this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
     }
-    if (this.headset.isWorn) this.headset.update(seconds);
+    if (this.headset.isWorn) this.headset.update(frame, seconds);
     else this.look(this.eyes.pose);
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
     const eye = new THREE.Vector3(...pose.slice(0, 3));
