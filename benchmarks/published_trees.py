@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+import sys
 
 import numpy as np
 
@@ -39,8 +40,8 @@ def tree_of_cylinders(cylinders: np.ndarray, wood: RodMaterial) -> TreeBuilder:
     """A tree of one body a cylinder, in equilibrium as drawn.
 
     Args:
-        cylinders: [k, 9 or more] radius, length, start (x, y, z), axis (x, y, z), number of the parent from 1 on (0: none);
-            parents before children; m.
+        cylinders: [k, 9 or more] m, radius, length, start (x, y, z), axis (x, y, z), number of the parent from 1 on
+            (0: none); parents before children.
         wood: of all of them.
     """
     radius, length, start, axis = cylinders[:, 0], cylinders[:, 1], cylinders[:, 2:5], cylinders[:, 5:8]
@@ -105,7 +106,8 @@ def main() -> None:
     parser.add_argument("frequencies", type=pathlib.Path, help="clone of WindAndTrees_NaturalFrequencies")
     given = parser.parse_args()
     pairs = []
-    print("| tree | cylinders | season | measured [Hz] | vinesim [Hz] | ratio |\n|---|---|---|---|---|---|")
+    write = sys.stdout.write
+    write("| tree | cylinders | season | measured [Hz] | vinesim [Hz] | ratio |\n|---|---|---|---|---|---|\n")
     for number in TREES:
         file = next(given.fem.glob(f"QSMs/cyl_data_Tf{number}_*.mat"))
         cylinders = scipy.io.loadmat(file)["CylData_updated"].astype(float)
@@ -118,7 +120,7 @@ def main() -> None:
             f"| T{number} | {len(cylinders)} | {season} | {span} | {computed:.3f} | {computed / mean:.2f} |", flush=True
         )
     seen, found = np.array(pairs).T
-    print(f"\nR^2 {np.corrcoef(seen, found)[0, 1] ** 2:.2f}, median ratio {np.median(found / seen):.2f}")
+    write(f"\nR^2 {np.corrcoef(seen, found)[0, 1] ** 2:.2f}, median ratio {np.median(found / seen):.2f}\n")
 
 
 if __name__ == "__main__":

@@ -35,7 +35,7 @@ BARE_DAMPING = (0.01, 0.08)
 
 
 def test_measured_cylinders_become_a_tree_of_the_same_shape() -> None:
-    """Random cylinders, each somewhere along an earlier one and beside it: every body begins and points where it did."""
+    """Random cylinders, each somewhere along and beside an earlier one: every body begins and points where it did."""
     rng = np.random.default_rng(3)
     cylinders = np.zeros((40, 9))
     cylinders[:, 0], cylinders[:, 1] = rng.uniform(0.02, 0.1, 40), rng.uniform(0.1, 0.5, 40)
