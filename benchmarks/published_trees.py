@@ -116,9 +116,8 @@ def main() -> None:
         mean = float(np.mean(all_measured))
         pairs.append((mean, computed))
         span = f"{mean:.3f} ({min(all_measured):.3f} to {max(all_measured):.3f})"
-        print(
-            f"| T{number} | {len(cylinders)} | {season} | {span} | {computed:.3f} | {computed / mean:.2f} |", flush=True
-        )
+        write(f"| T{number} | {len(cylinders)} | {season} | {span} | {computed:.3f} | {computed / mean:.2f} |\n")
+        sys.stdout.flush()
     seen, found = np.array(pairs).T
     write(f"\nR^2 {np.corrcoef(seen, found)[0, 1] ** 2:.2f}, median ratio {np.median(found / seen):.2f}\n")
 
