@@ -30,8 +30,12 @@ COLOURS = {
     "lamp_white": (1.00, 0.97, 0.88),
     "lamp_green": (0.10, 1.00, 0.30),
     "lamp_red": (0.70, 0.03, 0.03),
+    "indicator_lamp_green": (0.10, 1.00, 0.30),
+    "indicator_amber": (0.80, 0.42, 0.05),
+    "indicator_red": (0.72, 0.08, 0.10),
 }
-"""Lamps shine, rubber, steel and glass look like it, all else is painted: sensors go by these words."""
+"""Lamps shine, rubber, steel and glass look like it, all else is painted: sensors go by these words. The indicator
+lights change their colour by command."""
 
 ROUNDING_ERROR = 1e-12
 """Largest size of a value [m, rad, kg m2] that is taken for rounding, which differs between processors."""
@@ -104,7 +108,7 @@ ALONG = (0, math.pi / 2, 0)
 
 def beacon(x: float, y: float, z: float) -> tuple[Piece, ...]:
     """A signal tower on ``z``: green is lit, amber and red are not."""
-    tiers = ("lamp_green", "amber", "red")
+    tiers = ("indicator_lamp_green", "indicator_amber", "indicator_red")
     return (
         cylinder(0.012, 0.10, (x, y, z + 0.05), colour="steel", solid=False),
         *(cylinder(0.026, 0.032, (x, y, z + 0.116 + 0.036 * k), colour=c, solid=False) for k, c in enumerate(tiers)),

@@ -21,7 +21,7 @@ from vinesim.net.codec.human import (
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
 from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.scene.values import POINT_NAMES, HumanUpdate, RobotUpdate
+from vinesim.scene.values import INTENTIONS, POINT_NAMES, HumanUpdate, RobotUpdate
 
 HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.from_yaw(2.0))
 
@@ -41,11 +41,11 @@ def rotation_cosine(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.abs((a * b).sum(-1))
 
 
-def test_a_human_pose_is_root_three_inputs_hips_and_feet_in_161_bytes():
+def test_a_human_pose_is_root_three_inputs_hips_and_feet_in_162_bytes():
     """F88: root, head and two hands; F89: hips and feet."""
     sent = random_human()
     payload = encode_pose(sent)
-    assert len(payload) == 161
+    assert len(payload) == 162
     received = decode_pose(payload, "eva")
     assert isinstance(received, HumanUpdate)
     assert (received.actor, received.time) == ("eva", 12.5)
@@ -60,6 +60,14 @@ def test_a_human_pose_is_root_three_inputs_hips_and_feet_in_161_bytes():
     assert (received.pose.left_busy, received.pose.right_busy) == (False, True)
     np.testing.assert_allclose(received.pose.right_fingers, sent.pose.right_fingers, atol=0.5 / 255 + 1e-9)
     assert received.pose.left_fingers == (0.0,) * 5
+    for intention in INTENTIONS:
+        told = decode_pose(encode_pose(dataclasses.replace(sent, intention=intention)), "eva")
+        assert isinstance(told, HumanUpdate)
+        assert told.intention == intention
+    with pytest.raises(MessageError, match="unknown intention, 200"):
+        decode_pose(payload[:-1] + b"\xc8", "eva")
+    with pytest.raises(MessageError, match="'fly' of"):
+        encode_pose(dataclasses.replace(sent, intention="fly"))
 
 
 @given(st.integers(0, 1 << 32))

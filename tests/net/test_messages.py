@@ -16,7 +16,7 @@ from vinesim.net.codec import messages, rotation
 from vinesim.net.codec.messages import Hello, MessageError, TreeStates, WrongVersion
 from vinesim.net.replication.authority import Claim
 from vinesim.scene import ids
-from vinesim.scene.values import RobotUpdate
+from vinesim.scene.values import LightPattern, Lights, RobotUpdate
 
 
 def robot(rng: np.random.Generator, joints: int = 14) -> RobotUpdate:
@@ -66,7 +66,7 @@ def test_a_robot_pose_is_decoded_within_quantisation(joints):
     sent = robot(np.random.default_rng(joints), joints)
     payload = messages.encode_robot(sent)
     received = messages.decode_robot(payload, "tiago")
-    assert len(payload) == 46 + 3 * joints
+    assert len(payload) == 50 + 3 * joints
     assert (received.actor, received.time) == ("tiago", 12.5)
     np.testing.assert_allclose(received.base_q[:3], sent.base_q[:3], atol=1e-5)
     assert angle_between(received.base_q[3:], sent.base_q[3:]) < np.radians(0.005)
@@ -74,6 +74,14 @@ def test_a_robot_pose_is_decoded_within_quantisation(joints):
     np.testing.assert_allclose(received.position, sent.position, atol=1e-4 + 1e-9)
     fastest = np.abs(sent.velocity).max(initial=0.0)
     np.testing.assert_allclose(received.velocity, sent.velocity, atol=0.004 * fastest + 1e-5)
+    for pattern in LightPattern:
+        lights = Lights(pattern, (0, 128, 255))
+        assert (
+            messages.decode_robot(messages.encode_robot(dataclasses.replace(sent, lights=lights)), "a").lights == lights
+        )
+    at = messages.HEADER.size + 12 + 6 + 12 + 2
+    with pytest.raises(MessageError, match="unknown pattern, 4"):
+        messages.decode_robot(payload[:at] + b"\4" + payload[at + 1 :], "tiago")
 
 
 def test_joint_angles_beyond_a_turn_are_decoded():
@@ -81,7 +89,7 @@ def test_joint_angles_beyond_a_turn_are_decoded():
     sent.position[[1, 4]] = 6.6, -1234.5678
     payload = messages.encode_robot(sent)
     received = messages.decode_robot(payload, "tiago")
-    assert len(payload) == 46 + 3 * 5 + 4 * 2
+    assert len(payload) == 50 + 3 * 5 + 4 * 2
     np.testing.assert_allclose(received.position[[1, 4]], [6.6, -1234.5678], rtol=1e-7)
     np.testing.assert_allclose(received.position[[0, 2, 3]], sent.position[[0, 2, 3]], atol=1e-4 + 1e-9)
     with pytest.raises(MessageError, match="2 wide joints and 4 B"):
@@ -150,6 +158,7 @@ def test_updates_split_a_batch_by_tree():
         ({"base_q": np.array([0, 0, 1e12, 0, 0, 0, 1.0])}, "1e9"),
         ({"base_q": np.zeros(7)}, "unit quaternion"),
         ({"velocity": np.zeros(3)}, "velocities"),
+        ({"lights": Lights(LightPattern.ALARM, (0, 256, 0))}, "must be 0 to 255"),
         ({"position": np.full(14, np.inf)}, "finite"),
         ({"position": np.zeros(300), "velocity": np.zeros(300)}, "at most 256"),
     ],

@@ -3,6 +3,7 @@
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
 
+import json
 import os
 import time
 
@@ -16,7 +17,9 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 from geometry_msgs.msg import TwistStamped
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
+from std_msgs.msg import ColorRGBA, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tests.support.contact_scenes import cane
@@ -29,6 +32,7 @@ from vinesim.robot.description.loader import load_description
 from vinesim.ros.robot_node import RobotNode
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
+from vinesim.scene.values import Intention, LightPattern, Lights
 
 GOAL = 0.4
 """Of the head's first joint [rad]."""
@@ -93,3 +97,26 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
         wait_until(
             lambda: np.linalg.norm(robot.rigid.base_state("robot")[0][:2] - start) > 0.1, drive, "the base on its way"
         )
+
+        # F40, F49: lights by command and colour; intentions, latched
+        pattern = peer.node.create_publisher(String, "/indicator_lights/command", 10)
+        color = peer.node.create_publisher(ColorRGBA, "/indicator_lights/color", 10)
+        wait_until(lambda: pattern.get_subscription_count() and color.get_subscription_count(), step, "lights")
+        pattern.publish(String(data="warning"))
+        wait_until(lambda: robot.lights == Lights(LightPattern.WARNING, (255, 150, 0)), step, "the usual colour")
+        color.publish(ColorRGBA(r=0.0, g=1.0, b=0.0, a=1.0))
+        wait_until(lambda: robot.lights == Lights(LightPattern.WARNING, (0, 255, 0)), step, "green")
+        refused = node._commands.rejected
+        pattern.publish(String(data="disco"))
+        wait_until(lambda: node._commands.rejected == refused + 1, step, "a refusal")
+        pattern.publish(String(data="off"))
+        wait_until(lambda: robot.lights.pattern == LightPattern.OFF, step, "lights off")
+
+        node.publish_intentions([Intention("anna", "pick", 2.0)])
+        heard: list[String] = []
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        peer.node.create_subscription(String, "/human_intention", heard.append, latched)
+        wait_until(lambda: heard, step, "the latched intention")
+        assert json.loads(heard[0].data) == {
+            "people": [{"person": "anna", "intention": "pick", "start": 2.0, "end": None}]
+        }

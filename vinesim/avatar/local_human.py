@@ -11,7 +11,7 @@ from vinesim import frames
 from vinesim.avatar.haptics import HapticFeedback
 from vinesim.physics.rigid.human_shapes import SIDES
 from vinesim.physics.step import Physics
-from vinesim.scene.values import POINT_NAMES, Haptic, HumanPose, HumanSpec, HumanUpdate
+from vinesim.scene.values import INTENTIONS, POINT_NAMES, Haptic, HumanPose, HumanSpec, HumanUpdate
 
 _HEAD, _HANDS = POINT_NAMES.index("head"), [POINT_NAMES.index(side) for side in SIDES]
 
@@ -24,6 +24,8 @@ class LocalHuman:
         self.physics, self.name, self.source = physics, spec.name, source
         physics.add_human(spec)
         self.pose = spec.pose
+        self.intention = ""
+        """What the person indicates to do; see :meth:`indicate`."""
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the person's controllers after the last step."""
         self._feedback = HapticFeedback(physics, spec.name)
@@ -32,6 +34,12 @@ class LocalHuman:
         """For how many steps a hand counts as busy after it pushed a robot or held something."""
         self._steps_since_busy = [self._busy_steps] * len(SIDES)
         self._hand_wrenches: dict[str, dict[str, np.ndarray]] = {}
+
+    def indicate(self, intention: str) -> None:
+        """Indicate what the person is about to do: one of :data:`INTENTIONS`, empty when it is done."""
+        if intention not in INTENTIONS:
+            raise ValueError(f"no intention {intention!r}; give one of {', '.join(INTENTIONS[1:])}, or nothing")
+        self.intention = intention
 
     def control(self, time: float) -> None:
         """Before a step: move to where the source says."""
@@ -61,7 +69,7 @@ class LocalHuman:
         pose = dataclasses.replace(
             self.pose.with_points(points), left_busy=self._is_busy(0), right_busy=self._is_busy(1)
         )
-        return HumanUpdate(self.name, now, pose, velocity)
+        return HumanUpdate(self.name, now, pose, velocity, self.intention)
 
     def hand_wrenches_on(self, robots: Container[str]) -> dict[str, dict[str, np.ndarray]]:
         """Wrenches [6] of the hands on some ``robots`` in the last step, by robot and link; after :meth:`update`."""

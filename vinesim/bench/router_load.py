@@ -130,7 +130,8 @@ def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measur
     wall = after[2] - before[2]
     routers = sum(b - a for a, b in zip(before[0], after[0], strict=True)) / wall
     clients = sum(b["cpu"] - a["cpu"] for a, b in zip(before[1], after[1], strict=True)) / wall
-    size = len(encode_pose(RobotUpdate("", 0.0, frames.pose([0.0, 0.0, 0.0]), *map(np.zeros, (6, JOINTS, JOINTS)))))
+    joints = np.zeros(JOINTS)
+    size = len(encode_pose(RobotUpdate("", 0.0, frames.pose([0.0, 0.0, 0.0]), np.zeros(6), joints, joints)))
     spans = [(a, b, b["now"] - a["now"]) for a, b in zip(before[1], after[1], strict=True)]
     ticks = np.mean([(b["ticks"] - a["ticks"]) / seconds for a, b, seconds in spans])
     # what arrived, not what a late tick still found: of poses only the newest wait

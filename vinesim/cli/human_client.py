@@ -40,7 +40,7 @@ def run(options: ClientOptions) -> int:
             trace = session.trace(client, options.reach)
             if options.walk is None:
                 human.do(human.walk(standing_place(bunch_centres(session.model)[options.reach], start)))
-            human.do(pull_repeatedly(human, trace.centre))
+            human.do(pull_repeatedly(human, trace.centre, client.humans[session.name].indicate))
         session.show_page(client, human if isinstance(human, TrackedHuman) else None)
         status = session.run(client)
         if options.out is not None:
@@ -51,14 +51,21 @@ def run(options: ClientOptions) -> int:
     return 0
 
 
-def pull_repeatedly(human: ScriptedHuman, point: Callable[[], np.ndarray]) -> Iterator[None]:
-    """Hold what is at a point [3] in the world, pull at it, let it go; without end."""
+def pull_repeatedly(
+    human: ScriptedHuman, point: Callable[[], np.ndarray], indicate: Callable[[str], None] = lambda _: None
+) -> Iterator[None]:
+    """Hold what is at a point [3] in the world, pull at it, let it go; without end.
+
+    ``indicate`` is told what the person intends.
+    """
     while True:
+        indicate("pick")
         yield from human.reach("right", point)
         yield from human.wait(0.5)
         yield from human.withdraw("right", 0.3)
         yield from human.wait(1.0)
         yield from human.release("right")
+        indicate("")
         yield from human.withdraw("right")
         yield from human.wait(1.5)
 

@@ -31,6 +31,7 @@ from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
 from vinesim.client.remote.plant_couplings import PlantCouplings
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
+from vinesim.client.signals import show_lights
 from vinesim.client.world_time import WorldTime
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
@@ -262,6 +263,7 @@ class Client:
         self.physics.wind_time_offset = self.world_time.offset
         self.control()
         self.physics.step()
+        show_lights((*self.robots.values(), *self.remote_actors.values()), self.physics.time + self.world_time.offset)
         self.sense()
         self.send(now)
         for callback in self.wake_readers:

@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
+from std_msgs.msg import String
 
 from vinesim.ros.commands.actions import ControllerActions
 from vinesim.ros.commands.subscriptions import CommandQueue, CommandSubscriptions
@@ -23,8 +24,8 @@ from vinesim.ros.publishers.control import ControlPublisher
 from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
 from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
 from vinesim.ros.publishers.robot import RobotPublisher
-from vinesim.ros.topic import RELIABLE, PendingMessage
-from vinesim.scene.values import ComponentStatus, ControllerSpec, RobotSample
+from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage
+from vinesim.scene.values import ComponentStatus, ControllerSpec, Intention, RobotSample
 
 FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
@@ -74,6 +75,7 @@ class RobotNode(Node):
         self._clock = ClockPublisher(self._node, self._advertise, self._withdraw) if self._has_clock else None
         self._robot = RobotPublisher(self._advertise, TFMessage, self._urdf, self._static_transforms, self._base)
         self._ground_truth = GroundTruthPublisher(self._advertise, TFMessage)
+        self._intentions = self._advertise(String, "human_intention", TRANSIENT_LOCAL)
         self._diagnostics = self._advertise(DiagnosticArray, "/diagnostics", RELIABLE)
         self._proprioception = ProprioceptionPublisher(self._advertise, self._imus, self._wrenches)
         self._control = ControlPublisher(self._advertise, self._controllers)
@@ -149,6 +151,10 @@ class RobotNode(Node):
     def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
         """Publish true poses [name, 7] m, 1 in the map of poles, once; late subscribers receive them, too."""
         self._send(self._ground_truth.pending_static(names, poses), always=True)
+
+    def publish_intentions(self, intentions: Sequence[Intention]) -> None:
+        """Publish what people indicate, when it changes; late subscribers receive the last message, too."""
+        self._send([(self._intentions, lambda: convert.intentions(intentions))], always=True)
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
         """Publish the states of parts of the client; the node adds its own. 1 Hz will do."""

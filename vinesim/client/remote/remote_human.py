@@ -13,10 +13,13 @@ class RemoteHuman:
     def __init__(self, rigid: RigidWorld, name: str) -> None:
         """``name`` of a person who was added to ``rigid`` already; see :func:`human_spec`."""
         self.rigid, self.name = rigid, name
+        self.intention = ""
+        """What the person indicates to do."""
 
     def follow(self, update: HumanUpdate) -> None:
         """Be where ``update`` says at the end of the coming step."""
         self.rigid.move_human(self.name, update.pose)
+        self.intention = update.intention
 
     def remove(self) -> None:
         """Remove the copy."""

@@ -12,11 +12,13 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, run_ros_worker
 from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import Run, WorkerProcess
+from vinesim.client.signals import IntentionLog
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.simulation_control import SimulationControl
 from vinesim.robot.description.description import RobotDescription
@@ -53,6 +55,9 @@ class RosProcess:
         self._leads = clock
         self._simulation: SimulationControl | None = None
         self._missed_truth = 0
+        self._intentions = IntentionLog()
+        self._told_run: Run[RosChannel] | None = None
+        """The run of the process that knows :attr:`_intentions`."""
         poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
         fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
         self._records = StepRecords(name, description, series_stiffness(description.drives))
@@ -133,9 +138,20 @@ class RosProcess:
                 else:
                     now = physics.time + client.world_time.offset
                     self._contacts_left_out += self._records.write(record, now, sample)
+        self._tell_intentions(client)
         truth_period = float(channel.wanted["truth_period"][0])
         if truth_period and physics.tick % max(round(truth_period / physics.dt), 1) == 0:
             self._write_truth(client)
+
+    def _tell_intentions(self, client: Client) -> None:
+        """Pass what people indicate to the process when it changes; a new run is told what it does not know."""
+        people = {name: human.intention for name, human in client.humans.items()}
+        people |= {name: one.intention for name, one in client.remote_actors.items() if isinstance(one, RemoteHuman)}
+        run = self.worker.current()
+        has_changed = self._intentions.update(people, client.physics.time + client.world_time.offset)
+        if has_changed or run is not self._told_run:
+            self._told_run = run
+            run.send("intentions", self._intentions.intentions)
 
     def _write_truth(self, client: Client) -> None:
         """Pass true poses to the process: of bunches, boxes and people."""

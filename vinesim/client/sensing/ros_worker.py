@@ -159,6 +159,8 @@ class RosWorker:
                 return False
             if kind == "diagnose":
                 self.node.publish_diagnostics(*value)
+            elif kind == "intentions":
+                self.node.publish_intentions(value)
             elif kind == "truth":
                 self._rigid.take(value)
             elif kind == "finish":

@@ -23,6 +23,8 @@ from vinesim.ros.commands.types import (
     ImpedanceCommand,
     JointTolerances,
     JointTrajectory,
+    LightsColor,
+    LightsPattern,
 )
 
 log = logging.getLogger(__name__)
@@ -48,6 +50,8 @@ class RosCommandHandler:
         self.controllers = ControllerManager(robot)
         self.rejected_count = 0
         """Commands that this robot cannot take."""
+        self._lights_color: tuple[float, float, float] | None = None
+        """Of the indicator lights; None: that of the pattern."""
         self._commands, self._finish, self._world_time = commands, finish, world_time
 
     def __call__(self, time: float) -> None:
@@ -90,6 +94,11 @@ class RosCommandHandler:
                 controllers.start_gripper(command.controller, command.position, command.max_effort, time, command.goal)
             case CancelGoal():
                 controllers.cancel(command.goal, time)
+            case LightsPattern():
+                self.robot.command_lights(command.pattern, self._lights_color)
+            case LightsColor():
+                self._lights_color = command.color
+                self.robot.command_lights(self.robot.lights.pattern, command.color)
             case JointTrajectory() if len(command.times) == 0:
                 controllers.stop_trajectory(command.controller)
             case JointTrajectory():

@@ -1,9 +1,9 @@
 """Wire format of a person's pose, and encoding of any actor's pose.
 
 A person is transmitted as the root, the tracked points (head, two hands; CANOPIES D6.4, section 5.3), hips and feet,
-the flexion of ten fingers, four flags and the velocities of all points: always 161 bytes. Positions except the root are
-relative to the root in steps of 0.2 mm, up to 6.5 m; rotations are rotation vectors of 3 i16; velocities are i8 of two
-scales of the message.
+the flexion of ten fingers, four flags, the intention and the velocities of all points: always 162 bytes. Positions
+except the root are relative to the root in steps of 0.2 mm, up to 6.5 m; rotations are rotation vectors of 3 i16;
+velocities are i8 of two scales of the message.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vinesim.net.codec.header import (
     unpack_header,
 )
 from vinesim.net.codec.rotation import TURN_LSB, quaternion, rotation_vector
-from vinesim.scene.values import POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
+from vinesim.scene.values import INTENTIONS, POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
 
 POSITION_LSB = 2e-4
 """Quantisation step of a position relative to the root [m]; clipped at 6.5 m."""
@@ -44,7 +44,7 @@ MAX_SPEED = 40.0
 _POINTS = len(POINT_NAMES)
 _HIPS, _BODY = POINT_NAMES.index("hips"), slice(1, None)
 
-_HUMAN = struct.Struct(f"<3f{6 * _POINTS - 3}h2H{6 * _POINTS}bB10B")
+_HUMAN = struct.Struct(f"<3f{6 * _POINTS - 3}h2H{6 * _POINTS}bB10BB")
 
 _FLAGS = ("left_closed", "right_closed", "left_busy", "right_busy")
 
@@ -79,10 +79,21 @@ def encode_human(update: HumanUpdate) -> bytes:
     kinds = velocity.reshape(_POINTS, 2, 3)
     scales = np.minimum(np.ceil(np.abs(kinds).max(axis=(0, 2)) / (127.0 * VELOCITY_LSB)), 65535.0)
     speeds = _to_integers(kinds / np.maximum(scales * VELOCITY_LSB, VELOCITY_LSB)[:, None], 127)
+    if update.intention not in INTENTIONS:
+        raise MessageError(
+            f"intention {update.intention!r} of {update.actor!r}; give one of {', '.join(INTENTIONS[1:])}"
+        )
     flags = sum(bool(getattr(update.pose, name)) << bit for bit, name in enumerate(_FLAGS))
     bends = (round(FINGER_SCALE * min(max(bend, 0.0), 1.0)) for bend in fingers)
     return pack_header(MessageKind.HUMAN, _POINTS, update.time) + _HUMAN.pack(
-        *root.tolist(), *places, *turns, *scales.astype(int).tolist(), *speeds, flags, *bends
+        *root.tolist(),
+        *places,
+        *turns,
+        *scales.astype(int).tolist(),
+        *speeds,
+        flags,
+        *bends,
+        INTENTIONS.index(update.intention),
     )
 
 
@@ -111,7 +122,9 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
         raise MessageError(f"human pose with a point more than {MAX_REACH} m from the hips")
     if np.linalg.norm(velocity[:, 0], axis=1).max() > MAX_SPEED:
         raise MessageError(f"human pose with a point faster than {MAX_SPEED} m/s")
-    flags, bends = rest[0], [bend / FINGER_SCALE for bend in rest[1:]]
+    flags, bends = rest[0], [bend / FINGER_SCALE for bend in rest[1:11]]
+    if rest[11] >= len(INTENTIONS):
+        raise MessageError(f"human pose with an unknown intention, {rest[11]}")
     if flags >= 1 << len(_FLAGS):
         raise MessageError("human pose with unknown flags")
     left_closed, right_closed, left_busy, right_busy = (bool(flags >> bit & 1) for bit in range(len(_FLAGS)))
@@ -119,7 +132,7 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
         *points, left_closed=left_closed, right_closed=right_closed, left_busy=left_busy, right_busy=right_busy,
         left_fingers=tuple(bends[:5]), right_fingers=tuple(bends[5:]),
     )  # fmt: skip
-    return HumanUpdate(actor, time, pose, velocity.reshape(_POINTS, 6))
+    return HumanUpdate(actor, time, pose, velocity.reshape(_POINTS, 6), INTENTIONS[rest[11]])
 
 
 def quantise_pose(pose: HumanPose) -> HumanPose:

@@ -1,7 +1,8 @@
 """Wire format of a robot's pose: base pose and twist, joint positions and velocities.
 
-Base: position 3 f4 [m], rotation vector 3 i2, linear and angular velocity 6 i2, scale of joint velocities u2. Then all
-joint positions as i2, all joint velocities as i1 of that scale, and an f4 for each position that an i2 cannot hold.
+Base: position 3 f4 [m], rotation vector 3 i2, linear and angular velocity 6 i2, scale of joint velocities u2; pattern
+and colour of the lights 4 u1. Then all joint positions as i2, all joint velocities as i1 of that scale, and an f4 for
+each position that an i2 cannot hold.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import numpy as np
 
 from vinesim.net.codec.header import HEADER, MessageError, MessageKind, pack_header, unpack_header
 from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quaternion
-from vinesim.scene.values import RobotUpdate
+from vinesim.scene.values import LightPattern, Lights, RobotUpdate
 
 JOINT_RATE_LSB = 1e-5
 """Quantisation step of the scale of joint velocities [rad/s, m/s]; with i1 values joints reach 83 rad/s."""
@@ -27,7 +28,9 @@ BASE_VELOCITY_LSB = 1e-3
 MAX_JOINTS = 256
 """Joints of one robot."""
 
-_BASE = struct.Struct("<3f3h6hH")  # position, turn, velocity, scale of joint velocities; then joints: all i2, all i1
+_BASE = struct.Struct("<3f3h6hH4B")  # position, turn, velocity, scale of joint velocities, lights; then joints
+
+_PATTERNS = frozenset(map(int, LightPattern))
 
 _OUT_OF_RANGE = -32768  # a joint position that no i2 holds; it follows as f4
 """Marks a joint position that i2 cannot hold; it follows as f4."""
@@ -39,7 +42,7 @@ def _to_lsb(values: list[float], unit: float) -> list[int]:
 
 
 def encode_robot(update: RobotUpdate) -> bytes:
-    """Encode a robot's pose in 46 bytes, 3 for each joint and 4 more for each joint beyond 6.5 rad or m (a wheel).
+    """Encode a robot's pose in 50 bytes, 3 for each joint and 4 more for each joint beyond 6.5 rad or m (a wheel).
 
     Errors: joint positions 0.1 mrad or mm, joint velocities 0.4 % of the fastest joint. Base velocities are clipped at
     32.7 m/s or rad/s, joint velocities at 83. Raises :class:`MessageError` for wrong sizes, values that are not finite
@@ -66,10 +69,13 @@ def encode_robot(update: RobotUpdate) -> bytes:
     scale = min(math.ceil(float(speed.max(initial=0.0)) / (127.0 * JOINT_RATE_LSB)), 65535)
     unit = max(scale, 1) * JOINT_RATE_LSB
     rates = np.minimum(np.maximum(np.rint(velocity / unit), -127.0), 127.0)
+    lights = (int(update.lights.pattern), *update.lights.color)
+    if not all(0 <= number <= 255 for number in lights):
+        raise MessageError(f"lights {lights} of {update.actor!r}: each of four numbers must be 0 to 255")
     turn = _to_lsb([x * factor, y * factor, z * factor], TURN_LSB)
     return b"".join((
         pack_header(MessageKind.ROBOT, count, update.time),
-        _BASE.pack(*pose[:3], *turn, *_to_lsb(twist, BASE_VELOCITY_LSB), scale),
+        _BASE.pack(*pose[:3], *turn, *_to_lsb(twist, BASE_VELOCITY_LSB), scale, *lights),
         steps.astype("<i2").tobytes(),
         rates.astype("i1").tobytes(),
         position[~near].astype("<f4").tobytes(),
@@ -92,9 +98,11 @@ def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
     position[apart] = np.frombuffer(payload, "<f4", rest // 4, joints + 3 * count)
     if not (all(-1e9 < number < 1e9 for number in base[:3]) and (np.abs(position) < 1e9).all()):
         raise MessageError("actor pose with a number that is not finite or beyond 1e9")
+    if base[13] not in _PATTERNS:
+        raise MessageError(f"actor pose with lights of an unknown pattern, {base[13]}")
     turn = check_rotation_vectors(np.array(base[3:6]) * TURN_LSB, "actor pose")
     velocity = np.frombuffer(payload, "i1", count, joints + 2 * count) * (base[12] * JOINT_RATE_LSB)
     return RobotUpdate(
         actor, time, np.concatenate([base[:3], quaternion(turn)]), np.array(base[6:12]) * BASE_VELOCITY_LSB,
-        position, velocity,
+        position, velocity, Lights(LightPattern(base[13]), base[14:17]),
     )  # fmt: skip

@@ -74,7 +74,8 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
             velocity={**_list(_NUMBER), "description": "of its base: m/s, rad/s, world axes"},
             joint_position={**_list(_NUMBER), "description": "rad or m"},
             joint_velocity={**_list(_NUMBER), "description": "rad/s or m/s"},
-            points=_object("points", "of a person", **dict.fromkeys(POINT_NAMES, _POSE)), **_COMMON,
+            points=_object("points", "of a person", **dict.fromkeys(POINT_NAMES, _POSE)), intention=_TEXT,
+            lights=_object("lights", "of a robot, sRGB 0 to 255", pattern=_TEXT, color=_list(_COUNT)), **_COMMON,
         ),
     ),
     "c": (

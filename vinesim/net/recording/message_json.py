@@ -40,11 +40,13 @@ def _describe_pose(payload: bytes, key: str) -> dict[str, Any]:
     update = decode_pose(payload, sender_of(key))
     here = {"timestamp": _stamp(update.time), "frame_id": "map", "pose": _pose(update.base_q)}
     if isinstance(update, HumanUpdate):
-        return here | {"points": {name: _pose(at) for name, at in zip(POINT_NAMES, update.pose.points, strict=True)}}
+        points = {name: _pose(at) for name, at in zip(POINT_NAMES, update.pose.points, strict=True)}
+        return here | {"points": points, "intention": update.intention}
     return here | {
         "velocity": update.base_qd.tolist(),
         "joint_position": update.position.tolist(),
         "joint_velocity": update.velocity.tolist(),
+        "lights": {"pattern": update.lights.pattern.name.lower(), "color": list(update.lights.color)},
     }
 
 

@@ -95,10 +95,14 @@ class RemotePose:
         if self._buffer.delay > 0.0 and isinstance(update, RobotUpdate):
             rate = self._buffer.rate(time)
             twist = np.concatenate([rate[:3], update.base_qd[3:]])
-            return RobotUpdate(update.actor, now, shown[:7], twist, shown[7:], rate[7:])
+            return RobotUpdate(update.actor, now, shown[:7], twist, shown[7:], rate[7:], update.lights)
         if isinstance(update, HumanUpdate):
             return HumanUpdate(
-                update.actor, now, update.pose.with_points(shown.reshape(-1, 7)), update.velocity * moving
+                update.actor,
+                now,
+                update.pose.with_points(shown.reshape(-1, 7)),
+                update.velocity * moving,
+                update.intention,
             )
         return dataclasses.replace(
             update, time=now, base_q=shown[:7], base_qd=update.base_qd * moving, position=shown[7:],

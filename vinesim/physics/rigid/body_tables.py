@@ -35,7 +35,7 @@ def list_visuals(
         visuals.append(RigidVisual(f"box/{number}", Organ.BOX, number, shapes))
         bodies.append(names.body[f"box/{number}"])
     for name, robot in robots.items():
-        for link, shapes in robot.shapes.items():
+        for link, shapes in robot.shown_shapes.items():
             if shapes:
                 visuals.append(RigidVisual(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
                 bodies.append(robot.bodies[link])

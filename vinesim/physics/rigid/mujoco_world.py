@@ -28,6 +28,7 @@ from vinesim.physics.rigid.human_posture import VISUAL_PARTS
 from vinesim.physics.rigid.link_sensors import LinkSensors
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidVisual
 
@@ -285,6 +286,16 @@ class WorldCore:
         self.owners = list_owners(self._boxes, self._names, self._robots, self._humans, bunch_body)
         self._owned_geoms = collision_geoms.owned_geoms(m, self.owners)
         self._update_geoms()
+
+    def _show_lamps(self, robot: RobotBody) -> None:
+        """List the shapes of a robot anew after its indicator lights changed; only sensors need to know."""
+        prefix, shown = robot.spec.name + "/", robot.shown_shapes
+        self._visuals = tuple(
+            dataclasses.replace(one, shapes=shown[one.name.removeprefix(prefix)])
+            if one.name.startswith(prefix) and one.organ == Organ.ROBOT
+            else one
+            for one in self._visuals
+        )
 
     def _update_geoms(self) -> None:
         """List the geoms that collide anew after a hand closed or opened, and count :attr:`generation`."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from vinesim.physics.rigid.mujoco_world import WorldCore
 from vinesim.physics.rigid.urdf import RobotError
+from vinesim.scene.values.signals import Color
 
 
 def _check_finite(name: str, what: str, given: object, size: int) -> None:
@@ -108,6 +109,12 @@ class RobotAccess(WorldCore):
             _check_finite(name, f"wrench on {link!r}", wrench, 6)
         if wrenches or robot.remote_wrenches:
             robot.set_remote_wrenches(self.mj_data, wrenches)
+
+    def set_indicator_color(self, name: str, color: Color | None) -> None:
+        """Set the colour of a robot's indicator lights, black for unlit; None: as its URDF has them."""
+        robot = self.robot(name)
+        robot.indicator_color = color
+        self._show_lamps(robot)
 
     # ------------------------------------------------------------------ joints and base
 

@@ -6,6 +6,7 @@ compliant joint must swing with its own damping: for these :func:`split_damping`
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import mujoco
@@ -25,7 +26,8 @@ from vinesim.physics.rigid.urdf import (
 )
 from vinesim.scene.materials import Material
 from vinesim.scene.triangles import to_stl
-from vinesim.scene.values import RobotSpec
+from vinesim.scene.values import RobotSpec, Shape
+from vinesim.scene.values.signals import UNLIT, Color
 
 MIN_FRICTION, MAX_FRICTION = 1e-5, 10.0
 """[1] Bounds of a link's own coefficient: the least that MuJoCo takes, and what hardly slips. Files give up to 1e14 for
@@ -51,6 +53,9 @@ class RobotBody:
         except ValueError as error:
             raise build_error(spec, error) from error
         self.shapes = shapes_of_robot(spec)
+        """By link: what sensors see while the indicator lights are off."""
+        self._shown_shapes: dict[Color | None, dict[str, tuple[Shape, ...]]] = {None: self.shapes}
+        self.indicator_color: Color | None = None
         self.stiffness = np.array([d.stiffness for d in spec.drives], float)
         self.damping = np.array([d.damping for d in spec.drives], float)
         self.servo_limit = np.array([d.effort for d in spec.drives], float)
@@ -91,6 +96,16 @@ class RobotBody:
         """Links with a sensor, see :meth:`RigidWorld.add_link_sensor`."""
         self.remote_wrenches: dict[str, np.ndarray] = {}
         """By link: wrenches [6] of remote people; see :meth:`RigidWorld.set_remote_wrenches`."""
+
+    @property
+    def shown_shapes(self) -> dict[str, tuple[Shape, ...]]:
+        """By link: what sensors see, with the indicator lights in their present colour; the same objects for the same
+        colour."""
+        color = self.indicator_color
+        if color not in self._shown_shapes:
+            kept = {None: self.shapes, UNLIT: self._shown_shapes.get(UNLIT, _with_lamps(self.shapes, UNLIT))}
+            self._shown_shapes = kept if color == UNLIT else kept | {color: _with_lamps(self.shapes, color)}
+        return self._shown_shapes[color]
 
     # ------------------------------------------------------------------ in MuJoCo
 
@@ -165,6 +180,7 @@ class RobotBody:
         ):  # fmt: skip
             getattr(self, name)[:] = getattr(other, name)
         self.base_slip, self.base_height = other.base_slip, other.base_height
+        self.indicator_color = other.indicator_color
         self.sensor_links, self.remote_wrenches = other.sensor_links, other.remote_wrenches
 
     # ------------------------------------------------------------------ commands
@@ -322,3 +338,22 @@ def split_damping(
 def build_error(spec: RobotSpec, error: ValueError) -> RobotError:
     """What MuJoCo says against a robot, in one line."""
     return RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {' '.join(str(error).split())}")
+
+
+def _with_lamps(shapes: dict[str, tuple[Shape, ...]], color: Color | None) -> dict[str, tuple[Shape, ...]]:
+    """Shapes by link with indicator lights of a colour, which shine unless it is :data:`UNLIT`; a link without any
+    keeps its tuple."""
+    if color is None:
+        return shapes
+    red, green, blue = (part / 255.0 for part in color)
+    surface = "plastic" if color == UNLIT else "lamp"
+
+    def lit(pieces: tuple[Shape, ...]) -> tuple[Shape, ...]:
+        if not any(piece.is_indicator for piece in pieces):
+            return pieces
+        return tuple(
+            dataclasses.replace(piece, rgba=(red, green, blue, 1.0), surface=surface) if piece.is_indicator else piece
+            for piece in pieces
+        )
+
+    return {link: lit(pieces) for link, pieces in shapes.items()}

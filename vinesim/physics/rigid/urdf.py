@@ -170,6 +170,7 @@ def _shape(element: ElementTree.Element, paints: dict) -> Shape | None:
         material = paints.get(material.get("name"), material)
     rgba = tuple(_numbers(None if material is None else material.find("color"), "rgba", "0.6 0.6 0.6 1"))
     words = ("" if material is None else material.get("name") or "").lower().split("_")
+    is_indicator = "indicator" in words
     surface = next((_SURFACES[word] for word in words if word in _SURFACES), "")
     geometry = element.find("geometry")
     form = None if geometry is None else next(iter(geometry), None)
@@ -186,4 +187,6 @@ def _shape(element: ElementTree.Element, paints: dict) -> Shape | None:
         size, file = tuple(_numbers(form, "scale", "1 1 1")), form.get("filename", "").removeprefix("file://")
     else:
         return None
-    return Shape(form.tag, size, frames.pose(_numbers(origin, "xyz", "0 0 0"), turn), rgba, file, surface)
+    return Shape(
+        form.tag, size, frames.pose(_numbers(origin, "xyz", "0 0 0"), turn), rgba, file, surface, None, is_indicator
+    )

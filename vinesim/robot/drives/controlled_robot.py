@@ -24,7 +24,8 @@ from vinesim.robot.drives.commands import CommandError, CommandInterface
 from vinesim.robot.drives.joint_servos import JointServos
 from vinesim.robot.drives.proprioception import BodySensors, elastic_sample
 from vinesim.robot.drives.robot_instance import RobotInstance
-from vinesim.scene.values import Contact, RobotSample, RobotUpdate
+from vinesim.scene.values import Contact, LightPattern, Lights, RobotSample, RobotUpdate
+from vinesim.scene.values.signals import USUAL_COLOR
 
 Values = Sequence[float] | np.ndarray
 Joints = Sequence[str] | np.ndarray | None
@@ -187,6 +188,17 @@ class Robot(RobotInstance):
         self._base_goal = _clamp(linear, limits.linear), _clamp(angular, limits.angular)
         self._base_time = time
 
+    def command_lights(self, pattern: LightPattern, color: Sequence[float] | None = None) -> None:
+        """Let the indicator lights show a pattern, in a ``color`` [3] of sRGB from 0 to 1, that of the pattern unless
+        given; see :class:`Lights`."""
+        if color is None:
+            self.lights = Lights(pattern, USUAL_COLOR[pattern])
+            return
+        if len(color) != 3 or not all(0.0 <= part <= 1.0 for part in color):
+            raise CommandError(f"{self.name}: colour of lights {list(color)}; give three numbers from 0 to 1")
+        red, green, blue = (round(255.0 * part) for part in color)
+        self.lights = Lights(pattern, (red, green, blue))
+
     def _validated(self, values: Values, joints: Joints) -> tuple[np.ndarray, np.ndarray]:
         """Indices [k] and finite values [k], or :class:`CommandError`."""
         i, values = self.joint_indices(joints), np.asarray(values, float)
@@ -232,7 +244,7 @@ class Robot(RobotInstance):
         """What other clients receive: actual joint states, never commands."""
         position, velocity = self.rigid.joint_state(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
-        return RobotUpdate(self.name, time, base_q, base_qd, position, velocity)
+        return RobotUpdate(self.name, time, base_q, base_qd, position, velocity, self.lights)
 
 
 def _clamp(value: float, bound: float) -> float:

@@ -26,6 +26,7 @@ class RemoteRobot(RobotInstance):
                 f"{self.name}: update has {update.position.size} joints, its description {count}; "
                 "load the same robot on both clients"
             )
+        self.lights = update.lights
         here, _ = self.rigid.base_state(self.name)
         if np.linalg.norm(update.base_q[:3] - here[:3]) > self.TELEPORT_DISTANCE:
             self._teleport(update, here)
@@ -35,5 +36,6 @@ class RemoteRobot(RobotInstance):
         """Place the copy at the update's state; ``here`` [7]: where its base is."""
         if abs(update.base_q[2] - here[2]) > 1e-3:  # the base joint is planar: another height needs a new body
             self.rigid.remove_robot(self.name)
+            self._shown_color = None
             self.rigid.add_robot(self.description.to_spec(self.name, self._index, update.base_q))
         self.rigid.place_robot(self.name, update.base_q, update.position)

@@ -10,7 +10,7 @@ from vinesim import frames
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.odometry import TrackOdometry
-from vinesim.scene.values import Contact, JointSample, RobotSample
+from vinesim.scene.values import Contact, JointSample, Lights, RobotSample
 
 
 class RobotInstance:
@@ -38,6 +38,9 @@ class RobotInstance:
         spec = description.to_spec(self.name, index, pose)
         if not is_in_world:
             rigid.add_robot(spec)
+        self.lights = Lights()
+        """Indicator lights."""
+        self._shown_color: tuple[int, int, int] | None = None
         back = frames.conjugate(spec.pose[3:])
         self._start = spec.pose[:3].copy()
         self._start_turn = frames.to_matrix(back)
@@ -45,6 +48,13 @@ class RobotInstance:
         """[4, 4]: quaternion product with the inverse of the start's, as a matrix"""
         self._tracks_slip = any(description.base_limits.slip)
         self._track_odometry = TrackOdometry(*description.base_limits.slip, spec.pose)
+
+    def show_lights(self, time: float) -> None:
+        """Let the indicator lights flash as they are at a ``time`` of the world [s]; cheap while nothing changes."""
+        shown = self.lights.shown(time)
+        if shown != self._shown_color:
+            self._shown_color = shown
+            self.rigid.set_indicator_color(self.name, shown)
 
     def remove(self) -> None:
         """Remove the robot from the rigid world."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 
 from vinesim.ros.commands.types import (
@@ -19,8 +19,11 @@ from vinesim.ros.commands.types import (
     ImpedanceCommand,
     JointTolerances,
     JointTrajectory,
+    LightsColor,
+    LightsPattern,
 )
 from vinesim.ros.messages.convert import seconds
+from vinesim.scene.values import LightPattern
 
 
 class CommandError(ValueError):
@@ -34,6 +37,23 @@ def base_velocity(message: TwistStamped) -> BaseVelocity:
     if not np.isfinite(velocity).all():
         raise CommandError(f"cmd_vel is not finite: {velocity.tolist()}")
     return BaseVelocity(seconds(message.header.stamp), velocity[:3], velocity[3:])
+
+
+def lights_pattern(message: String) -> LightsPattern:
+    """A pattern of the indicator lights, by its name."""
+    try:
+        return LightsPattern(LightPattern[message.data.strip().upper()])
+    except KeyError:
+        known = ", ".join(one.name.lower() for one in LightPattern)
+        raise CommandError(f"no pattern of lights {message.data!r}; give one of {known}") from None
+
+
+def lights_color(message: ColorRGBA) -> LightsColor:
+    """A colour of the indicator lights: sRGB from 0 to 1; with alpha 0 that of the pattern."""
+    color = message.r, message.g, message.b
+    if not all(0.0 <= part <= 1.0 for part in (*color, message.a)):
+        raise CommandError(f"colour of lights {(*color, message.a)}; give four numbers from 0 to 1")
+    return LightsColor(color if message.a > 0.0 else None)
 
 
 def _joint_values(message: Float64MultiArray, controller: str, joints: Sequence[str], *, nan: bool) -> np.ndarray:

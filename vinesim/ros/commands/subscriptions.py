@@ -12,7 +12,7 @@ from typing import Any
 import rclpy.node
 from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 
 from vinesim.ros.commands import convert
@@ -22,6 +22,8 @@ from vinesim.ros.commands.types import (
     ElasticCommand,
     ForwardCommand,
     ImpedanceCommand,
+    LightsColor,
+    LightsPattern,
 )
 from vinesim.ros.topic import RELIABLE
 from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
@@ -68,6 +70,8 @@ def _setpoint_key(command: Command) -> tuple[str, ...] | None:
     match command:
         case BaseVelocity():
             return ("base",)
+        case LightsPattern() | LightsColor():
+            return (type(command).__name__,)
         case ForwardCommand():
             return (command.controller,)
         case ImpedanceCommand():
@@ -83,6 +87,8 @@ class CommandSubscriptions:
     def __init__(self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue) -> None:
         self._node, self._queue = node, queue
         self._subscribe(TwistStamped, "mobile_base_controller/cmd_vel", convert.base_velocity)
+        self._subscribe(String, "indicator_lights/command", convert.lights_pattern)
+        self._subscribe(ColorRGBA, "indicator_lights/color", convert.lights_color)
         for spec in controllers:
             self._subscribe_controller(spec.name, spec.kind, spec.joints)
 

@@ -10,7 +10,7 @@ import enum
 
 import numpy as np
 
-from vinesim.scene.values import GripperState
+from vinesim.scene.values import GripperState, LightPattern
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -101,13 +101,38 @@ class GripperGoal:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class LightsPattern:
+    """What the indicator lights say (std_msgs/String on indicator_lights/command)."""
+
+    pattern: LightPattern
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class LightsColor:
+    """In which colour (std_msgs/ColorRGBA on indicator_lights/color)."""
+
+    color: tuple[float, float, float] | None
+    """sRGB from 0 to 1; None: that of the pattern."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class CancelGoal:
     """A goal is to end."""
 
     goal: bytes
 
 
-Command = BaseVelocity | ForwardCommand | ImpedanceCommand | ElasticCommand | JointTrajectory | GripperGoal | CancelGoal
+Command = (
+    BaseVelocity
+    | ForwardCommand
+    | ImpedanceCommand
+    | ElasticCommand
+    | JointTrajectory
+    | GripperGoal
+    | LightsPattern
+    | LightsColor
+    | CancelGoal
+)
 
 
 class GoalStatus(enum.StrEnum):

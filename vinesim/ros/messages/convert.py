@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import array
 import functools
+import json
 import struct
 import sys
 from collections.abc import Iterable, Mapping
@@ -23,7 +24,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo as CameraInfoMessage
 from sensor_msgs.msg import CompressedImage, Image, JointState, LaserScan, PointCloud2, PointField
 from sensor_msgs.msg import Imu as ImuMessage
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 from trajectory_msgs.msg import JointTrajectoryPoint
 
 from vinesim.ros.messages.transforms import split_time
@@ -41,6 +42,7 @@ from vinesim.scene.values import (
     ComponentStatus,
     ElasticSample,
     Imu,
+    Intention,
     JointSample,
     LidarScan,
     RobotSample,
@@ -146,6 +148,12 @@ def imu(sample: Imu) -> ImuMessage:
     set_vector(message.angular_velocity, sample.angular_velocity)
     set_vector(message.linear_acceleration, sample.linear_acceleration)
     return message
+
+
+def intentions(known: Iterable[Intention]) -> String:
+    """What people indicate to do, as JSON; times are those of the world [s]."""
+    people = [{"person": one.person, "intention": one.what, "start": one.start, "end": one.end} for one in known]
+    return String(data=json.dumps({"people": people}))
 
 
 def elastic_state(sample: ElasticSample, joint: int) -> JointState:

@@ -32,11 +32,13 @@ from vinesim.scene.values.sensors import (
     LevelLaser,
     LidarScan,
 )
+from vinesim.scene.values.signals import INTENTIONS, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
 __all__ = [
     "FORWARD_KINDS",
+    "INTENTIONS",
     "MIN_BERRY_PIXELS",
     "POINT_NAMES",
     "Box",
@@ -59,10 +61,13 @@ __all__ = [
     "HumanSpec",
     "HumanUpdate",
     "Imu",
+    "Intention",
     "JointReference",
     "JointSample",
     "LevelLaser",
     "LidarScan",
+    "LightPattern",
+    "Lights",
     "Measurement",
     "Mesh",
     "ObjectUpdate",

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from vinesim.scene.values.human import HumanPose
+from vinesim.scene.values.signals import LIGHTS_OFF, Lights
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -23,6 +24,7 @@ class RobotUpdate:
     """[joint] rad or m"""
     velocity: np.ndarray
     """[joint] rad/s or m/s"""
+    lights: Lights = LIGHTS_OFF
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -34,6 +36,8 @@ class HumanUpdate:
     pose: HumanPose
     velocity: np.ndarray
     """[7, 6] of all points, m/s and rad/s in world axes, for extrapolation."""
+    intention: str = ""
+    """One of :data:`INTENTIONS`: what the person indicates to do."""
 
     @property
     def base_q(self) -> np.ndarray:

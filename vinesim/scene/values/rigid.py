@@ -38,6 +38,8 @@ class Shape:
     surface: str = ""
     """What it is made of (:data:`vinesim.scene.appearance.SURFACES`); empty: what such things are usually made of."""
     mesh: Mesh | None = None
+    is_indicator: bool = False
+    """Whether it is one of a robot's indicator lights."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,67 @@
+"""Signals of robots and people: indicator lights, and what a person intends to do."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+Color = tuple[int, int, int]
+"""sRGB, each 0 to 255."""
+
+UNLIT: Color = (0, 0, 0)
+"""Colour of a lamp between two flashes."""
+
+INTENTIONS = ("", "walk", "pick", "cut", "carry", "hand over", "put down", "point", "wait", "ask for help")
+"""What a person may indicate to do, and nothing; the place in this list crosses the network."""
+
+
+class LightPattern(enum.IntEnum):
+    """What indicator lights say (CANOPIES D6.4, section 3.3)."""
+
+    OFF = 0
+    NOTIFICATION = 1
+    WARNING = 2
+    ALARM = 3
+
+
+FREQUENCY = {LightPattern.NOTIFICATION: 0.4, LightPattern.WARNING: 0.8, LightPattern.ALARM: 2.0}
+"""[Hz] Flashes; slow ones are 0.4 to 0.8 Hz, normal ones 1.4 to 2.8 Hz (IEC 60073)."""
+
+USUAL_COLOR: dict[LightPattern, Color] = {
+    LightPattern.OFF: UNLIT, LightPattern.NOTIFICATION: (255, 255, 255), LightPattern.WARNING: (255, 150, 0),
+    LightPattern.ALARM: (255, 0, 0),
+}  # fmt: skip
+"""Colours unless others are asked for (IEC 60073)."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Lights:
+    """The indicator lights of a robot."""
+
+    pattern: LightPattern = LightPattern.OFF
+    color: Color = UNLIT
+
+    def shown(self, time: float) -> Color | None:
+        """The colour at a time of the world [s], :data:`UNLIT` between flashes; None: off, as the URDF has them.
+
+        All clients show the same: the flashes follow from the time.
+        """
+        if self.pattern is LightPattern.OFF:
+            return None
+        return self.color if time * FREQUENCY[self.pattern] % 1.0 < 0.5 else UNLIT
+
+
+LIGHTS_OFF = Lights()
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Intention:
+    """What a person indicates to do (CANOPIES D6.4, section 3.5)."""
+
+    person: str
+    what: str
+    """One of :data:`INTENTIONS`."""
+    start: float
+    """[s] of the world"""
+    end: float | None = None
+    """[s] of the world; None: it goes on."""
