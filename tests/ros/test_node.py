@@ -181,6 +181,7 @@ def test_every_topic_is_heard_with_its_official_type():
         topic_monitor() as report,
     ):
         robot.publish_environment_static(("pole_0",), poses[:1])
+        robot.publish_intentions(())
         ticks = iter(range(10**6))
 
         def tick() -> None:
@@ -203,13 +204,14 @@ def test_every_topic_is_heard_with_its_official_type():
     assert received["/tf"]["type_hash"] == "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 
 
-LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static")
+LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static", "human_intention")
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/robot_description": "std_msgs/msg/String",
     "/joint_states": "sensor_msgs/msg/JointState",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/human_intention": "std_msgs/msg/String",
     "/tf_environment": "tf2_msgs/msg/TFMessage",
     "/tf_environment_static": "tf2_msgs/msg/TFMessage",
     "/mobile_base_controller/odom": "nav_msgs/msg/Odometry",
