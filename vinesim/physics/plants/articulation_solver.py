@@ -113,7 +113,7 @@ class ArticulationSolver:
             buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
             tree_rate=self.tree_rate, stepping=self._stepping, groups=self._groups, floating=self._floating,
             topologies=Topologies(model, state.body_cut, self.tree_moving), thread_pool=self.thread_pool,
-            whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]]),
+            whole=self._moves_with_others(),
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -124,6 +124,12 @@ class ArticulationSolver:
     def dt(self) -> float:
         """[s] Duration of a step. Fixed: kernels, damping and counts of steps follow from it at the start."""
         return self._dt
+
+    def _moves_with_others(self) -> np.ndarray:
+        """Trees on wires and arms that give [tree] bool; those move once a step."""
+        model = self.model
+        on_wire = np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
+        return on_wire | model.is_on_arm()
 
     def _allocate(self, phi: float) -> None:
         """Arrays of the solver beside model and state."""
@@ -139,6 +145,11 @@ class ArticulationSolver:
         """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
+        self.root_turn, self.root_turn_rate = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
+        """By what the arm turns the rest of each root's spring, and how fast [tree, 3] rad, rad/s, joint axes."""
+        self.root_softening = np.zeros((trees, 3), np.float32)
+        """The outer product of this [tree, 3] (N m/rad)^(1/2), in joint axes, with itself is by what an arm makes each
+        root's spring less stiff when all its awake trees move as one. Only the sleep of trees asks for it."""
         self.body_load = np.zeros((bodies, 6), np.float32)
         """Wrenches that last until changed (wind, a rope): force [N], moment about the body's origin [N m], world."""
         self.velocity_free = np.zeros((bodies, 6), np.float32)
@@ -194,6 +205,8 @@ class ArticulationSolver:
                       "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
                       "joint_damping": self.joint_damping, "tie_point": ties.point, "tie_anchor": ties.anchor,
                       "tie_anchor_velocity": ties.anchor_velocity, "tie_axis": ties.axis, "tree_air": self.tree_air,
+                      "root_turn": self.root_turn, "root_turn_rate": self.root_turn_rate,
+                      "root_softening": self.root_softening,
                       "joint_x": state.joint_x, "joint_xd": state.joint_xd, "joint_qd": state.joint_qd,
                       "joint_xd_free": self.joint_xd_free, "joint_qd_free": self.joint_qd_free},
             wp.quat: {"body_rest": self._rest, "joint_q": state.joint_q},
