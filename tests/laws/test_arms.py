@@ -233,20 +233,3 @@ def test_a_shoot_that_another_client_lays_aside_turns_the_arm_here() -> None:
     physics.step()
     assert physics.supports.deflection[1, 0] < -1e-3
     assert physics.plants.awake.tolist() == [0, 2, 3]
-
-
-def test_trees_alone_and_eight_at_once_feel_the_arm_to_the_bit() -> None:
-    """Eight shoots on one arm share a vector; with substeps asked of one by one they would not."""
-    along = tuple(np.linspace(0.2, 0.9, 8))
-    states = []
-    for alone in (False, True):
-        physics = world(cordon(along))
-        push(physics, 2, np.array([0.1, 0.3, 0.0]))
-        for _ in range(50):
-            if alone:
-                physics.supports.update()
-                physics.plants.predict()
-                physics.plants.predict(np.arange(8))
-            physics.step()
-        states.append(physics.state.joint_q.copy())
-    np.testing.assert_array_equal(*states)

@@ -51,7 +51,7 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     elastic = 0.5 * float((plants.joint_stiffness[bodies] * turned**2).sum())
     roots = model.body_parent[bodies] < 0
     since = turned[roots] - frames.log(model.joint_settled[bodies[roots]].astype(float))
-    arm_turn = plants.root_turn[model.body_tree[bodies[roots]]]
+    arm_turn = plants.root_rests.turn[model.body_tree[bodies[roots]]]
     elastic -= 0.5 * float((plants.joint_stiffness[bodies[roots]] * arm_turn * since).sum())
     ties = np.flatnonzero(np.isin(model.tie_body, bodies))
     pose = state.body_q[model.tie_body[ties]].astype(float)

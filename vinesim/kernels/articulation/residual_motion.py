@@ -107,7 +107,7 @@ def residual_motion(
     its speed, not in its distance: it may rest anywhere.
 
     p: with :data:`REST_STEP` as its step. model: without joint damping. body_length: [body] m. tie_axis, tie_softening:
-    [tie] see :class:`vinesim.physics.plants.ties.TieTable`. root_softening: [tree] (N m/rad)^(1/2), see :class:`vinesim.physics.plants.articulation_solver.ArticulationSolver`. trees: [thread] which tree. forces: with the contact wrenches of the last step. joints: at its end; joints_still: the same without
+    [tie] see :class:`vinesim.physics.plants.ties.TieTable`. root_softening: [tree] (N m/rad)^(1/2), see :class:`vinesim.physics.plants.ties.RootRests`. trees: [thread] which tree. forces: with the contact wrenches of the last step. joints: at its end; joints_still: the same without
     rates. forces_static: with ``static_load_out`` as the load and no contact wrenches. prediction_out: its
     ``joint_qd_free`` times T / 4 is the displacement of each joint. speed_out, distance_out: [tree] m/s, m.
     is_free_out: [tree] whether nothing touches it and none of it floats, so that all of its displacement is known. All

@@ -31,7 +31,7 @@ from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
 from vinesim.physics.plants.remote_pose import blend_towards
 from vinesim.physics.plants.step_runner import StepRunner
-from vinesim.physics.plants.ties import TieTable
+from vinesim.physics.plants.ties import RootRests, TieTable
 from vinesim.physics.plants.topology import Topologies
 from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
@@ -62,8 +62,7 @@ class ArticulationSolver:
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
         substeps: divide the step of trees whose first mode is too fast for it; off only to compare with other solvers.
-        buffers: where arrays live, instead of what ``device`` says.
-    """
+        buffers: where arrays live, instead of what ``device`` says."""
 
     def __init__(
         self,
@@ -99,6 +98,7 @@ class ArticulationSolver:
         self.tick = 0
         """Integrations so far."""
         self.ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
+        self.root_rests = RootRests(len(model.tree_first))
         self._allocate(phi)
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
@@ -113,7 +113,8 @@ class ArticulationSolver:
             buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
             tree_rate=self.tree_rate, stepping=self._stepping, groups=self._groups, floating=self._floating,
             topologies=Topologies(model, state.body_cut, self.tree_moving), thread_pool=self.thread_pool,
-            whole=self._moves_with_others(),
+            whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
+            | model.is_on_arm(),
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -124,12 +125,6 @@ class ArticulationSolver:
     def dt(self) -> float:
         """[s] Duration of a step. Fixed: kernels, damping and counts of steps follow from it at the start."""
         return self._dt
-
-    def _moves_with_others(self) -> np.ndarray:
-        """Trees on wires and arms that give [tree] bool; those move once a step."""
-        model = self.model
-        on_wire = np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
-        return on_wire | model.is_on_arm()
 
     def _allocate(self, phi: float) -> None:
         """Arrays of the solver beside model and state."""
@@ -145,11 +140,6 @@ class ArticulationSolver:
         """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
-        self.root_turn, self.root_turn_rate = np.zeros((trees, 3), np.float32), np.zeros((trees, 3), np.float32)
-        """By what the arm turns the rest of each root's spring, and how fast [tree, 3] rad, rad/s, joint axes."""
-        self.root_softening = np.zeros((trees, 3), np.float32)
-        """The outer product of this [tree, 3] (N m/rad)^(1/2), in joint axes, with itself is by what an arm makes each
-        root's spring less stiff when all its awake trees move as one. Only the sleep of trees asks for it."""
         self.body_load = np.zeros((bodies, 6), np.float32)
         """Wrenches that last until changed (wind, a rope): force [N], moment about the body's origin [N m], world."""
         self.velocity_free = np.zeros((bodies, 6), np.float32)
@@ -183,14 +173,14 @@ class ArticulationSolver:
 
     def _pin_arrays(self) -> None:
         """Move the arrays of solver, ties and state to where the device can reach them."""
-        for owner in (self, self.ties, self.state):
+        for owner in (self, self.ties, self.root_rests, self.state):
             for name, value in vars(owner).items():
                 if isinstance(value, np.ndarray):
                     setattr(owner, name, self.buffers.pinned(value))
 
     def kernel_arrays(self) -> dict[Any, dict[str, np.ndarray]]:
         """All arrays that kernels read or write, by element type and name."""
-        model, state, ties = self.model, self.state, self.ties
+        model, state, ties, rests = self.model, self.state, self.ties, self.root_rests
         return {
             wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
                        "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
@@ -205,8 +195,7 @@ class ArticulationSolver:
                       "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
                       "joint_damping": self.joint_damping, "tie_point": ties.point, "tie_anchor": ties.anchor,
                       "tie_anchor_velocity": ties.anchor_velocity, "tie_axis": ties.axis, "tree_air": self.tree_air,
-                      "root_turn": self.root_turn, "root_turn_rate": self.root_turn_rate,
-                      "root_softening": self.root_softening,
+                      "root_turn": rests.turn, "root_turn_rate": rests.rate, "root_softening": rests.softening,
                       "joint_x": state.joint_x, "joint_xd": state.joint_xd, "joint_qd": state.joint_qd,
                       "joint_xd_free": self.joint_xd_free, "joint_qd_free": self.joint_qd_free},
             wp.quat: {"body_rest": self._rest, "joint_q": state.joint_q},

@@ -64,8 +64,8 @@ class ElasticSupports:
         self._bind(nodes)
 
     def _bind(self, nodes: dict[str, np.ndarray]) -> None:
-        plants, ties, count = self._plants, self._plants.ties, len(self._tree)
-        state = plants.state
+        plants, count = self._plants, len(self._tree)
+        ties, rests, state = plants.ties, plants.root_rests, plants.state
         shape = {
             "deflection": self.deflection, "reference": np.zeros((count, 3)), "ratio": np.zeros(count),
             "velocity": np.zeros((count, 3)), "share": np.zeros(count),
@@ -76,8 +76,8 @@ class ElasticSupports:
         }  # fmt: skip
         springs = {
             "span": ties.span, "stiffness": ties.stiffness, "anchor": ties.anchor,
-            "anchor_velocity": ties.anchor_velocity, "softening": ties.softening, "root_turn": plants.root_turn,
-            "root_turn_rate": plants.root_turn_rate, "root_softening": plants.root_softening,
+            "anchor_velocity": ties.anchor_velocity, "softening": ties.softening, "root_turn": rests.turn,
+            "root_turn_rate": rests.rate, "root_softening": rests.softening,
         }  # fmt: skip
         self._solve = bind_launch(
             kernels.balance_supports,
@@ -193,9 +193,9 @@ def _tip_response(plants: ArticulationSolver, tree: np.ndarray, axis: np.ndarray
     [k] m/rad."""
     if len(tree) == 0:
         return np.zeros(0)
-    plants.root_turn[tree] = axis
+    plants.root_rests.turn[tree] = axis
     _, distance, _ = EquilibriumFinder(plants).residual_motion(tree.astype(np.int32))
-    plants.root_turn[tree] = 0.0
+    plants.root_rests.turn[tree] = 0.0
     return np.maximum(distance.astype(float), 1e-9)
 
 

@@ -249,7 +249,7 @@ class _Response:
         for step in range(_LOAD_STEPS + _NEWTON_STEPS):
             self._load(min((step + 1) / _LOAD_STEPS, 1.0) * self._pressure(self.steady))
             self.plants.ties.softening[:] = 0.0
-            self.plants.root_softening[:] = 0.0
+            self.plants.root_rests.softening[:] = 0.0
             _, distance, _ = self._finder.residual_motion(trees)
             good &= distance < 1e6
             self._finder.move_to_rest(trees[good])
