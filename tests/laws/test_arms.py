@@ -105,15 +105,15 @@ def test_shoots_of_one_arm_move_each_other_as_a_dense_solve_says() -> None:
         push(physics, shoot, np.array([0.0, 0.4, 0.0]))
         settle(physics)
         moved[shoot] = tips(physics)[:, 1] / 0.4
-        borne = STIFFNESS[1] * (tips(physics)[:, 1] / SHOOT + physics.supports.deflection[:, 0])
-        np.testing.assert_allclose(-physics.supports.deflection[:, 0], compliance(ALONG) @ borne, rtol=1e-3)
+        borne = STIFFNESS[1] * (tips(physics)[:, 1] / SHOOT + physics.elastic_supports.deflection[:, 0])
+        np.testing.assert_allclose(-physics.elastic_supports.deflection[:, 0], compliance(ALONG) @ borne, rtol=1e-3)
     np.testing.assert_allclose(moved, SHOOT**2 * np.linalg.inv(whole_stiffness()), rtol=2e-3, atol=1e-7)
     np.testing.assert_allclose(moved, moved.T, rtol=2e-3)
     assert moved[1, 2] > 0.1 * moved[1, 1]
     physics = world(cordon())
     push(physics, 1, np.array([0.4, 0.0, 0.0]))
     settle(physics)
-    assert abs(physics.supports.deflection).max() < 1e-7
+    assert abs(physics.elastic_supports.deflection).max() < 1e-7
 
 
 def test_what_one_leaning_shoot_does_to_another_that_does_to_it() -> None:
@@ -169,7 +169,7 @@ def test_shoots_on_an_arm_gain_no_energy(modulus: float, phi: float, lean: float
     seen = []
     for step in range(1000):
         physics.update_kinematics()
-        physics.supports.update()
+        physics.elastic_supports.update()
         if step % 5 == 0:
             pull = (gradient * physics.state.joint_qd).sum(1)
             seen.append(energy(physics.plants, 0.0).total + 0.5 * pull @ left_out @ pull)
@@ -199,7 +199,7 @@ def test_a_push_wakes_those_that_the_arm_moves_and_no_others() -> None:
         physics.sleep_monitor.wake(np.array([0]))
         settle(physics, 1000)
         assert len(physics.plants.awake) == 0
-        assert len(physics.supports.active) == 0
+        assert len(physics.elastic_supports.active) == 0
         assert abs(tips(physics)).max() < 5e-5
 
 
@@ -231,5 +231,5 @@ def test_a_shoot_that_another_client_lays_aside_turns_the_arm_here() -> None:
     turn = frames.rotate(frames.conjugate(physics.model.tree_pose[1, 3:].astype(float)), np.array([-0.02, 0.0, 0.0]))
     physics.apply_remote_rest([1], [frames.exp(turn[None])])
     physics.step()
-    assert physics.supports.deflection[1, 0] < -1e-3
+    assert physics.elastic_supports.deflection[1, 0] < -1e-3
     assert physics.plants.awake.tolist() == [0, 2, 3]

@@ -52,13 +52,12 @@ class ArticulationSolver:
         model: constants; :class:`ValueError` in words if a tree cannot be simulated.
         state: its arrays are read and written in place.
         parameters: numbers of the scheme; those that follow replace single ones and may be infinite.
-        dt: step [s].
-        phi: 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
+        dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
         threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
-        fast_rate, max_rate: [rad/s] see ``fast_joint_rate`` and ``max_joint_rate`` of ``PhysicsParameters``.
-        fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
+        fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
+            ``PhysicsParameters``, and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
         substeps: divide the step of trees whose first mode is too fast for it; off only to compare with other solvers.
@@ -97,8 +96,7 @@ class ArticulationSolver:
         """Where arrays live, for NumPy and for kernels."""
         self.tick = 0
         """Integrations so far."""
-        self.ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
-        self.root_rests = RootRests(len(model.tree_first))
+        self.ties, self.root_rests = TieTable(model, p.max_held_bodies, p.max_hands_per_body), RootRests(model)
         self._allocate(phi)
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()

@@ -115,7 +115,8 @@ class RootRests:
     """How arms turn the rests of the springs of roots, on which trees stand; see
     :mod:`vinesim.physics.plants.elastic_supports`."""
 
-    def __init__(self, trees: int) -> None:
+    def __init__(self, model: Model) -> None:
+        trees = len(model.tree_first)
         self.turn = np.zeros((trees, 3), np.float32)
         """[tree, 3] rad, joint axes."""
         self.rate = np.zeros((trees, 3), np.float32)
