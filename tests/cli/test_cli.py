@@ -269,7 +269,7 @@ def test_secured_from_certificate_to_client(tmp_path):
         (["record", "run.mcap", "--only", "cats"], ["cats", "poses", "trees"]),
         (["record", "run.mcap", "--area", "0", "0", "-1", "1"], ["area 0 0 -1 1", "X0 < X1"]),
         (["replay", "nowhere.mcap", "--out", "pictures"], ["nowhere.mcap", "No such file"]),
-        (["replay", "run.mcap"], ["--connect", "--listen", "--out"]),
+        (["replay", "run.mcap"], ["--connect", "--listen", "--out", "--ros"]),
         (["demo", "--scene", "nowhere"], ["nowhere"]),
         (["demo", "--robot", "unknown"], ["unknown"]),
         (["demo", "--job", "dance"], ["dance", "push", "pick", "exchange"]),

@@ -36,7 +36,9 @@ def cordon(
     with it as drawn."""
     trees, places = [], [(x, 0.0) for x in along] + [(x, 0.3) for x in np.linspace(0.2, 0.8, others)]
     for x, y in places:
-        tree = TreeBuilder(frames.pose(np.array([x, y, 1.0]), frames.from_x_axis([np.sin(lean), 0.0, np.cos(lean)], [0.6, 0.8, 0.0])))
+        tree = TreeBuilder(
+            frames.pose(np.array([x, y, 1.0]), frames.from_x_axis([np.sin(lean), 0.0, np.cos(lean)], [0.6, 0.8, 0.0]))
+        )
         tree.add_body(
             -1, mass=MASS, com=(SHOOT / 2, 0, 0), length=SHOOT, radius=(0.004, 0.004),
             inertia=np.full(3, MASS * SHOOT**2 / 12), stiffness=STIFFNESS, damping=beta * STIFFNESS,

@@ -7,7 +7,6 @@ import gc
 import json
 import os
 import pathlib
-import signal
 import sys
 import threading
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from typing import Any, Self, TypeVar
 
 from vinesim import allocator
 from vinesim.cli.client_options import ClientOptions, check_options
+from vinesim.cli.signals import stop_at_signals
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
@@ -30,6 +30,7 @@ from vinesim.robot.tasks.task import Task
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene, with_seed
+from vinesim.web import page_files
 
 SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
@@ -105,6 +106,20 @@ class ClientSession:
         client.trace = start_trace(client, self.model, bunch)
         return client.trace
 
+    def show_page(self, client: Client) -> None:
+        """Show the vineyard in browsers until the session ends, if ``--page`` is given; a spectator's eyes are where
+        the newest page looks from."""
+        if self.options.page is None:
+            return
+        page_files.check()
+        from vinesim.client.page_world import PageWorld
+        from vinesim.web.page_server import PageServer
+
+        world = PageWorld(client)
+        server = self.enter(PageServer(world, self.options.page))
+        print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
+        client.post_step.append(lambda _: world.collect(server))
+
     def run(
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
         sensors: Callable[[], dict[str, Any]] = dict, publish: Callable[[dict[str, Any]], Any] = lambda _: None,
@@ -153,8 +168,7 @@ def run_loop(
     gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
     gc.enable()
     # until here Ctrl-C simply interrupts; from now on it ends the run in order
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop_at_signals(stop)
     limit = None if seconds is None else round(seconds / dt)
     while not (stop.is_set() or loop.ticks == limit or is_done()):
         loop.begin()

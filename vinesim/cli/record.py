@@ -6,11 +6,11 @@ import contextlib
 import datetime
 import os
 import pathlib
-import signal
 import sys
 import threading
 import time
 
+from vinesim.cli.signals import stop_at_signals
 from vinesim.client.recording.recorder import FAMILIES, Observer, Recorder, observer_grid
 from vinesim.errors import UsageError
 from vinesim.net.recording.mcap_writer import RecordingWriter, free_path
@@ -34,9 +34,7 @@ def run(
     about["asked"] = "what is sent anyway" if area is None else "area " + " ".join(f"{edge:g}" for edge in area)
     about |= _vineyard(scene, seed)
 
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_at_signals(threading.Event())
     with contextlib.ExitStack() as stack:
         name = name or f"recorder-{os.getpid()}"
         bus = stack.enter_context(ZenohBus(name, connect=connect, world=world, certificates=tls, live=False))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pathlib
-import signal
 import threading
 import time
 
+from vinesim.cli.signals import stop_at_signals
 from vinesim.errors import UsageError
 from vinesim.net.recording.mcap_writer import free_path
 from vinesim.ros import middleware
@@ -50,7 +50,7 @@ def record(path: pathlib.Path, topics: list[str], seconds: float | None) -> int:
         return 3
     from vinesim.ros.tools.bag_recorder import BagRecorder
 
-    stop, path = _stop_at_signals(), free_path(path)
+    stop, path = stop_at_signals(threading.Event()), free_path(path)
     began = told = time.monotonic()
     with BagRecorder(path, topics) as recorder:
         print(f"recording into {path}; Ctrl-C ends it", flush=True)
@@ -73,7 +73,7 @@ def play(path: pathlib.Path, rate: float) -> int:
         return 3
     from vinesim.ros.tools import bag_player
 
-    stop = _stop_at_signals()
+    stop = stop_at_signals(threading.Event())
     print(f"playing {path}", flush=True)
     try:
         played = bag_player.play(path, rate=rate, is_stopped=stop.is_set)
@@ -81,10 +81,3 @@ def play(path: pathlib.Path, rate: float) -> int:
         raise UsageError(str(error)) from None
     print(f"{path}: {played.total()} messages of {len(played)} topics")
     return 0
-
-
-def _stop_at_signals() -> threading.Event:
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import pathlib
-import signal
 import threading
 from typing import Any
 
+from vinesim.cli.signals import stop_at_signals
 from vinesim.errors import UsageError
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.retained_store import Quota
@@ -33,9 +33,7 @@ def run(
     places = listen or default_listen(secured=tls is not None, insecure=insecure)
     check_exposure(places, secured=tls is not None, insecure=insecure)
     plan = None if scene is None else _plan(scene, seed)
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop = stop_at_signals(threading.Event())
     with Server(
         places, connect=connect or (), state_folder=state_dir, scene=plan,
         max_actors=max_clients, quota=Quota(*quota), certificates=tls,

@@ -114,6 +114,11 @@ class RobotProcesses:
             ],
         )
 
+    def close_ros(self) -> None:
+        """End the ROS node; the counts of its messages are complete then."""
+        if self.ros is not None:
+            self.ros.close()
+
     def save_picture(self, folder: pathlib.Path) -> None:
         """Write the kept picture; see :meth:`SensorProcess.save_picture`."""
         self.sensors.save_picture(folder)

@@ -75,6 +75,7 @@ class RosProcess:
         """[topic] messages of steps that found no room on the way to the process."""
         body_sensors = {*config.imus, *config.wrenches}
         self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
+        self._parameters = config.parameters
         self.worker = WorkerProcess(
             f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
             lambda context: RosChannel(config, context), self._receive,
@@ -93,6 +94,7 @@ class RosProcess:
             self.robot, self._take_commands, lambda result: self.worker.send("finish", result), client.world_time
         )
         client.pre_step.insert(0, self._control)
+        client.after_reset.append(self._begin_anew)
         if self._leads:
             self._simulation = SimulationControl(client, lambda reply: self.worker.send("simulated", reply))
             client.between_steps.append(self._simulation)
@@ -105,6 +107,12 @@ class RosProcess:
             self._is_restarted = False
             self.handler.cancel_all(time)
         self.handler(time)
+
+    def _begin_anew(self) -> None:
+        """After a reset: obey no earlier command, and publish the new robot."""
+        self._take_commands()
+        self.robot = self.client.robots[self.robot.name]
+        self.handler.begin_anew(self.robot)
 
     def _after_step(self, client: Client) -> None:
         """Pass the state to the process, as far as its topics have subscribers."""
@@ -172,6 +180,8 @@ class RosProcess:
             self._simulation.put(value)
         elif kind == "statistics":
             self._sent, self._dropped = value["sent"], value["dropped"]
+        elif kind == "parameters":
+            self._parameters.update(value)
         elif kind == "restarted":
             self._is_restarted = True
             self._sent_before.update(self._sent)
@@ -195,7 +205,7 @@ class RosProcess:
         self.worker.send("diagnose", (time, list(components)))
 
     def close(self) -> None:
-        """End the process."""
+        """End the process; its counts are complete then. A second call does nothing."""
         self.worker.close()
         self._truth_list.close()
 

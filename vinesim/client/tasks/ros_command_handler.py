@@ -20,7 +20,6 @@ from vinesim.ros.commands.types import (
     GoalResult,
     GoalStatus,
     GripperGoal,
-    GripperResult,
     ImpedanceCommand,
     JointTolerances,
     JointTrajectory,
@@ -69,6 +68,13 @@ class RosCommandHandler:
         self.controllers.cancel_all(time)
         self.controllers.take_results()
 
+    def begin_anew(self, robot: Robot) -> None:
+        """Abort all goals, and command ``robot`` from now on: the one that has taken the place of the former."""
+        self.controllers.abort_all("the simulation was reset")
+        for result in self.controllers.take_results():
+            self._finish(_goal_result(result))
+        self.robot, self.controllers = robot, ControllerManager(robot)
+
     def _apply(self, command: Command, time: float) -> None:
         controllers = self.controllers
         match command:
@@ -108,11 +114,6 @@ def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
 
 def _goal_result(result: controller_manager.GoalResult) -> GoalResult:
     """A result as ROS has it. A goal that another one ended is aborted, with the code of ros2_controllers for that."""
-    outcome, gripper = result.outcome, result.gripper
+    outcome = result.outcome
     code = {Outcome.PREEMPTED: Outcome.INVALID_GOAL, Outcome.CANCELED: Outcome.SUCCESSFUL}.get(outcome, outcome)
-    return GoalResult(
-        result.goal, _STATUS.get(outcome, GoalStatus.ABORTED), int(code), result.text,
-        None if gripper is None else GripperResult(
-            gripper.position, gripper.effort, gripper.stalled, gripper.reached_goal
-        ),
-    )  # fmt: skip
+    return GoalResult(result.goal, _STATUS.get(outcome, GoalStatus.ABORTED), int(code), result.text, result.gripper)

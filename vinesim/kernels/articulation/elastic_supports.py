@@ -29,13 +29,17 @@ class SupportNodes:
     first: wp.array(dtype=wp.int32)  # [support + 1] its first node
     is_arm: wp.array(dtype=wp.bool)  # [support] whether it is an arm
     last_stiffness: wp.array(dtype=wp.float64)  # [support] N/m, N m/rad of what is behind its last node; 0: a free end
-    stiffness: wp.array(dtype=wp.float64)  # [N/m, N m/rad] of what is between this node and the one before, or the start
+    stiffness: wp.array(
+        dtype=wp.float64
+    )  # [N/m, N m/rad] of what is between this node and the one before, or the start
     axis: wp.array(dtype=wp.vec3d)  # unit vector along a wire, in the world; along an arm, in joint axes
     body: wp.array(dtype=wp.int32)  # that the tie holds; the root on an arm
     tree: wp.array(dtype=wp.int32)  # of that body
     number: wp.array(dtype=wp.int32)  # of the tie among those of its body
     point: wp.array(dtype=wp.vec3d)  # [m] of the tie in the body
-    origin: wp.array(dtype=wp.vec3d)  # [m] anchor of the tie, [rad] rotation vector of the joint, while nothing has moved
+    origin: wp.array(
+        dtype=wp.vec3d
+    )  # [m] anchor of the tie, [rad] rotation vector of the joint, while nothing has moved
     wake_distance: wp.array(dtype=wp.float64)  # [m, rad] by which it may move under a sleeping tree
 
 

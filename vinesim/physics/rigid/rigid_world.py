@@ -22,6 +22,7 @@ from vinesim.physics.rigid import free_bunch, mujoco_sleep, recompile, static_wo
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
 from vinesim.physics.rigid.mujoco_world import CompiledWorld
+from vinesim.physics.rigid.rigid_world_boxes import BoxAccess
 from vinesim.physics.rigid.rigid_world_bunches import BunchAccess
 from vinesim.physics.rigid.rigid_world_humans import HumanAccess
 from vinesim.physics.rigid.rigid_world_robots import RobotAccess
@@ -37,7 +38,7 @@ MAX_RATE = 1e4
 """[m/s, rad/s] No body moves as fast, unless the simulation has become unstable."""
 
 
-class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
+class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
     """Robots, people, crates, free bunches and static geoms in one MuJoCo world, and their step."""
 
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
@@ -115,7 +116,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         """Use a world that was compiled with more or fewer actors, with other shapes of robots, or with more room for
         free bunches; between steps.
 
-        False, and nothing is changed, if other actors joined or left meanwhile: compile it anew.
+        False, and nothing is changed, if other actors or boxes came or went meanwhile: compile it anew.
         """
         present = tuple(
             actor for actor in (*self._robots.values(), *self._humans.values()) if actor not in compiled.removed
@@ -132,7 +133,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             for actor in planned
             if actor in replaced or actor not in added
         ]
-        stays = tuple(kept) == present
+        stays = tuple(kept) == present and compiled.boxes == self.boxes
         if not stays or compiled.bunch_slots <= max(self._bunch_slot.values(), default=-1):
             return False
         for new, old in replaced.items():

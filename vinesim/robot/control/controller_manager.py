@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim.robot.control.gripper_controller import CutterController, GripperController, GripperState
+from vinesim.robot.control.gripper_controller import CutterController, GripperController
 from vinesim.robot.control.trajectory_controller import (
     GoalHandle,
     Outcome,
@@ -21,7 +21,7 @@ from vinesim.robot.control.trajectory_controller import (
 )
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.scene.values import ControllerKind, ControllerSpec
+from vinesim.scene.values import ControllerKind, ControllerSpec, GripperState
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -58,6 +58,8 @@ class ControllerManager:
         self._indices = {spec.name: robot.joint_indices(spec.joints) for spec in self.specs.values()}
         self._owner: list[str | None] = [None] * len(joints)
         """[joint] the controller that moves it."""
+        self._follows = np.zeros(len(joints), bool)
+        """[joint] whether that is a trajectory controller."""
         self._trajectories: dict[str, TrajectoryController] = {}
         self._grippers: dict[str, GripperController] = {}
         self._cutters: dict[str, CutterController] = {}
@@ -134,6 +136,11 @@ class ControllerManager:
         for active in list(self._goals.values()):
             self.cancel(active.id, time)
 
+    def abort_all(self, text: str) -> None:
+        """Abort all goals; ``text`` says why."""
+        for name in list(self._goals):
+            self._end(name, Outcome.PREEMPTED, text)
+
     def take_results(self) -> list[GoalResult]:
         """The goals that have ended since the last call."""
         results, self._results = self._results, []
@@ -197,8 +204,8 @@ class ControllerManager:
             state = self._gripper_state(name, time)
             if state is not None and state.is_done:
                 self._results.append(GoalResult(self._goals.pop(name).id, Outcome.SUCCESSFUL, "", state))
-        others = np.array([owner not in self._trajectories for owner in self._owner])
-        self.desired[others], self.desired_velocity[others] = self.robot.setpoint[others], 0.0
+        np.copyto(self.desired, self.robot.setpoint, where=~self._follows)
+        self.desired_velocity[~self._follows] = 0.0
 
     def _gripper_state(self, name: str, time: float) -> GripperState | None:
         if name in self._grippers:
@@ -227,6 +234,7 @@ class ControllerManager:
             self._end(other, Outcome.PREEMPTED, f"{name} took over joints of {other}")
         for j in joints:
             self._owner[j] = name
+        self._follows[joints] = name in self._trajectories
 
     def _end(self, name: str, outcome: Outcome, text: str, time: float = 0.0) -> None:
         active = self._goals.pop(name, None)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.scene.values import GripperState
 
 GOAL_TOLERANCE = 2e-3
 """[m or rad] A gripper this near to its goal has reached it."""
@@ -14,24 +13,6 @@ STALL_SPEED = 1e-3
 """[m/s or rad/s] A gripper that moves slower is stalled; the default of ``gripper_action_controller``."""
 STALL_DURATION = 0.3
 """[s] for which it must be so slow. GUESSED: a tenth of the time that it takes to close."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class GripperState:
-    """Feedback and result of a gripper's goal."""
-
-    position: float
-    """Opening [m or rad]."""
-    effort: float
-    """Largest of the fingers' efforts [N or N m]; of a cutter what it had to overcome [N]."""
-    stalled: bool = False
-    """It stopped before its goal: something is between its fingers, or too strong for its blades."""
-    reached_goal: bool = False
-
-    @property
-    def is_done(self) -> bool:
-        """Whether the goal has ended."""
-        return self.stalled or self.reached_goal
 
 
 class GripperController:

@@ -12,7 +12,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has n
 
 from vinesim.robot.description.errors import description_error
 from vinesim.robot.description.sidecar import Controller, Sidecar
-from vinesim.scene.values import ControllerKind, ControllerSpec
+from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
 
 INTERFACE_OF_KIND = {
     ControllerKind.JOINT_TRAJECTORY: "position",
@@ -23,7 +23,6 @@ INTERFACE_OF_KIND = {
     ControllerKind.IMPEDANCE: "effort",
 }
 """The command interface of ros2_control that each kind of controller needs of its joints."""
-FORWARD_KINDS = (ControllerKind.FORWARD_POSITION, ControllerKind.FORWARD_VELOCITY, ControllerKind.FORWARD_EFFORT)
 MIN_ARM_JOINTS = 4
 """A group with a tool, or with so many joints, is an arm: it gets an impedance controller."""
 

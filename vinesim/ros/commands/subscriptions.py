@@ -24,13 +24,12 @@ from vinesim.ros.commands.types import (
     ImpedanceCommand,
 )
 from vinesim.ros.topic import RELIABLE
-from vinesim.scene.values import ControllerKind, ControllerSpec
+from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
 
 log = logging.getLogger(__name__)
 
 MAX_QUEUED = 256
 """Largest number of queued commands; a client that takes them after every step never loses the oldest."""
-FORWARD_KINDS = (ControllerKind.FORWARD_POSITION, ControllerKind.FORWARD_VELOCITY, ControllerKind.FORWARD_EFFORT)
 
 
 class CommandQueue:

@@ -93,9 +93,8 @@ def _hypothesis(frame: CameraFrame, one: BunchTruth) -> ObjectHypothesisWithPose
 
 def _pose(values: np.ndarray) -> Pose:
     message = Pose()
-    message.position.x, message.position.y, message.position.z = values[:3].tolist()
-    turn = message.orientation
-    turn.x, turn.y, turn.z, turn.w = values[3:].tolist()
+    convert.set_vector(message.position, values[:3])
+    convert.set_quaternion(message.orientation, values[3:])
     return message
 
 

@@ -120,10 +120,10 @@ def odometry(sample: RobotSample, base: str) -> Odometry:
     """Odometry of the base: pose in ``odom``, velocity in its own axes, both as measured, and their covariances."""
     message = Odometry(header=header(sample.joints.time, "odom"), child_frame_id=base)
     pose = message.pose.pose
-    _set_vector(pose.position, sample.odom_q[:3])
-    _set_quaternion(pose.orientation, sample.odom_q[3:])
-    _set_vector(message.twist.twist.linear, sample.odom_qd[:3])
-    _set_vector(message.twist.twist.angular, sample.odom_qd[3:])
+    set_vector(pose.position, sample.odom_q[:3])
+    set_quaternion(pose.orientation, sample.odom_q[3:])
+    set_vector(message.twist.twist.linear, sample.odom_qd[:3])
+    set_vector(message.twist.twist.angular, sample.odom_qd[3:])
     for target, planar in zip((message.pose, message.twist), sample.odom_covariance, strict=True):
         covariance = np.diag([0.0, 0.0, UNMEASURED, UNMEASURED, UNMEASURED, 0.0])
         covariance[np.ix_(_PLANAR, _PLANAR)] = planar
@@ -134,17 +134,17 @@ def odometry(sample: RobotSample, base: str) -> Odometry:
 def wrench(sample: Wrench) -> WrenchStamped:
     """What a force-torque sensor reads, in its frame."""
     message = WrenchStamped(header=header(sample.time, sample.frame))
-    _set_vector(message.wrench.force, sample.force)
-    _set_vector(message.wrench.torque, sample.torque)
+    set_vector(message.wrench.force, sample.force)
+    set_vector(message.wrench.torque, sample.torque)
     return message
 
 
 def imu(sample: Imu) -> ImuMessage:
     """What an inertial measurement unit reads; exact, so all covariances are 0."""
     message = ImuMessage(header=header(sample.time, sample.frame))
-    _set_quaternion(message.orientation, sample.orientation)
-    _set_vector(message.angular_velocity, sample.angular_velocity)
-    _set_vector(message.linear_acceleration, sample.linear_acceleration)
+    set_quaternion(message.orientation, sample.orientation)
+    set_vector(message.angular_velocity, sample.angular_velocity)
+    set_vector(message.linear_acceleration, sample.linear_acceleration)
     return message
 
 
@@ -390,9 +390,11 @@ def _floats(values: np.ndarray) -> array.array:
     return data
 
 
-def _set_vector(target: Any, values: np.ndarray) -> None:
+def set_vector(target: Any, values: np.ndarray) -> None:
+    """Write [3] into the fields x, y and z of a message."""
     target.x, target.y, target.z = map(float, values)
 
 
-def _set_quaternion(target: Any, values: np.ndarray) -> None:
+def set_quaternion(target: Any, values: np.ndarray) -> None:
+    """Write [4] into the fields x, y, z and w of a message."""
     target.x, target.y, target.z, target.w = map(float, values)

@@ -35,18 +35,23 @@ class ControlPublisher:
             if spec.kind is ControllerKind.SERIES_ELASTIC
             for joint in spec.joints
         ]
+        self._names: tuple[str, ...] | None = None
+        self._places: dict[str, int] = {}
+        """Of joints in the arrays of samples."""
         self._steps = 0
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """All messages of one step."""
-        places = {name: i for i, name in enumerate(sample.joints.names)}
+        if sample.joints.names is not self._names:  # the same tuple every step
+            self._names = sample.joints.names
+            self._places = {name: i for i, name in enumerate(self._names)}
         self._steps += 1
         if sample.reference is not None and self._steps % STATE_PERIOD == 0:
             for joints, topic in self._states:
-                yield topic, partial(self._state, sample, joints, np.array([places[joint] for joint in joints]))
+                yield topic, partial(self._state, sample, joints, np.array([self._places[joint] for joint in joints]))
         if sample.elements is not None:
             for joint, topic in self._elements:
-                yield topic, partial(convert.elastic_state, sample.elements, places[joint])
+                yield topic, partial(convert.elastic_state, sample.elements, self._places[joint])
 
     def _state(self, sample: RobotSample, joints: tuple[str, ...], places: np.ndarray) -> Any:
         points = convert.reference_points(sample, places)

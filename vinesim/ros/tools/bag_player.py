@@ -20,7 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
-from vinesim.ros.tools.message_types import message_class
+from vinesim.ros.tools.subscribing import message_class
 
 log = logging.getLogger(__name__)
 

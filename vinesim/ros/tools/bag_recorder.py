@@ -25,7 +25,7 @@ from vinesim.errors import writing
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 from vinesim.ros.messages.definitions import UnknownTypeError, message_definition
-from vinesim.ros.tools.message_types import message_class
+from vinesim.ros.tools.subscribing import message_class, offered_qos
 
 log = logging.getLogger(__name__)
 
@@ -96,16 +96,10 @@ class BagRecorder:
             self.unknown.add(type_name)
             self._subscriptions[name] = None
             return
-        reliable = all(one.qos_profile.reliability == ReliabilityPolicy.RELIABLE for one in offered)
-        latched = all(one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered)
-        qos = QoSProfile(
-            depth=QUEUE_DEPTH,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        )
+        qos = offered_qos(offered, QUEUE_DEPTH)
         channel = self._writer.register_channel(
             topic=name, message_encoding="cdr", schema_id=schema,
-            metadata={"offered_qos_profiles": _qos_text(reliable, latched)},
+            metadata={"offered_qos_profiles": _qos_text(qos)},
         )  # fmt: skip
         self._subscriptions[name] = self._node.create_subscription(
             message, name, self._taker(name, channel), qos, raw=True
@@ -141,8 +135,10 @@ class BagRecorder:
         self.close()
 
 
-def _qos_text(reliable: bool, latched: bool) -> str:
+def _qos_text(qos: QoSProfile) -> str:
     """QoS of a channel as rosbag2 (version 9 of its metadata) writes it."""
+    reliable = qos.reliability == ReliabilityPolicy.RELIABLE
+    latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
     return (
         f"- history: keep_last\n  depth: {1 if latched else 10}\n  reliability: "
         f"{'reliable' if reliable else 'best_effort'}\n  durability: {'transient_local' if latched else 'volatile'}\n"

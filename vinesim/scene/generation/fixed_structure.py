@@ -79,7 +79,11 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
 
 
 def _cone_chains(
-    points: np.ndarray, radius: np.ndarray, organ: Organ, index: np.ndarray, tension: float = 0.0,
+    points: np.ndarray,
+    radius: np.ndarray,
+    organ: Organ,
+    index: np.ndarray,
+    tension: float = 0.0,
     shear_modulus: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Round cones along polylines [chain, point, 3]."""

@@ -7,12 +7,14 @@ A value that leaves the physics thread owns its arrays: they are never written a
 from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPose, HumanSpec
 from vinesim.scene.values.measurement import Measurement
 from vinesim.scene.values.network import Coupling, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
-from vinesim.scene.values.rigid import Mesh, RigidVisual, Shape
+from vinesim.scene.values.rigid import Mesh, RigidBox, RigidVisual, Shape
 from vinesim.scene.values.robot import (
+    FORWARD_KINDS,
     ControllerKind,
     ControllerSpec,
     Drive,
     ElasticSample,
+    GripperState,
     Imu,
     JointReference,
     JointSample,
@@ -34,6 +36,7 @@ from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
 __all__ = [
+    "FORWARD_KINDS",
     "MIN_BERRY_PIXELS",
     "POINT_NAMES",
     "Box",
@@ -49,6 +52,7 @@ __all__ = [
     "Detachment",
     "Drive",
     "ElasticSample",
+    "GripperState",
     "HandSample",
     "Haptic",
     "HumanPose",
@@ -62,6 +66,7 @@ __all__ = [
     "Measurement",
     "Mesh",
     "ObjectUpdate",
+    "RigidBox",
     "RigidVisual",
     "RobotSample",
     "RobotSpec",

@@ -78,6 +78,10 @@ class ControllerKind(enum.StrEnum):
     SERIES_ELASTIC = "series_elastic"
 
 
+FORWARD_KINDS = (ControllerKind.FORWARD_POSITION, ControllerKind.FORWARD_VELOCITY, ControllerKind.FORWARD_EFFORT)
+"""Controllers that pass on one value for each joint."""
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class ControllerSpec:
     """One controller of a robot: prefix of its topics and actions, and the joints that it moves."""
@@ -114,6 +118,24 @@ class JointReference:
     """[joint] rad or m"""
     velocity: np.ndarray
     """[joint] rad/s or m/s"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GripperState:
+    """How far a gripper's or cutter's goal is, or how it ended (control_msgs/GripperCommand)."""
+
+    position: float
+    """Opening [m or rad]."""
+    effort: float
+    """Largest of the fingers' efforts [N or N m]; of a cutter what it had to overcome [N]."""
+    stalled: bool = False
+    """It stopped before its goal: something is between its fingers, or too strong for its blades."""
+    reached_goal: bool = False
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the goal has ended."""
+        return self.stalled or self.reached_goal
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
