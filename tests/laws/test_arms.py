@@ -1,4 +1,4 @@
-"""Arms of a cordon twist: statics, reciprocity, modes and energy of shoots on one arm; whom a push wakes, where all rest."""
+"""Arms of a cordon twist: statics, reciprocity, modes, energy of its shoots; whom a push wakes, where all rest."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def settle(physics: Physics, steps: int = 500) -> None:
 
 
 def test_shoots_of_one_arm_move_each_other_as_a_dense_solve_says() -> None:
-    """Tips by the inverse of joints, arm and ties [4, 4]; the arm by what the joints bear. Along the arm nothing gives."""
+    """Tips by the inverse of joints, arm and ties [4, 4]; the arm by what joints bear. Along it nothing gives."""
     moved = np.zeros((4, 4))
     for shoot in range(4):
         physics = world(cordon())

@@ -41,7 +41,7 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
 
     Kinetic: sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic: k theta^2 / 2 about each joint axis, where
     theta is the rotation vector of the joint, and k d^2 / 2 of each tie; k d (d + u) / 2 with its share of the wire
-    that it deflects by u; of a root less k phi (theta - theta_0) / 2, with the turn phi of its arm's twist and theta as drawn.
+    that it deflects by u; of a root on an arm that is twisted by u, less k u (theta - theta as drawn) / 2.
     """
     model, state = plants.model, plants.state
     bodies = _moving_bodies(plants, trees)

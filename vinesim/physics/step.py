@@ -103,10 +103,7 @@ class Physics:
             ("rigid: predict velocities without plant contacts", self.rigid.predict),
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
-            (
-                "elastic supports: bring wires and arms to balance with awake trees, wake trees that they move",
-                self._update_elastic_supports,
-            ),
+            ("elastic supports: balance wires and arms with awake trees, wake others", self._update_elastic_supports),
             ("plants: predict velocities without contacts", self.plants.predict),
             ("contacts: wake trees that others touch, solve all together", self.contact_solver.solve),
             ("plants: integrate with contact wrenches", self._integrate_plants),

@@ -1,13 +1,11 @@
 """Elastic supports: wires that shoots are tied to and arms that they stand on give, so that shoots move each other.
 
-See :mod:`vinesim.kernels.articulation.elastic_supports`. Only supports of trees that are awake are computed. The anchors in
-the tie table are the wires' places, and the rests of the springs of roots turn with the arms, so that the trees, their
-sleep and joint wrenches need not know of supports.
+See :mod:`vinesim.kernels.articulation.elastic_supports`. Only supports of trees that are awake are computed. The
+anchors in the tie table are the wires' places, and the rests of the springs of roots turn with the arms, so that the
+trees, their sleep and joint wrenches need not know of supports.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import warp as wp
@@ -15,6 +13,7 @@ import warp as wp
 from vinesim import frames
 from vinesim.kernels.articulation import elastic_supports as kernels
 from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.berry_clusters import spans
@@ -25,7 +24,7 @@ WAKE_SHARE = 0.25
 would move a point of it by as much. TUNED: twenty shoots that sleep on a wire hold it with 2 N until then."""
 
 LEAST_SHARE = 5e-4
-"""[1] Nodes of a support are taken to be at least by this share of its whole compliance from each other and its ends."""
+"""[1] Nodes of a support are taken to be by this share of its compliance from each other and from its ends, or more."""
 
 _NO_TREES = np.zeros(0, np.int32)
 
@@ -41,14 +40,14 @@ class ElasticSupports:
         nodes = {name: np.concatenate([wires[name], arms[name]]) for name in wires}
         first = np.flatnonzero(np.diff(nodes["support"], prepend=-1))
         self._tree = model.body_tree[nodes["body"]].astype(np.int32)
-        self._support = np.repeat(np.arange(len(first)), np.diff([*first, len(self._tree)]))
+        self._support = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(self._tree))))
         by_tree = np.argsort(self._tree, kind="stable")
         self._tree_supports = self._support[by_tree].astype(np.int32)
         trees = len(model.tree_first)
         self._tree_start = np.searchsorted(self._tree[by_tree], np.arange(trees + 1)).astype(np.int32)
         self.deflection = np.zeros((len(self._tree), 3))
-        """[node, 3] of wires m from where they are when nothing has moved, of arms their twist [rad, 0, 0]; wires first,
-        from start to end."""
+        """[node, 3] of wires m from where they are when nothing has moved, of arms their twist [rad, 0, 0]; wires
+        first, each from start to end."""
         self._active, self._is_moved = np.zeros(len(first), np.int32), np.zeros(trees, np.bool_)
         self._active_count, self._moved_count = 0, np.zeros(1, np.int32)
         self.is_coupled = np.zeros(trees, np.bool_)
@@ -56,12 +55,13 @@ class ElasticSupports:
         self._is_placed = np.zeros(trees, np.bool_)
         self._awake, self._placed, self._is_listed = _NO_TREES, _NO_TREES, False
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
-        nodes |= {
+        stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
+        self._bind({
             "first": np.append(first, len(self._tree)).astype(np.int32), "is_arm": nodes["is_arm"][first],
-            "tree": self._tree, "number": np.append(wires["tie"] - first_tie, 0 * arms["body"]).astype(np.int32),
+            "stiffness": stiffness, "last_stiffness": last_stiffness, "tree": self._tree,
+            "number": np.append(wires["tie"] - first_tie, 0 * arms["body"]).astype(np.int32),
             "wake_distance": WAKE_SHARE * parameters.sleep_distance / nodes["response"],
-        } | _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)  # fmt: skip
-        self._bind(nodes)
+        } | {name: nodes[name] for name in ("axis", "body", "point", "origin")})  # fmt: skip
 
     def _bind(self, nodes: dict[str, np.ndarray]) -> None:
         plants, count = self._plants, len(self._tree)
@@ -81,10 +81,12 @@ class ElasticSupports:
         }  # fmt: skip
         self._solve = bind_launch(
             kernels.balance_supports,
-            [_fill(kernels.SupportNodes, nodes), _share(self._active, wp.int32), _share(state.tree_awake, wp.bool),
-             _share(self._is_placed, wp.bool), _fill(kernels.SupportedBodies, bodies)],
-            [_fill(kernels.SupportState, shape), _fill(kernels.SupportedSprings, springs),
-             _share(self._is_moved, wp.bool), _share(self._moved_count, wp.int32)],
+            [SharedArrays(kernels.SupportNodes, **nodes).struct, share(self._active, wp.int32),
+             share(state.tree_awake, wp.bool), share(self._is_placed, wp.bool),
+             SharedArrays(kernels.SupportedBodies, **bodies).struct],
+            [SharedArrays(kernels.SupportState, **shape).struct,
+             SharedArrays(kernels.SupportedSprings, **springs).struct, share(self._is_moved, wp.bool),
+             share(self._moved_count, wp.int32)],
         )  # fmt: skip
 
     @property
@@ -174,9 +176,9 @@ def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     axis = frames.rotate(frames.conjugate(frames.multiply(joint, frames.exp(0.5 * drawn))), axis)
     order = np.lexsort((compliance, arm[here]))
     nodes = {
-        "support": len(model.fixed_start) + arm[here], "tie": np.full(len(tree), -1), "is_arm": np.ones(len(tree), bool),
-        "axis": axis,
-        "body": body.astype(np.int32), "point": np.zeros((len(tree), 3)), "origin": drawn, "response": _tip_response(plants, tree, axis),
+        "support": len(model.fixed_start) + arm[here], "tie": np.full(len(tree), -1),
+        "is_arm": np.ones(len(tree), bool), "axis": axis, "body": body.astype(np.int32),
+        "point": np.zeros((len(tree), 3)), "origin": drawn, "response": _tip_response(plants, tree, axis),
         "compliance": compliance, "whole": np.bincount(number, twist)[number][here],
     }  # fmt: skip
     return {name: value[order] for name, value in nodes.items()}
@@ -201,27 +203,12 @@ def _tip_response(plants: ArticulationSolver, tree: np.ndarray, axis: np.ndarray
 
 def _springs_in_series(
     compliance: np.ndarray, whole: np.ndarray, is_free: np.ndarray, first: np.ndarray
-) -> dict[str, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:
     """Stiffness [node] of what is before each node of a support, and [support] behind its last one, 0 where its end
-    ``is_free`` [node]. ``compliance`` [node] up to the node, ``whole`` [node] of all of its support."""
+    ``is_free`` [node]. ``compliance`` [node]: up to the node; ``whole`` [node]: of all of its support; ``first``
+    [support]: its first node."""
     before = np.append(0.0, compliance[:-1])[: len(compliance)]
     before[first] = 0.0
     last = np.append(first[1:], len(compliance))[: len(first)] - 1
     behind = np.maximum(whole[last] - compliance[last], LEAST_SHARE * whole[last])
-    return {
-        "stiffness": 1.0 / np.maximum(compliance - before, LEAST_SHARE * whole),
-        "last_stiffness": np.where(is_free[last], 0.0, 1.0 / behind),
-    }
-
-
-def _fill(struct: Any, arrays: dict[str, np.ndarray]) -> Any:
-    """A kernel argument struct over NumPy arrays, by the names of its fields."""
-    filled = struct()
-    for name, field in struct.vars.items():
-        setattr(filled, name, _share(arrays[name], field.type.dtype))
-    return filled
-
-
-def _share(data: np.ndarray, dtype: Any) -> wp.array:
-    """A Warp array over the memory of a NumPy array."""
-    return wp.array(np.ascontiguousarray(data), dtype=dtype, device="cpu", copy=False)
+    return 1.0 / np.maximum(compliance - before, LEAST_SHARE * whole), np.where(is_free[last], 0.0, 1.0 / behind)

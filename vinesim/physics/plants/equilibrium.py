@@ -47,8 +47,8 @@ class EquilibriumFinder:
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         self._measure = launches.record(
             residual_motion, fill(s.SolverParameters, **(numbers | {"dt": REST_STEP})),
-            fill(s.ArticulationModel, joint_damping="no_rate"), "body_length", "tie_axis", "tie_softening", "root_softening",
-            "subset",
+            fill(s.ArticulationModel, joint_damping="no_rate"), "body_length", "tie_axis", "tie_softening",
+            "root_softening", "subset",
             fill(s.AppliedForces), fill(s.JointState), fill(s.JointState, joint_xd="no_rate", joint_qd="no_rate"),
             fill(s.AppliedForces, body_load="static_load", body_wrench="no_wrench", root_turn_rate="no_turn_rate"),
             "static_load",

@@ -143,8 +143,8 @@ def _validate_ties(model: Model) -> None:
     if (bad := (model.tree_piece < -1) | (model.tree_piece >= pieces)).any():
         tree = int(np.argmax(bad))
         raise ValueError(
-            f"tree {tree}: piece {model.tree_piece[tree]} of {pieces} fixed pieces, counted from 0; give one of them, or "
-            "-1 for none"
+            f"tree {tree}: piece {model.tree_piece[tree]} of {pieces} fixed pieces, counted from 0; give one of them, "
+            "or -1 for none"
         )
     if (bad := ~(model.fixed_shear_modulus >= 0.0)).any():
         piece = int(np.argmax(bad))
