@@ -122,6 +122,6 @@ class RootRests:
         self.rate = np.zeros((trees, 3), np.float32)
         """[tree, 3] rad/s, joint axes."""
         self.softening = np.zeros((trees, 3), np.float32)
-        """The outer product of this [tree, 3] (N m/rad)^(1/2), joint axes, with itself is by what spring and arm are less
-        stiff than the spring alone, when all awake trees of the arm move as one. Only the sleep of trees asks for
+        """The outer product of this [tree, 3] (N m/rad)^(1/2), joint axes, with itself is by what spring and arm are
+        less stiff than the spring alone, when all awake trees of the arm move as one. Only the sleep of trees asks for
         it."""
