@@ -5,6 +5,7 @@ Every message is built and sent by the thread that passes its values, in order.
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree
 
@@ -55,6 +56,7 @@ class RobotNode(Node):
         bunch_of_body: np.ndarray | None = None,
         base: str = "base_footprint",
         clock: bool = True,
+        params_file: pathlib.Path | None = None,
     ) -> None:
         message_packages.ensure_importable(OWN_MESSAGES)
         self._urdf, self._static_transforms, self._base = urdf, static_transforms, base
@@ -64,7 +66,7 @@ class RobotNode(Node):
         self._commands = CommandQueue()
         self._steps = 0
         names = [spec.name for spec in controllers]
-        super().__init__(name, namespace, [*names, *imus, *wrenches])
+        super().__init__(name, namespace, [*names, *imus, *wrenches], params_file)
 
     def _open(self) -> None:
         from tf2_msgs.msg import TFMessage

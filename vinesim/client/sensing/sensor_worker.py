@@ -71,6 +71,8 @@ class SensorConfig:
     """Where they compute; the CPU from the next start on if a GPU fails."""
     wind: Wind | None = None
     """That of the scene."""
+    params_file: pathlib.Path | None = None
+    """ROS parameters of its node."""
 
     @property
     def sensor_frames(self) -> dict[str, str]:
@@ -157,7 +159,7 @@ class SensorWorker:
             SensorNode(
                 f"{ros_name(config.name)}_sensors", namespace=config.namespace,
                 cameras=[m.name for m in description.cameras], lidars=[m.name for m in description.lidars],
-                rates=self._rates(),
+                rates=self._rates(), params_file=config.params_file,
             )
         )  # fmt: skip
 
