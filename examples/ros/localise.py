@@ -28,7 +28,7 @@ class Localiser(Node):
         settings.wait_for_services()
         settings.set_parameters([Parameter("publish_map_to_odom", value=False)])
         self.tf = self.create_publisher(TFMessage, "/tf", 100)
-        self.create_subscription(Imu, "/base_imu", self.turn, 100)
+        self.create_subscription(Imu, "/base_imu", self.turn, 1000)
         self.create_subscription(Odometry, "/mobile_base_controller/odom", self.travel, 100)
 
     def turn(self, message: Imu) -> None:

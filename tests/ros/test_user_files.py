@@ -104,8 +104,8 @@ def driver(peer: StockNode) -> Callable[[float, float], None]:
         twist = TwistStamped()
         twist.twist.linear.x, twist.twist.angular.z = ahead, turn
         commands.publish(twist)
-        for _ in range(10):
-            peer.spin(0.005)
+        for _ in range(40):
+            peer.spin(0.001)
 
     return drive
 
@@ -137,13 +137,19 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
     from simulation_interfaces.srv import GetEntityState
     from tf2_msgs.msg import TFMessage
 
-    frames: list = []
+    own: list[dict] = []  # the transforms of each message, by child frame: of the robot, and of the example
+    others: list[dict] = []
+
+    def take(message: TFMessage) -> None:
+        found = {t.child_frame_id: t.transform for t in message.transforms}
+        (own if "base_footprint" in found else others).append(found)
+
     odometry: list[Odometry] = []
     subscriptions = [
-        robot.node.create_subscription(TFMessage, "/tf", lambda m: frames.extend(m.transforms), 100),
+        robot.node.create_subscription(TFMessage, "/tf", take, 100),
         robot.node.create_subscription(Odometry, "/mobile_base_controller/odom", odometry.append, 100),
     ]
-    ask = robot.node.create_client(GetEntityState, "/vinebot_simulation/get_entity_state")
+    ask = robot.node.create_client(GetEntityState, "/get_entity_state")
     wait_until(ask.service_is_ready, lambda: robot.spin(0.05), "the simulation")
 
     def true_yaw() -> float:
@@ -151,40 +157,27 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
         wait_until(future.done, lambda: robot.spin(0.05), "a state")
         return yaw(future.result().state.pose.orientation)
 
-    def mapped() -> float | None:
-        """Yaw of the base in the map, by the newest transforms."""
-        newest = {t.child_frame_id: t for t in frames}
-        if "odom" not in newest or "base_footprint" not in newest:
-            return None
-        return yaw(newest["odom"].transform.rotation) + yaw(newest["base_footprint"].transform.rotation)
-
     with example("localise.py", "vinebot") as printed:
-
-        def is_localised() -> bool:
-            """Whether no message of tf holds both: the robot keeps its truth to itself, and the example publishes."""
-            found = {t.child_frame_id for t in frames}
-            frames.clear()
-            return "odom" in found and abs(mapped_now()) < 1e-6
-
-        def mapped_now() -> float:
-            wait_until(lambda: mapped() is not None, lambda: robot.spin(0.05), "frames")
-            return mapped() or 0.0
-
-        wait_until(is_localised, lambda: [robot.spin(0.01) for _ in range(40)], "map to odom")
-        printed()
+        wait_until(lambda: own and others and "odom" not in own[-1], lambda: (printed(), robot.spin(0.05)), "frames")
         before, start = true_yaw(), yaw(odometry[-1].pose.pose.orientation)
         drive = driver(robot)
-        wait_until(lambda: abs(turned(yaw(odometry[-1].pose.pose.orientation), start)) > 1.0, lambda: drive(0.0, 0.6))
-        for _ in range(40):
+
+        def counted() -> float:
+            return turned(yaw(odometry[-1].pose.pose.orientation), start)
+
+        def found() -> float:
+            return turned(yaw(others[-1]["odom"].rotation), -yaw(own[-1]["base_footprint"].rotation))
+
+        wait_until(lambda: counted() > 1.0, lambda: drive(0.0, 0.4))
+        for _ in range(20):
             drive(0.0, 0.0)
-        frames.clear()
-        found = mapped_now()
         truth = turned(true_yaw(), before)
-        counted = turned(yaw(odometry[-1].pose.pose.orientation), start)
+        # what was sent while it turned may still wait; then both hold
+        wait_until(lambda: abs(turned(found(), truth)) < 0.04, lambda: drive(0.0, 0.0), f"a turn of {truth:.2f} rad")
+        wait_until(lambda: abs(counted() - truth / (1.0 - SLIP)) < 0.04, lambda: drive(0.0, 0.0), "odometry, slipping")
+        assert abs(turned(found(), truth)) < 0.04
     for one in subscriptions:
         robot.node.destroy_subscription(one)
-    assert abs(turned(found, truth)) < 0.02
-    assert counted == pytest.approx(truth / (1.0 - SLIP), abs=0.02)
 
 
 # ---------------------------------------------------------------- the folder ros/
