@@ -69,6 +69,8 @@ class ClientOptions:
     sensor_hz: float | None
     renderer: str
     tick_log: pathlib.Path | None
+    page: int | None = None
+    """Port of the page; 0: any that is free; None: no page."""
 
 
 def check_role(role: str, given: Collection[str]) -> None:

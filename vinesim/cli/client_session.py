@@ -30,6 +30,7 @@ from vinesim.robot.tasks.task import Task
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene, with_seed
+from vinesim.web import page_files
 
 SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
@@ -104,6 +105,20 @@ class ClientSession:
         """Record force on and displacement of a bunch from now on."""
         client.trace = start_trace(client, self.model, bunch)
         return client.trace
+
+    def show_page(self, client: Client) -> None:
+        """Show the vineyard in browsers until the session ends, if ``--page`` is given; a spectator's eyes are where
+        the newest page looks from."""
+        if self.options.page is None:
+            return
+        page_files.check()
+        from vinesim.client.page_world import PageWorld
+        from vinesim.web.page_server import PageServer
+
+        world = PageWorld(client)
+        server = self.enter(PageServer(world, self.options.page))
+        print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
+        client.post_step.append(lambda _: world.collect(server))
 
     def run(
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,

@@ -38,6 +38,7 @@ def run(options: ClientOptions) -> int:
             if options.walk is None:
                 human.do(human.walk(standing_place(bunch_centres(session.model)[options.reach], start)))
             human.do(pull_repeatedly(human, trace.centre))
+        session.show_page(client)
         status = session.run(client)
         if options.out is not None:
             save_report(options.out, status.report())

@@ -45,6 +45,7 @@ def run(options: ClientOptions) -> int:
             process.attach(client, client.robots[name])
         task = None if begin is None else begin(client.physics, client.robot)
         _add_behaviour(session, client, task, approach)
+        session.show_page(client)
         status = session.run(
             client, task=task, sent=sensors[0].sent_messages, sensors=lambda: _sensor_status(sensors),
             publish=lambda values: [one.publish_diagnostics(values) for one in sensors],

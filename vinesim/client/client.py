@@ -109,7 +109,7 @@ class Client:
         """Meshes of local robots for other clients, and of remote ones for this client."""
         self.replicators: dict[str, Replicator] = {}
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
-        self.objects = ObjectSync(self.physics, self.replicators)
+        self.objects = ObjectSync(self.physics, self.replicators, self._is_present)
         self.couplings = PlantCouplings(self.physics)
         self._description, self._executor = description, executor
         self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
@@ -242,8 +242,8 @@ class Client:
 
     def _add_replicator(self, name: str, replicator: Replicator) -> None:
         self.replicators[name] = replicator
-        for own, share in self.replicators.items():
-            share.local_actors = self.replicators.keys() - {own}
+        for own in self.replicators.values():
+            own.share_client(other for other in self.replicators.values() if other is not own)
 
     def tick(self) -> None:
         """Simulate one step of ``physics.dt``; none while :attr:`steps_before_pause` is 0."""
@@ -282,6 +282,7 @@ class Client:
             if hello.kind in ("robot", "human"):
                 self.spawner.enqueue(hello)
         for name in inbox.left:
+            self.objects.carrier_left(name)
             self.spawner.cancel(name)
             self.meshes.forget(name)
             if (other := self.remote_actors.pop(name, None)) is not None:
@@ -336,6 +337,7 @@ class Client:
             detached = objects.detached_by(name, all_others=name == self.name)
             touched = objects.touched_by(name, mine)
             touching |= bool(touched)
+            carried_on = objects.carried_on(name)
             settled = replicator.send(
                 now, pose, touched=touched, moving=moving, read=objects.read_state,
                 grabbed=objects.with_trees(detached), detached=detached, detached_roots=objects.cut_roots,
@@ -344,11 +346,12 @@ class Client:
                 has_body=self.physics.support_tracker.__contains__,
                 couplings=self.couplings.of_actor(name, self._remote_trees.keys() | self.couplings.trees),
                 wrenches=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
+                carried_on=carried_on,
             )  # fmt: skip
             for update in settled:
                 # the last message is what all copies hold: hold the same, quantised state
                 objects.blend_tree(update, 1.0)
-            for number in mine - replicator.owned:
+            for number in mine.union(carried_on) - replicator.owned:
                 objects.mark_resting(replicator.record(number))
         self.interest_audit.update(self, touching)
 
@@ -408,6 +411,10 @@ class Client:
         inbox.trees = [trees[tree] for tree in sorted(trees)]
         inbox.objects = [moved[number] for number in sorted(moved) if self._is_owned_remotely(number)]
         return inbox
+
+    def _is_present(self, name: str) -> bool:
+        """Whether an actor of another client is in the world now."""
+        return any(replicator.is_present(name) for replicator in self.replicators.values())
 
     def _is_owned_remotely(self, number: int) -> bool:
         """Whether an actor of another client owns an object or tree."""

@@ -51,6 +51,10 @@ Out = Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, tra
 SensorRate = Annotated[
     float | None, typer.Option(min=0.1, help="Pictures and scans a second; each sensor's own rate unless given.")
 ]
+Page = Annotated[
+    int | None,
+    typer.Option(min=0, max=65535, help="Show the vineyard in a browser, on this port of this machine; 0: a free one."),
+]
 # what the clients of a demo and of a benchmark are told to do
 Push = Annotated[int | None, typer.Option(hidden=True, help="Of a robot: reach for this bunch and push it repeatedly.")]
 Watch = Annotated[
@@ -72,7 +76,7 @@ def client(
     job: Job = None, walk: Walk = None, reach: Reach = None, height: Height = 1.75, watch: Watch = None,
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
-    sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None,
+    sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,
 ) -> None:  # fmt: skip
     """Join the vineyard as one actor, with a simulation of its own.
 
@@ -83,6 +87,7 @@ def client(
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
       vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
       vinesim client --role spectator --connect tcp/127.0.0.1:7447 --pose 2 0 1.57 --out pictures
+      vinesim client --role spectator --connect tcp/127.0.0.1:7447 --page 8080
       vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva
     """
     gc.disable()  # a sixth of the time of the start; the loop enables it

@@ -10,6 +10,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
+from vinesim.scene.materials import Material, materials_of_organs
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidBox, Shape
 
@@ -56,6 +57,11 @@ def contact_friction(coefficient: float, rolling_arm: float = 0.0001) -> list[fl
     return [coefficient, 0.005, rolling_arm]
 
 
+def geom_user(material: int, *, has_own_friction: bool = False) -> list[float]:
+    """User data of a geom: its :class:`Material`, and whether its friction is its own, whatever it touches."""
+    return [float(material), float(has_own_friction)]
+
+
 def boxes_of(model: Model) -> dict[int, RigidBox]:
     """The boxes of a scene as generated, by number."""
     rows = zip(model.box_pose.astype(float), model.box_size.astype(float), model.box_mass.tolist(), strict=True)
@@ -71,18 +77,19 @@ def build_static_world(
     """
     spec = mujoco.MjSpec()
     _set_options(spec, parameters)
+    spec.nuser_geom = len(geom_user(Material.UNKNOWN))
     friction = contact_friction(parameters.friction)
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=GROUND,
-        conaffinity=BOX | CRATE_FLOOR | FREE_BUNCH, friction=friction,
+        conaffinity=BOX | CRATE_FLOOR | FREE_BUNCH, friction=friction, userdata=geom_user(Material.SOIL),
     )  # fmt: skip
-    radius = model.fixed_radius.mean(1)
+    radius, material = model.fixed_radius.mean(1), materials_of_organs(model.fixed_organ)
     for piece in range(len(radius)):
         spec.worldbody.add_geom(
             name=f"fixed/{piece}", type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             fromto=np.concatenate([model.fixed_start[piece], model.fixed_end[piece]]).astype(float),
             size=[float(radius[piece]), 0, 0], contype=FIXED, conaffinity=0, friction=friction,
-            margin=max(MIN_STATIC_RADIUS - float(radius[piece]), 0.0),
+            margin=max(MIN_STATIC_RADIUS - float(radius[piece]), 0.0), userdata=geom_user(material[piece]),
         )  # fmt: skip
     for number, box in (boxes_of(model) if boxes is None else boxes).items():
         turn = frames.to_wxyz(frames.normalize(box.pose[3:]))
@@ -116,12 +123,12 @@ def _add_crate(body: mujoco.MjsBody, size: np.ndarray, mass: float, friction: li
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=wall.size, pos=wall.pose[:3], friction=friction,
             mass=mass * share / sum(volume), contype=CRATE_FLOOR if is_floor else BOX,
-            conaffinity=ALL_BITS & ~FREE_BUNCH if is_floor else ALL_BITS,
+            conaffinity=ALL_BITS & ~FREE_BUNCH if is_floor else ALL_BITS, userdata=geom_user(Material.PLASTIC),
         )  # fmt: skip
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX, size=[*walls[0].size[:2], CRATE_BED_DEPTH / 2],
         pos=[0.0, 0.0, CRATE_WALL - CRATE_BED_DEPTH / 2], friction=friction, mass=0.0, contype=0,
-        conaffinity=FREE_BUNCH,
+        conaffinity=FREE_BUNCH, userdata=geom_user(Material.PLASTIC),
     )  # fmt: skip
 
 
