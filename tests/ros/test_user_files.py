@@ -31,6 +31,7 @@ from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 
 from tests.support.stock_node import StockNode, wait_until
+from vinesim.bench.ros_topics import action_rows
 from vinesim.client.processes.child_process import process_group
 from vinesim.ros.messages import message_packages
 
@@ -178,6 +179,22 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
         assert abs(turned(found(), truth)) < 0.04
     for one in subscriptions:
         robot.node.destroy_subscription(one)
+
+
+@pytest.mark.slow
+def test_goals_from_another_process_end_as_they_should(robot: StockNode) -> None:
+    """A small version of ``vinesim bench ros``: one goal to its end, one cancelled, one preempted; no handle is kept."""
+    done = subprocess.run(
+        [sys.executable, "-m", "vinesim.bench.goal_sender", "--goals", "1", "--cancels", "1", "--preempts", "1"],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert sorted(row["kind"] for row in rows) == ["cancel", "end", "goal", "preempt"]
+    assert all(row["right"] for row in rows if row["kind"] != "end"), rows
+    assert rows[-1]["known"] == 0
+    for row in action_rows(rows):
+        assert row.ratio is None or row.ratio >= 1.0, row
 
 
 # ---------------------------------------------------------------- the folder ros/
