@@ -10,8 +10,8 @@ import logging
 import pathlib
 import threading
 import time as wall
-from collections.abc import Iterable
-from typing import Self
+from collections.abc import Iterable, Mapping
+from typing import Any, Self
 
 import rclpy
 import rclpy.node
@@ -42,10 +42,11 @@ class Node:
     """
 
     def __init__(
-        self, name: str, namespace: str, topics: Iterable[str], params_file: pathlib.Path | None = None
-    ) -> None:
-        """``topics``: names given by the user, checked before anything starts; ``params_file``: values of parameters
-        (YAML, as ``--params-file`` of ROS 2 takes it)."""
+        self, name: str, namespace: str, topics: Iterable[str], params_file: pathlib.Path | None = None,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        """``topics``: names given by the user, checked before anything starts. ``params_file``: values of parameters
+        (YAML, as ``--params-file`` of ROS 2 takes it); ``parameters``: those that were set in an earlier run."""
         try:
             validate_node_name(name)
             validate_namespace(f"/{namespace}" if namespace else "/")
@@ -62,9 +63,9 @@ class Node:
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         try:
             self._node = self._create(name, namespace, params_file)
-            self._parameters = Parameters(self._node)
+            self._parameters = Parameters(self._node, parameters)
             self._open()
-            self._parameters.apply_initial()
+            self._parameters.apply()
         except BaseException:
             self._context.shutdown()
             raise
@@ -107,6 +108,11 @@ class Node:
         if not topics:
             raise ValueError(f"no topic {family!r}; there are: {', '.join(sorted(self._topics))}")
         return any(topic.subscription_count for topic in topics)
+
+    @property
+    def set_parameters(self) -> dict[str, Any]:
+        """Values of the parameters that were ever set, by name; another object after each change."""
+        return self._parameters.set_by_user
 
     @property
     def sent(self) -> dict[str, int]:
