@@ -41,7 +41,8 @@ class RobotNode(Node):
     ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
     sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none. All topics but /clock
     and /diagnostics stand under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether
-    this node may publish it, which one node of a ROS domain does. ``parameters``: values set in an earlier run.
+    this node may publish it, which one node of a ROS domain does. ``params_file``,
+    ``parameters``: see :class:`Node`.
     """
 
     def __init__(
