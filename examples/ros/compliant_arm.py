@@ -29,7 +29,7 @@ class CompliantArm(Node):
 
     def take(self, message: JointState) -> None:
         """Soften the arm at the first message that comes with the controller there; then watch its joints."""
-        places = dict(zip(message.name, message.position))
+        places = dict(zip(message.name, message.position, strict=True))
         here = [places[joint] for joint in self.joints]
         if not self.equilibrium:
             if all(topic.get_subscription_count() for topic in self.topics.values()):
@@ -40,7 +40,7 @@ class CompliantArm(Node):
                     self.topics[what].publish(Float64MultiArray(data=values))
                 print("soft", flush=True)
             return
-        away, joint = max((abs(a - b), name) for a, b, name in zip(here, self.equilibrium, self.joints))
+        away, joint = max((abs(a - b), name) for a, b, name in zip(here, self.equilibrium, self.joints, strict=True))
         if away > PUSHED and not self.is_pushed:
             print(f"{joint} gives way by {away:.3f} rad", flush=True)
         elif away < BACK and self.is_pushed:

@@ -164,7 +164,7 @@ def test_a_parameter_file_counts_from_the_start(tmp_path):
         assert node.environment_rate == 2.0
         assert sensors._parameters["cam.jpeg_quality"] == 50
     file.write_text("/**: {ros__parameters: {publish_truth: 3}}\n")
-    with pytest.raises(ValueError, match="publish_truth.*expecting type"):
+    with pytest.raises(ValueError, match=r"publish_truth.*expecting type"):
         RobotNode("r", "<robot name='r'/>", params_file=file)
     file.write_text("here: there: nowhere\n")
     with pytest.raises(ValueError, match=r"parameters\.yaml is no ROS 2 parameter file") as refused:

@@ -159,7 +159,7 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
         return yaw(future.result().state.pose.orientation)
 
     with example("localise.py", "vinebot") as printed:
-        wait_until(lambda: own and others and "odom" not in own[-1], lambda: (printed(), robot.spin(0.05)), "frames")
+        wait_until(lambda: own and others and "odom" not in own[-1], lambda: (printed(), robot.spin(0.05)), "tf")
         before, start = true_yaw(), yaw(odometry[-1].pose.pose.orientation)
         drive = driver(robot)
 
@@ -175,7 +175,7 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
         truth = turned(true_yaw(), before)
         # what was sent while it turned may still wait; then both hold
         wait_until(lambda: abs(turned(found(), truth)) < 0.04, lambda: drive(0.0, 0.0), f"a turn of {truth:.2f} rad")
-        wait_until(lambda: abs(counted() - truth / (1.0 - SLIP)) < 0.04, lambda: drive(0.0, 0.0), "odometry, slipping")
+        wait_until(lambda: abs(counted() - truth / (1.0 - SLIP)) < 0.04, lambda: drive(0.0, 0.0), "odometry")
         assert abs(turned(found(), truth)) < 0.04
     for one in subscriptions:
         robot.node.destroy_subscription(one)

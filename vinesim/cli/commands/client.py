@@ -72,7 +72,8 @@ Reach = Annotated[
 def client(
     ctx: typer.Context, role: Role = "robot", name: Name = None, connect: Server = None, tls: Certificates = None,
     scene: Scene = "demo", seed: Seed = None, robot: Robots = None, spawn: Spawn = 0, pose: StartPose = None,
-    approach: Approach = 0.0, namespace: Namespace = "", params_file: ParamsFile = None, ros: Ros = True, push: Push = None,
+    approach: Approach = 0.0, namespace: Namespace = "", params_file: ParamsFile = None, ros: Ros = True,
+    push: Push = None,
     job: Job = None, walk: Walk = None, reach: Reach = None, height: Height = 1.75, watch: Watch = None,
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",

@@ -31,7 +31,8 @@ class RobotProcesses:
 
     def __init__(
         self, name: str, scene: Scene, model: Model, description: RobotDescription, *, namespace: str = "",
-        params_file: pathlib.Path | None = None, ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
+        params_file: pathlib.Path | None = None,
+        ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
         renderer: str = "warp", device: str = "cpu",
     ) -> None:  # fmt: skip
         """``clock``: may publish /clock, as one node of a ROS domain does; ``params_file``: ROS parameters of the
