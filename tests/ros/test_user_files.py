@@ -183,7 +183,7 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
 
 @pytest.mark.slow
 def test_goals_from_another_process_end_as_they_should(robot: StockNode) -> None:
-    """A small version of ``vinesim bench ros``: one goal to its end, one cancelled, one preempted; no handle is kept."""
+    """A small version of ``vinesim bench ros``: one goal to its end, one cancelled, one preempted; none is kept."""
     done = subprocess.run(
         [sys.executable, "-m", "vinesim.bench.goal_sender", "--goals", "1", "--cancels", "1", "--preempts", "1"],
         capture_output=True, text=True, timeout=300, check=False,
