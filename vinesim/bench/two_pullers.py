@@ -138,8 +138,8 @@ def run_client(connect: str, name: str, seconds: float, out: str) -> None:
                 sys.stdout.flush()
     finally:
         bus.close()
-    names = (field.name for field in dataclasses.fields(Seen))
-    np.savez(out, **{name: np.array(column) for name, column in zip(names, zip(*rows, strict=True), strict=True)})
+    clock, way, owners, held, alone = map(np.array, zip(*rows, strict=True))
+    np.savez(out, clock=clock, way=way, owner=owners, held=held, alone=alone)
 
 
 # ---------------------------------------------------------------- both
@@ -163,12 +163,13 @@ def run_two_pullers(seconds: float = SECONDS, protocol: str = "tcp") -> tuple[fl
         watchdog = threading.Timer(START, lambda: [person.kill() for person in people])
         watchdog.start()
         try:
-            if any(person.stdout.readline() != "met\n" for person in people):
+            pipes = [(person.stdout, person.stdin) for person in people if person.stdout and person.stdin]
+            if any(said.readline() != "met\n" for said, _ in pipes):
                 raise RuntimeError(f"the clients did not meet within {START:.0f} s")
             begin = time.monotonic() + 1.0
-            for person in people:
-                person.stdin.write(f"{begin}\n")
-                person.stdin.flush()
+            for _, say in pipes:
+                say.write(f"{begin}\n")
+                say.flush()
             for person in people:
                 person.wait(seconds + START)
             if missing := [name for name, file in files.items() if not file.exists()]:
