@@ -126,6 +126,17 @@ def test_a_robot_without_truth_and_bad_values():
             assert reason, (name, value)
             assert "\n" not in reason
         assert node.environment_rate == 20.0
+        kept = node.set_parameters
+    assert kept == {"publish_map_to_odom": False, "publish_truth": True, "environment_rate": 20.0}
+    kept |= {"publish_truth": False}
+    for one in heard.values():
+        one.clear()
+    with RobotNode("r", "<robot name='r'/>", namespace="space", parameters=kept) as node, StockNode() as peer:
+        node.publish_environment_static(("pole_0",), REST[None])
+        peer.node.create_subscription(TFMessage, "space/tf", heard["tf"].append, 10)
+        peer.node.create_subscription(TFMessage, "space/tf_environment_static", heard["poles"].append, latched)
+        wait_until(lambda: heard["tf"] and heard["poles"], tick, "topics of a node that was started again")
+        assert (parents(), len(heard["poles"][-1].transforms), node.environment_rate) == (["odom"], 0, 20.0)
 
 
 def test_depth_labels_and_rates_of_sensors():

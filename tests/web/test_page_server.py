@@ -30,8 +30,11 @@ class CountingWorld:
     def state(self, since):
         return (self.tick, str(self.tick).encode()) if self.tick > since else None
 
-    def view(self, pose):
-        self.poses.append(pose)
+    def take(self, page, said):
+        self.poses.append(list(said.view))
+
+    def leave(self, page):
+        pass
 
 
 @pytest.fixture
@@ -93,6 +96,9 @@ def test_a_page_that_stalls_gets_no_more_than_the_window_and_then_the_newest_sta
         json.dumps({"drawn": 1, "view": [1e9, 0, 0, 0, 0, 0, 1]}),
         json.dumps({"drawn": 1, "view": [0, 0, 0, 0, 0, 0, 0]}),
         '{"drawn": 1, "view": [NaN, 0, 0, 0, 0, 0, 1]}', '{"drawn": 1e999, "view": [0, 0, 0, 0, 0, 0, 1]}',
+        json.dumps({"drawn": 1, "view": HERE, "person": {"head": HERE, "left": {"pose": HERE, "closed": 1}}}),
+        json.dumps({"drawn": 1, "view": HERE, "person": {"head": [0.0] * 7}}),
+        json.dumps({"drawn": 1, "view": HERE, "more": 1}),
         "[" * 3000,
     ],
 )  # fmt: skip

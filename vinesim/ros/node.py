@@ -9,8 +9,8 @@ from __future__ import annotations
 import logging
 import threading
 import time as wall
-from collections.abc import Iterable
-from typing import Self
+from collections.abc import Iterable, Mapping
+from typing import Any, Self
 
 import rclpy
 from rclpy.context import Context
@@ -39,8 +39,11 @@ class Node:
     for a name that ROS does not allow; each with one line of text. A context: :meth:`close` at its end.
     """
 
-    def __init__(self, name: str, namespace: str, topics: Iterable[str]) -> None:
-        """``topics``: names given by the user, checked before anything starts. :meth:`_start` starts the thread."""
+    def __init__(
+        self, name: str, namespace: str, topics: Iterable[str], parameters: Mapping[str, Any] | None = None
+    ) -> None:
+        """``topics``: names given by the user, checked before anything starts. ``parameters``: values that were set
+        in an earlier run of the node."""
         try:
             validate_node_name(name)
             validate_namespace(f"/{namespace}" if namespace else "/")
@@ -57,8 +60,9 @@ class Node:
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         try:
             self._node = rclpy.create_node(name, context=self._context, namespace=namespace or None)
-            self._parameters = Parameters(self._node)
+            self._parameters = Parameters(self._node, parameters)
             self._open()
+            self._parameters.apply()
         except BaseException:
             self._context.shutdown()
             raise
@@ -92,6 +96,11 @@ class Node:
         if not topics:
             raise ValueError(f"no topic {family!r}; there are: {', '.join(sorted(self._topics))}")
         return any(topic.subscription_count for topic in topics)
+
+    @property
+    def set_parameters(self) -> dict[str, Any]:
+        """Values of the parameters that were ever set, by name; another object after each change."""
+        return self._parameters.set_by_user
 
     @property
     def sent(self) -> dict[str, int]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import json
 import logging
 import threading
 from collections.abc import Callable
@@ -19,12 +18,13 @@ from aiohttp import WSMsgType, web
 from vinesim.errors import UsageError
 from vinesim.web import page_files
 from vinesim.web.page_files import PAGE
+from vinesim.web.page_input import PageInput, decode_input
 
 log = logging.getLogger(__name__)
 
 WINDOW = 2
 """States in flight to one page. Without a limit a page on a busy machine was 0.4 to 1 s behind."""
-_MAX_INPUT = 4096
+_MAX_INPUT = 8192
 """Longest message of a page [B]."""
 
 
@@ -43,8 +43,12 @@ class World(Protocol):
         """Tick and message of the newest state: what has moved after the tick ``since``; None: nothing is new."""
         ...
 
-    def view(self, pose: list[float]) -> None:
-        """The eyes of the page are at ``pose`` [7] m, 1 now: x forward, z up."""
+    def take(self, page: int, said: PageInput) -> None:
+        """What a page has sent; pages are counted from 0."""
+        ...
+
+    def leave(self, page: int) -> None:
+        """A page is gone."""
         ...
 
 
@@ -56,6 +60,7 @@ class PageServer:
         page_files.check()
         self._world, self._host, self._asked = world, host, port
         self.port = 0
+        self._pages = 0
         self.states_sent = 0
         self.refused = 0
         """Messages of pages that were not understood."""
@@ -144,7 +149,8 @@ class PageServer:
         self._fresh.add(fresh)
         fresh.set()
         flight: collections.deque[int] = collections.deque()
-        reader = asyncio.ensure_future(self._read(socket, flight, fresh))
+        page, self._pages = self._pages, self._pages + 1
+        reader = asyncio.ensure_future(self._read(page, socket, flight, fresh))
         tick = -1
         try:
             while not (reader.done() or self._stopping is None or self._stopping.is_set()):
@@ -161,36 +167,24 @@ class PageServer:
         finally:
             self._fresh.discard(fresh)
             reader.cancel()
+            self._world.leave(page)
             await socket.close()
         return socket
 
     async def _read(
-        self, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
+        self, page: int, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
     ) -> None:  # fmt: skip
         """Take what a page sends; ``flight`` are the ticks of the states that it has not drawn yet."""
         async for message in socket:
-            if message.type is not WSMsgType.TEXT or (said := _said(message.data)) is None:
+            if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
                 self.refused += 1
                 log.warning("a page sent what is no message of a page: dropped (%d so far)", self.refused)
                 continue
-            drawn, pose = said
-            while flight and flight[0] <= drawn:
+            while flight and flight[0] <= said.drawn:
                 flight.popleft()
-            self._world.view(pose)
+            self._world.take(page, said)
             fresh.set()
         fresh.set()
-
-
-def _said(text: str) -> tuple[int, list[float]] | None:
-    """Tick and pose [7] of ``{"drawn": tick, "view": pose}``, or None if it is no such message."""
-    try:
-        message = json.loads(text)
-        drawn, pose = int(message["drawn"]), [float(value) for value in message["view"]]
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-        return None
-    square = sum(value * value for value in pose[3:])
-    is_pose = len(pose) == 7 and all(abs(value) < 1e5 for value in pose) and abs(square - 1.0) < 1e-2
-    return (drawn, pose) if is_pose else None
 
 
 async def _index(_: web.Request) -> web.FileResponse:

@@ -75,6 +75,7 @@ class RosProcess:
         """[topic] messages of steps that found no room on the way to the process."""
         body_sensors = {*config.imus, *config.wrenches}
         self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
+        self._parameters = config.parameters
         self.worker = WorkerProcess(
             f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
             lambda context: RosChannel(config, context), self._receive,
@@ -179,6 +180,8 @@ class RosProcess:
             self._simulation.put(value)
         elif kind == "statistics":
             self._sent, self._dropped = value["sent"], value["dropped"]
+        elif kind == "parameters":
+            self._parameters.update(value)
         elif kind == "restarted":
             self._is_restarted = True
             self._sent_before.update(self._sent)

@@ -82,6 +82,7 @@ class SensorProcess:
             device, wind=wind_of(scene),
         )  # fmt: skip
         self._frames = tuple(config.sensor_frames.values())
+        self._parameters = config.parameters
         self.worker = WorkerProcess(
             f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
             lambda context: SensorChannel(config, context), self._receive, rehearsal=SENSOR_REHEARSAL,
@@ -174,6 +175,8 @@ class SensorProcess:
                 log.info("the sensors of %s are not ready, awaited: %s", self.name, ", ".join(value))
         elif kind == "statistics":
             self._counts = value
+        elif kind == "parameters":
+            self._parameters.update(value)
         elif kind == "restarted":
             for what, counts in self._counts.items():
                 self._counts_before.setdefault(what, collections.Counter()).update(counts)
