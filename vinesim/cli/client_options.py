@@ -71,6 +71,8 @@ class ClientOptions:
     tick_log: pathlib.Path | None
     page: int | None = None
     """Port of the page; 0: any that is free; None: no page."""
+    page_lan: bool = False
+    """Whether other machines of the network may open the page."""
 
 
 def check_role(role: str, given: Collection[str]) -> None:
@@ -93,6 +95,8 @@ def check_status(status: str) -> None:
 def check_options(options: ClientOptions) -> None:
     """Refuse what can be refused before anything is built: :class:`UsageError`, or DeviceError for a missing device."""
     check_status(options.status)
+    if options.page_lan and options.page is None:
+        raise UsageError("--page-lan without a page: give --page PORT, too")
     if options.tls is not None and options.connect is None:
         raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7447")
     if options.params_file is not None and not options.params_file.is_file():

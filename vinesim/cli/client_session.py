@@ -117,7 +117,16 @@ class ClientSession:
         from vinesim.web.page_server import PageServer
 
         world = PageWorld(client, person)
-        server = self.enter(PageServer(world, self.options.page))
+        if self.options.page_lan:
+            from vinesim.client.page_access import network_access, print_code
+
+            access = network_access()
+            server = self.enter(
+                PageServer(world, self.options.page, access.host, tls=access.tls, token=access.token)
+            )  # fmt: skip
+            print_code(server.address)
+        else:
+            server = self.enter(PageServer(world, self.options.page))
         print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
         client.post_step.append(lambda _: world.collect(server))
 
