@@ -12,7 +12,7 @@ ROLES = ("robot", "human", "spectator")
 
 ROLES_OF_OPTION = {
     **dict.fromkeys(("robot", "approach", "namespace", "params_file", "ros", "push", "job", "watch"), ("robot",)),
-    **dict.fromkeys(("walk", "reach", "height"), ("human",)),
+    **dict.fromkeys(("walk", "reach", "height", "gestures"), ("human",)),
     "jitter_buffer": ("robot", "human"),
     "sensor_hz": ("robot", "spectator"),
     "renderer": ("robot", "spectator"),
@@ -73,6 +73,8 @@ class ClientOptions:
     """Port of the page; 0: any that is free; None: no page."""
     page_lan: bool = False
     """Whether other machines of the network may open the page."""
+    gestures: pathlib.Path | None = None
+    """File of a person's own finger poses."""
 
 
 def check_role(role: str, given: Collection[str]) -> None:

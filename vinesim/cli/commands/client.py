@@ -58,6 +58,9 @@ Page = Annotated[
 PageLan = Annotated[
     bool, typer.Option("--page-lan", help="Let other machines of the network open the page, by https with a token.")
 ]
+OwnGestures = Annotated[
+    pathlib.Path | None, typer.Option("--gestures", help="Of a human: TOML file of finger poses for the buttons.")
+]
 # what the clients of a demo and of a benchmark are told to do
 Push = Annotated[int | None, typer.Option(hidden=True, help="Of a robot: reach for this bunch and push it repeatedly.")]
 Watch = Annotated[
@@ -81,7 +84,7 @@ def client(
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
     sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,
-    page_lan: PageLan = False,
+    page_lan: PageLan = False, gestures: OwnGestures = None,
 ) -> None:  # fmt: skip
     """Join the vineyard as one actor, with a simulation of its own.
 
