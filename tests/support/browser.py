@@ -56,9 +56,12 @@ class Page:
                 assert "error" not in answer, f"{method}: {answer['error']}"
                 return answer["result"]
 
-    def open(self, address: str) -> None:
-        """Go to an address."""
+    def open(self, address: str, *, before: str = "") -> None:
+        """Go to an address; the script ``before`` runs before those of the page."""
         self.call("Runtime.enable")
+        if before:
+            self.call("Page.enable")
+            self.call("Page.addScriptToEvaluateOnNewDocument", source=before)
         self.call("Page.navigate", url=address)
 
     def run(self, script: str) -> Any:

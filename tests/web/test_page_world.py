@@ -10,6 +10,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 from vinesim.web.array_message import decode
+from vinesim.web.page_input import PageInput
 
 
 class OnePage:
@@ -118,6 +119,12 @@ def test_a_picked_bunch_becomes_a_rigid_body_of_the_page(shown):
 
 def test_the_eyes_of_a_spectator_follow_the_page(shown):
     client, world = shown
-    world.view([4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0])
+    here, there = (4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0)
+    world.take(0, PageInput(1, here))
+    world.take(1, PageInput(1, there))
     client.tick()
-    assert client.pose.tolist() == [4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0]
+    assert tuple(client.pose) == here, "the first page leads"
+    world.leave(0)
+    world.take(1, PageInput(1, there))
+    client.tick()
+    assert tuple(client.pose) == there

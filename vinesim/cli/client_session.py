@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
 
 from vinesim import allocator
+from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.cli.signals import stop_at_signals
 from vinesim.client.client import Client
@@ -106,17 +107,26 @@ class ClientSession:
         client.trace = start_trace(client, self.model, bunch)
         return client.trace
 
-    def show_page(self, client: Client) -> None:
-        """Show the vineyard in browsers until the session ends, if ``--page`` is given; a spectator's eyes are where
-        the newest page looks from."""
+    def show_page(self, client: Client, person: TrackedHuman | None = None) -> None:
+        """Show the vineyard in browsers until the session ends, if ``--page`` is given. The first page moves a
+        spectator's eyes, or the ``person``."""
         if self.options.page is None:
             return
         page_files.check()
         from vinesim.client.page_world import PageWorld
         from vinesim.web.page_server import PageServer
 
-        world = PageWorld(client)
-        server = self.enter(PageServer(world, self.options.page))
+        world = PageWorld(client, person)
+        if self.options.page_lan:
+            from vinesim.client.page_access import network_access, print_code
+
+            access = network_access()
+            server = self.enter(
+                PageServer(world, self.options.page, access.host, tls=access.tls, token=access.token)
+            )  # fmt: skip
+            print_code(server.address)
+        else:
+            server = self.enter(PageServer(world, self.options.page))
         print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
         client.post_step.append(lambda _: world.collect(server))
 

@@ -237,11 +237,13 @@ class Client:
         """Remove a local human who is not this client's own actor, between steps; the bus is the caller's to close."""
         self.physics.remove_human(name)
         del self.humans[name], self.replicators[name]
-        for share in self.replicators.values():
-            share.local_actors = share.local_actors - {name}
+        self._share_client()
 
     def _add_replicator(self, name: str, replicator: Replicator) -> None:
         self.replicators[name] = replicator
+        self._share_client()
+
+    def _share_client(self) -> None:
         for own in self.replicators.values():
             own.share_client(other for other in self.replicators.values() if other is not own)
 

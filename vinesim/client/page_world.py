@@ -7,15 +7,18 @@ from typing import Any
 
 import numpy as np
 
+from vinesim.avatar.gestures import OPEN_HAND
+from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator, follow_view
 from vinesim.physics.plants.sway import Sway
-from vinesim.scene.values import Snapshot
+from vinesim.scene.values import Haptic, Snapshot
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.static_primitives import row_layout
 from vinesim.sensors.scheduler import load_kernels
 from vinesim.web import array_message
+from vinesim.web.page_input import PageInput, TrackedPerson
 from vinesim.web.page_server import PageServer
 
 GRASS = 25.0
@@ -31,8 +34,9 @@ class PageWorld:
     tick each tree has last moved; a page is sent the trees that have moved since the last state that was sent to it.
     """
 
-    def __init__(self, client: Client) -> None:
-        self._client = client
+    def __init__(self, client: Client, person: TrackedHuman | None = None) -> None:
+        """``person``: the source of the client's own human, whom the first page moves."""
+        self._client, self._person = client, person
         self._at_rest = client.physics.snapshot().body_q.copy()
         self._moved_at = np.full(len(client.model.tree_first), -1)
         """[tree] tick"""
@@ -43,8 +47,11 @@ class PageWorld:
         self._snapshot: Snapshot | None = None
         self._rigid_version, self._rigid = 0, b""
         self._visuals: tuple[Any, ...] | None = None
-        self.pose: list[float] | None = None
-        """Where the newest page looks from [7] m, 1: x forward, z up; None while there is none."""
+        self._driver: int | None = None
+        """The page that moves the spectator's eyes or the person: the first that sends anything."""
+        self._eyes: np.ndarray | None = None
+        self._haptics: dict[str, Haptic] = {}
+        """Strongest vibration of each hand since the last state."""
 
     # ------------------------------------------------------------------ in the client's loop
 
@@ -52,8 +59,12 @@ class PageWorld:
         """After a step: note what has moved, take a snapshot if a page looks, and lead a spectator's eyes there."""
         physics = self._client.physics
         self._moved_at[physics.plants.awake] = physics.tick
-        if self.pose is not None and isinstance(self._client, Spectator):
-            self._client.pose = np.array(self.pose)
+        if self._eyes is not None and isinstance(self._client, Spectator):
+            self._client.pose = self._eyes
+        if self._person is not None:
+            for haptic in self._client.humans[self._client.name].haptics:
+                if (before := self._haptics.get(haptic.hand)) is None or before.amplitude < haptic.amplitude:
+                    self._haptics[haptic.hand] = haptic
         if self._sway is None or not server.has_viewers:
             return
         snapshot = physics.snapshot()
@@ -82,6 +93,9 @@ class PageWorld:
                 "bodies": len(model.body_mass), "dt": self._client.physics.dt,
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
+                "person": None if self._person is None else self._client.name,
+                "gestures": {} if self._person is None else dict(self._person.gestures.poses),
+                "buttons": {} if self._person is None else dict(self._person.gestures.buttons),
             },
             _columns(primitives, slice(0, primitives.plant_count))
             | _clusters(primitives, slice(0, len(primitives.cluster_first) - len(primitives.rigid_clusters)))
@@ -105,8 +119,12 @@ class PageWorld:
             self._lay_out_rigid(self._primitives, snapshot)
         body = self._bodies(np.flatnonzero(self._moved_at > since))
         pose, rigid = snapshot.body_q[body], np.asarray(snapshot.visual_q).reshape(-1, 7)
+        haptics, self._haptics = self._haptics, {}
         state = array_message.encode(
-            {"tick": snapshot.tick, "time": snapshot.time, "rigid": self._rigid_version},
+            {
+                "tick": snapshot.tick, "time": snapshot.time, "rigid": self._rigid_version,
+                "haptics": {hand: [one.amplitude, one.duration] for hand, one in haptics.items()},
+            },
             {
                 "body": body.astype(np.uint32), "place": pose[:, :3].astype(np.float32), "turn": _turns(pose),
                 "rigid_place": rigid[:, :3].astype(np.float32), "rigid_turn": _turns(rigid),
@@ -125,9 +143,20 @@ class PageWorld:
             _columns(primitives, rows) | _clusters(primitives, clusters, primitives.plant_count),
         )
 
-    def view(self, pose: list[float]) -> None:
-        """Take over where a page looks from."""
-        self.pose = pose
+    def take(self, page: int, said: PageInput) -> None:
+        """Take over where a page looks from and what its person does; only the first page's."""
+        if self._driver is None:
+            self._driver = page
+        if page != self._driver:
+            return
+        self._eyes = np.array(said.view)
+        if self._person is not None and said.person is not None:
+            self._person.take(_tracked(said.person))
+
+    def leave(self, page: int) -> None:
+        """A page is gone: another one may move the person."""
+        if page == self._driver:
+            self._driver = None
 
     def _bodies(self, trees: np.ndarray) -> np.ndarray:
         """Bodies of some trees, one tree after the other."""
@@ -142,7 +171,18 @@ class PageWorld:
             return client.pose
         if client.robots:
             return follow_view(client.physics.rigid.base_state(next(iter(client.robots)))[0])
-        return follow_view(client.humans[client.name].pose.points[0])
+        human = client.humans[client.name].pose
+        return human.head if self._person is not None else follow_view(human.root)
+
+
+def _tracked(person: TrackedPerson) -> TrackedPoints:
+    """A page's person as its avatar takes it."""
+    hands = person.left, person.right
+    left, right = (None if hand is None else np.array(hand.pose) for hand in hands)
+    return TrackedPoints(
+        np.array(person.head), left, right, (bool(hands[0] and hands[0].closed), bool(hands[1] and hands[1].closed)),
+        (OPEN_HAND if hands[0] is None else hands[0].fingers, OPEN_HAND if hands[1] is None else hands[1].fingers),
+    )  # fmt: skip
 
 
 def _turns(pose: np.ndarray) -> np.ndarray:

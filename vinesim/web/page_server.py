@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import collections
-import json
+import hmac
 import logging
+import ssl
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol, Self
@@ -19,12 +20,13 @@ from aiohttp import WSMsgType, web
 from vinesim.errors import UsageError
 from vinesim.web import page_files
 from vinesim.web.page_files import PAGE
+from vinesim.web.page_input import PageInput, decode_input
 
 log = logging.getLogger(__name__)
 
 WINDOW = 2
 """States in flight to one page. Without a limit a page on a busy machine was 0.4 to 1 s behind."""
-_MAX_INPUT = 4096
+_MAX_INPUT = 8192
 """Longest message of a page [B]."""
 
 
@@ -43,19 +45,31 @@ class World(Protocol):
         """Tick and message of the newest state: what has moved after the tick ``since``; None: nothing is new."""
         ...
 
-    def view(self, pose: list[float]) -> None:
-        """The eyes of the page are at ``pose`` [7] m, 1 now: x forward, z up."""
+    def take(self, page: int, said: PageInput) -> None:
+        """What a page has sent; pages are counted from 0."""
+        ...
+
+    def leave(self, page: int) -> None:
+        """A page is gone."""
         ...
 
 
 class PageServer:
     """A context: the page is served until it is left."""
 
-    def __init__(self, world: World, port: int = 0, host: str = "127.0.0.1") -> None:
-        """``port`` 0: any that is free. Raises :class:`UsageError` if the page lacks anything or the port is taken."""
+    def __init__(
+        self, world: World, port: int = 0, host: str = "127.0.0.1", *, tls: ssl.SSLContext | None = None,
+        token: str | None = None,
+    ) -> None:  # fmt: skip
+        """``port`` 0: any that is free; ``tls``: by https; ``token``: only who has it in the address is let in.
+
+        Raises :class:`UsageError` if the page lacks anything or the port is taken.
+        """
         page_files.check()
         self._world, self._host, self._asked = world, host, port
+        self._tls, self._token = tls, token
         self.port = 0
+        self._pages = 0
         self.states_sent = 0
         self.refused = 0
         """Messages of pages that were not understood."""
@@ -69,7 +83,9 @@ class PageServer:
     @property
     def address(self) -> str:
         """What to type into a browser."""
-        return f"http://{self._host}:{self.port}/"
+        scheme = "http" if self._tls is None else "https"
+        token = "" if self._token is None else f"?token={self._token}"
+        return f"{scheme}://{self._host}:{self.port}/{token}"
 
     @property
     def has_viewers(self) -> bool:
@@ -105,8 +121,8 @@ class PageServer:
 
     async def _serve(self) -> None:
         self._stopping = asyncio.Event()
-        app = web.Application(middlewares=[_refuse_other_origins])
-        app.router.add_get("/", _index)
+        app = web.Application(middlewares=[_refuse_other_origins, self._refuse_without_token])
+        app.router.add_get("/", self._index)
         app.router.add_get("/scene", self._scene)
         app.router.add_get("/rigid", self._rigid)
         app.router.add_get("/state", self._state)
@@ -114,7 +130,7 @@ class PageServer:
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         try:
-            site = web.TCPSite(runner, self._host, self._asked)
+            site = web.TCPSite(runner, self._host, self._asked, ssl_context=self._tls)
             await site.start()
             self.port = runner.addresses[0][1]
             self._started.set()
@@ -130,6 +146,22 @@ class PageServer:
         for event in self._fresh:
             event.set()
 
+    @web.middleware
+    async def _refuse_without_token(
+        self, request: web.Request, handler: Callable[..., Any]
+    ) -> web.StreamResponse:  # fmt: skip
+        """The token comes in the address once, and as a cookie from then on."""
+        given = request.query.get("token", request.cookies.get("token", ""))
+        if self._token is not None and not hmac.compare_digest(given.encode(), self._token.encode()):
+            raise web.HTTPForbidden(text="open the address with its token, as the client has printed it")
+        return await handler(request)
+
+    async def _index(self, _: web.Request) -> web.FileResponse:
+        page = web.FileResponse(PAGE / "index.html", headers={"Cache-Control": "no-cache"})
+        if self._token is not None:
+            page.set_cookie("token", self._token, httponly=True, samesite="Strict", secure=self._tls is not None)
+        return page
+
     async def _scene(self, _: web.Request) -> web.Response:
         return _binary(self._world.scene())
 
@@ -144,7 +176,8 @@ class PageServer:
         self._fresh.add(fresh)
         fresh.set()
         flight: collections.deque[int] = collections.deque()
-        reader = asyncio.ensure_future(self._read(socket, flight, fresh))
+        page, self._pages = self._pages, self._pages + 1
+        reader = asyncio.ensure_future(self._read(page, socket, flight, fresh))
         tick = -1
         try:
             while not (reader.done() or self._stopping is None or self._stopping.is_set()):
@@ -161,40 +194,24 @@ class PageServer:
         finally:
             self._fresh.discard(fresh)
             reader.cancel()
+            self._world.leave(page)
             await socket.close()
         return socket
 
     async def _read(
-        self, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
+        self, page: int, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
     ) -> None:  # fmt: skip
         """Take what a page sends; ``flight`` are the ticks of the states that it has not drawn yet."""
         async for message in socket:
-            if message.type is not WSMsgType.TEXT or (said := _said(message.data)) is None:
+            if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
                 self.refused += 1
                 log.warning("a page sent what is no message of a page: dropped (%d so far)", self.refused)
                 continue
-            drawn, pose = said
-            while flight and flight[0] <= drawn:
+            while flight and flight[0] <= said.drawn:
                 flight.popleft()
-            self._world.view(pose)
+            self._world.take(page, said)
             fresh.set()
         fresh.set()
-
-
-def _said(text: str) -> tuple[int, list[float]] | None:
-    """Tick and pose [7] of ``{"drawn": tick, "view": pose}``, or None if it is no such message."""
-    try:
-        message = json.loads(text)
-        drawn, pose = int(message["drawn"]), [float(value) for value in message["view"]]
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-        return None
-    square = sum(value * value for value in pose[3:])
-    is_pose = len(pose) == 7 and all(abs(value) < 1e5 for value in pose) and abs(square - 1.0) < 1e-2
-    return (drawn, pose) if is_pose else None
-
-
-async def _index(_: web.Request) -> web.FileResponse:
-    return web.FileResponse(PAGE / "index.html", headers={"Cache-Control": "no-cache"})
 
 
 def _binary(body: bytes) -> web.Response:

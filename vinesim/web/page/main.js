@@ -1,8 +1,10 @@
-// The page of a spectator: loads the vineyard, follows its states, flies.
+// The page: loads the vineyard, follows its states; a spectator flies, a person walks, reaches and may wear a headset.
 
 import * as THREE from "three";
 import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
+import { Headset } from "./headset.js";
+import { DeskHand, WalkingEyes } from "./person.js";
 import { World } from "./world.js";
 
 const RETRY = 1000; // ms
@@ -10,7 +12,7 @@ const SHADOW_PERIOD = 250; // ms
 const element = (id) => document.getElementById(id);
 
 /** What the page has done, for those who look at it from outside. */
-const page = (window.vinesim = { states: 0, drawn: 0, tick: -1, frames: 0, calls: 0, triangles: 0, failure: null });
+const page = (window.vinesim = { states: 0, drawn: 0, tick: -1, frames: 0, calls: 0, triangles: 0, haptics: {}, failure: null });
 
 class Viewer {
   constructor(world, start) {
@@ -21,7 +23,15 @@ class Viewer {
     this.scene = new THREE.Scene();
     this.scene.add(world.group);
     this.camera = new THREE.PerspectiveCamera(60, 1, 0.03, 500);
-    this.eyes = new FlyingEyes(this.renderer.domElement, start);
+    this.isPerson = world.header.person !== null;
+    this.eyes = new (this.isPerson ? WalkingEyes : FlyingEyes)(this.renderer.domElement, start);
+    this.hand = this.isPerson ? new DeskHand(this.renderer.domElement, world.header.gestures) : null;
+    this.rig = new THREE.Group();
+    this.scene.add(this.rig);
+    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons);
+    this.offerHeadset();
+    this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
+    this.help.hidden = false;
     this.newest = null;
     this.followed = -1;
     this.shadowAt = -1e9;
@@ -32,7 +42,13 @@ class Viewer {
     addEventListener("keydown", (event) => this.press(event.code));
     this.resize();
     this.connect();
-    this.renderer.setAnimationLoop(() => this.draw());
+    this.renderer.setAnimationLoop((_, frame) => this.draw(frame));
+  }
+
+  async offerHeadset() {
+    const button = element("enter");
+    button.hidden = !await navigator.xr?.isSessionSupported("immersive-vr");
+    button.addEventListener("click", () => this.headset.enter(this.eyes.place, this.eyes.yaw).catch(fail));
   }
 
   connect() {
@@ -57,6 +73,8 @@ class Viewer {
     // poses of trees come once: those of a state that is overtaken before it is drawn count, too
     this.world.apply(state);
     this.newest = state;
+    for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
+    this.headset.pulse(state.haptics);
     if (state.rigid !== this.world.rigidVersion && !this.loading) {
       this.loading = true;
       try { this.world.setRigid(await load("rigid")); } finally { this.loading = false; }
@@ -69,7 +87,7 @@ class Viewer {
       this.followed = actors.length ? (this.followed + 2) % (actors.length + 1) - 1 : -1;
     }
     if (code === "KeyN") element("names").hidden = !element("names").hidden;
-    if (code === "KeyH") element("help").hidden = !element("help").hidden;
+    if (code === "KeyH") this.help.hidden = !this.help.hidden;
   }
 
   /** Robots and people: name, and the first body of each. */
@@ -82,7 +100,7 @@ class Viewer {
     return [...first].map(([name, k]) => ({ name, carrier: this.world.bodies + 1 + k }));
   }
 
-  draw() {
+  draw(frame) {
     const now = performance.now(), passed = (now - this.lastFrame) / 1000, seconds = Math.min(passed, 0.1);
     this.lastFrame = now;
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
@@ -92,9 +110,11 @@ class Viewer {
       const { carrier } = actors[this.followed];
       this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
     }
-    const pose = this.eyes.pose, eye = new THREE.Vector3(...pose.slice(0, 3));
+    if (this.headset.isWorn) this.headset.update(frame, seconds);
+    else this.look(this.eyes.pose);
+    const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
+    const eye = new THREE.Vector3(...pose.slice(0, 3));
     this.world.list(eye);
-    this.look(pose);
     this.renderer.info.reset();
     if (now - this.shadowAt > SHADOW_PERIOD) {
       this.shadowAt = now;
@@ -111,16 +131,31 @@ class Viewer {
       const said = `${this.world.header.scene}  ${this.newest.time.toFixed(1)} s  ${(1 / this.frame).toFixed(0)} frames/s`;
       element("state").textContent = said;
       this.newest = null;
-      if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify({ drawn: page.tick, view: pose }));
+      if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(this.message(pose)));
     }
+  }
+
+  /** What the client is told: the state that was drawn, where the eyes are, and the person's head and hands. */
+  message(pose) {
+    const message = { drawn: page.tick, view: pose };
+    if (!this.isPerson) return message;
+    if (this.headset.isWorn) return { ...message, person: { head: pose, ...this.headset.hands() } };
+    const ray = new THREE.Vector3(...this.hand.cursor, 0.5).unproject(this.camera).sub(this.camera.position).normalize();
+    const now = performance.now(), seconds = Math.min((now - (this.toldAt ?? now)) / 1000, 0.1);
+    this.toldAt = now;
+    const right = this.hand.tracked(pose.slice(0, 3), [ray.x, -ray.z, ray.y], this.eyes.yaw, seconds);
+    return { ...message, person: { head: pose, left: null, right } };
   }
 
   /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
   look(pose) {
     const turn = new THREE.Quaternion(...pose.slice(3));
     const ahead = new THREE.Vector3(1, 0, 0).applyQuaternion(turn).applyEuler(this.world.group.rotation);
+    this.rig.position.set(0, 0, 0);
+    this.rig.rotation.y = 0;
     this.camera.position.set(pose[0], pose[1], pose[2]).applyEuler(this.world.group.rotation);
     this.camera.lookAt(ahead.add(this.camera.position));
+    this.rig.updateMatrixWorld();
   }
 
   /** Names above the actors. */

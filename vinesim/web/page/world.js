@@ -38,9 +38,10 @@ export class World {
     }
     this.write(arrays, 0);
     this.plantClusters = clusters(arrays);
-    this.rigidClusters = clusters({ first: [], size: [], kind: [], bunch: [], ball: [], shape: [] });
+    this.rigidClusters = clusters({ first: [], size: [], kind: [], bunch: [], ball: [], shape: [], carrier: [] });
     this.picked = new Set();
     this.names = [];
+    this.hidden = new Set(); // carriers whose rigid primitives are not drawn
     this.rigidVersion = 0;
     this.eye = new THREE.Vector3();
     this.listedAt = null;
@@ -88,7 +89,7 @@ export class World {
     this.shadowGroup = new THREE.Group();
     this.shadowGroup.rotation.x = -Math.PI / 2;
     this.draws = MESHES.map(({ name, levels }, kind) => {
-      const side = name === "leaf" || name === "triangle" ? THREE.DoubleSide : THREE.FrontSide;
+      const side = name === "leaf" ? THREE.DoubleSide : THREE.FrontSide;
       const make = (fragmentShader) => new THREE.RawShaderMaterial({
         glslVersion: THREE.GLSL3, vertexShader: VERTEX[name], fragmentShader, uniforms, side });
       const seen = make(fragment(name)), cast = make(depthOnly(name));
@@ -132,6 +133,9 @@ export class World {
     this.write(arrays, this.plants);
     this.rigidClusters = clusters(arrays);
     this.names = header.names;
+    const own = partsBeforeEyes(this.header);
+    this.hidden = new Set();
+    this.names.forEach((name, k) => { if (own.has(name)) this.hidden.add(this.bodies + 1 + k); });
     this.rigidVersion = header.version;
     this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
     this.listedAt = null;
@@ -196,6 +200,7 @@ export class World {
     const { x, y, z } = this.eye;
     for (let k = 0; k < set.first.length; ++k) {
       if (set.bunch[k] >= 0 && this.picked.has(set.bunch[k])) continue;
+      if (this.hidden.has(set.carrier[k])) continue;
       const kind = set.kind[k], levels = this.draws[kind];
       let level = 0;
       if (fades) {
@@ -238,6 +243,11 @@ export class World {
   }
 }
 
+/** Parts of the page's own person that would be before its eyes. */
+function partsBeforeEyes({ person }) {
+  return new Set(person === null ? [] : ["head", "neck"].map((part) => `${person}/${part}`));
+}
+
 function makeSky(common) {
   const material = new THREE.RawShaderMaterial({ glslVersion: THREE.GLSL3, vertexShader: SKY_VERTEX,
     fragmentShader: SKY_FRAGMENT, uniforms: common, side: THREE.BackSide, depthWrite: false, depthFunc: THREE.LessEqualDepth });
@@ -264,5 +274,6 @@ function clusters(arrays) {
     for (let i = 0; i < size[k]; ++i) sum += Math.abs(shape[16 * (first[k] + i) + 3]);
     thickness[k] = kind[k] === 6 ? 1 : Math.max(sum / size[k], 1e-4) * (kind[k] === LEAF ? 0.6 : kind[k] === SPHEROID ? 0.8 : 1);
   }
-  return { first, size, kind, bunch, ball, thickness };
+  const carrier = Array.from(first, (row) => arrays.carrier[row]);
+  return { first, size, kind, bunch, ball, thickness, carrier };
 }
