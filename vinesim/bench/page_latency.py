@@ -57,7 +57,7 @@ async def _measure(address: str) -> dict[str, Any]:
     async with aiohttp.ClientSession() as session:
         async with session.get(address + "scene") as answer:
             body = await answer.read()
-        header, arrays = array_message.decode(body)
+        _, arrays = array_message.decode(body)
         head = [*arrays["start"].tolist()]
         head[3:] = (np.array(head[3:]) / np.linalg.norm(head[3:])).tolist()
         async with session.ws_connect(address + "state", max_msg_size=0) as socket:
