@@ -94,6 +94,8 @@ class PageWorld:
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
                 "person": None if self._person is None else self._client.name,
+                "gestures": {} if self._person is None else dict(self._person.gestures.poses),
+                "buttons": {} if self._person is None else dict(self._person.gestures.buttons),
             },
             _columns(primitives, slice(0, primitives.plant_count))
             | _clusters(primitives, slice(0, len(primitives.cluster_first) - len(primitives.rigid_clusters)))
