@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from vinesim import frames
+from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
-from vinesim.client.spectator import Spectator, standing_view
+from vinesim.client.spectator import FOLLOW_YAW, Spectator, standing_view
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
@@ -128,3 +131,17 @@ def test_the_eyes_of_a_spectator_follow_the_page(shown):
     world.take(1, PageInput(1, there))
     client.tick()
     assert tuple(client.pose) == there
+
+
+def test_the_page_of_a_robot_far_away_looks_over_its_shoulder_to_the_vines():
+    with MemoryHub().bus("visitor") as bus:
+        scene = load_scene("demo")
+        model = generate(scene)
+        start = frames.pose(np.array([-12.0, 3.0, 0.0]), frames.from_yaw(2.5))
+        client = Client(scene, model, load_description("vinebot"), bus, name="visitor", pose=start)
+        view = decode(PageWorld(client).scene())[1]["start"]
+    ahead = frames.rotate(view[3:], np.array([1.0, 0.0, 0.0]))[:2]
+    ways = model.tree_pose[:, :2] - view[:2]
+    angles = np.arccos(ways @ ahead / np.linalg.norm(ways, axis=1))
+    assert angles.min() < FOLLOW_YAW + 0.1
+    assert np.linalg.norm(view[:2] - start[:2]) < 3.0

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from vinesim import frames
 from vinesim.avatar.gestures import OPEN_HAND
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator, follow_view
 from vinesim.physics.plants.sway import Sway
+from vinesim.scene.model import Model
 from vinesim.scene.values import Haptic, Snapshot
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
@@ -23,6 +25,8 @@ from vinesim.web.page_server import PageServer
 
 GRASS = 25.0
 """Tufts a square metre: a browser draws fewer than the cameras."""
+NEAR = 3.0
+"""An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
 _TURN_STEPS = 32767
 """Steps of a component of a quaternion from 0 to 1."""
 
@@ -169,10 +173,21 @@ class PageWorld:
         client = self._client
         if isinstance(client, Spectator):
             return client.pose
-        if client.robots:
-            return follow_view(client.physics.rigid.base_state(next(iter(client.robots)))[0])
-        human = client.humans[client.name].pose
-        return human.head if self._person is not None else follow_view(human.root)
+        if self._person is not None:
+            return client.humans[client.name].pose.head
+        name = next(iter(client.robots), client.name)
+        root = client.physics.rigid.base_state(name)[0] if client.robots else client.humans[name].pose.root
+        return follow_view(_towards_plants(np.asarray(root, float), client.model))
+
+
+def _towards_plants(root: np.ndarray, model: Model) -> np.ndarray:
+    """A pose [7], turned to the nearest tree if that is far."""
+    ways = model.tree_pose[:, :2] - root[:2]
+    distances = np.linalg.norm(ways, axis=1)
+    if not len(distances) or distances.min() < NEAR:
+        return root
+    x, y = ways[np.argmin(distances)]
+    return frames.pose(root[:3], frames.from_yaw(np.arctan2(y, x)))
 
 
 def _tracked(person: TrackedPerson) -> TrackedPoints:
