@@ -145,3 +145,21 @@ def test_the_page_of_a_robot_far_away_looks_over_its_shoulder_to_the_vines():
     angles = np.arccos(ways @ ahead / np.linalg.norm(ways, axis=1))
     assert angles.min() < FOLLOW_YAW + 0.1
     assert np.linalg.norm(view[:2] - start[:2]) < 3.0
+
+
+def test_of_a_large_vineyard_a_page_loads_what_is_nearest(shown):
+    client, _ = shown
+    whole = decode(PageWorld(client).scene())[1]
+    part = decode(PageWorld(client, most=5000).scene())[1]
+    assert 4900 < len(part["material"]) <= 5000
+    np.testing.assert_array_equal(part["first"], np.cumsum(part["size"]) - part["size"])
+
+    def away(arrays):
+        return np.linalg.norm(arrays["ball"].reshape(-1, 4)[:, :3] - client.pose[:3], axis=1)
+
+    left_out = np.sort(away(whole))[len(part["size"]) :]
+    assert away(part).max() <= left_out.min() + 1e-6
+    cluster = len(part["size"]) // 2
+    same = np.flatnonzero((whole["ball"].reshape(-1, 4) == part["ball"].reshape(-1, 4)[cluster]).all(1))[0]
+    rows = [slice(int(a["first"][k]), int(a["first"][k] + a["size"][k])) for a, k in ((part, cluster), (whole, same))]
+    np.testing.assert_array_equal(part["shape"].reshape(-1, 16)[rows[0]], whole["shape"].reshape(-1, 16)[rows[1]])
