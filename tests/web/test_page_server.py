@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import ssl
 import urllib.error
 import urllib.request
 
@@ -9,6 +10,7 @@ import aiohttp
 import pytest
 
 from tests.support.waiting import wait
+from vinesim.client import page_access
 from vinesim.errors import UsageError
 from vinesim.web.page_server import WINDOW, PageServer
 
@@ -141,3 +143,21 @@ def test_viewers_come_and_go(served):
     assert not server.has_viewers
     asyncio.run(page())
     wait(lambda: not server.has_viewers, "the page is gone")
+
+
+def test_other_machines_need_the_token_and_get_https(tmp_path, monkeypatch):
+    monkeypatch.setenv("VINESIM_CACHE", str(tmp_path))
+    monkeypatch.setattr(page_access, "own_address", lambda: "127.0.0.1")
+    access = page_access.network_access()
+    trusting = ssl.create_default_context(cafile=tmp_path / "page-certificate" / "ca.pem")
+    with PageServer(CountingWorld(), 0, access.host, tls=access.tls, token=access.token) as server:
+        assert server.address.startswith(f"https://{access.host}:{server.port}/?token=")
+        plain = server.address.split("?")[0]
+        for path in ("", "scene", "main.js", "?token=", "?token=x", "state"):
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(plain + path, timeout=10, context=trusting)
+        browser = urllib.request.build_opener(
+            urllib.request.HTTPSHandler(context=trusting), urllib.request.HTTPCookieProcessor()
+        )
+        assert b"vinesim" in browser.open(server.address, timeout=10).read()
+        assert browser.open(plain + "scene", timeout=10).read() == b"scene", "a cookie holds the token from then on"

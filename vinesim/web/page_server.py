@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import collections
+import hmac
 import logging
+import ssl
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol, Self
@@ -55,10 +57,17 @@ class World(Protocol):
 class PageServer:
     """A context: the page is served until it is left."""
 
-    def __init__(self, world: World, port: int = 0, host: str = "127.0.0.1") -> None:
-        """``port`` 0: any that is free. Raises :class:`UsageError` if the page lacks anything or the port is taken."""
+    def __init__(
+        self, world: World, port: int = 0, host: str = "127.0.0.1", *, tls: ssl.SSLContext | None = None,
+        token: str | None = None,
+    ) -> None:  # fmt: skip
+        """``port`` 0: any that is free; ``tls``: by https; ``token``: only who has it in the address is let in.
+
+        Raises :class:`UsageError` if the page lacks anything or the port is taken.
+        """
         page_files.check()
         self._world, self._host, self._asked = world, host, port
+        self._tls, self._token = tls, token
         self.port = 0
         self._pages = 0
         self.states_sent = 0
@@ -74,7 +83,9 @@ class PageServer:
     @property
     def address(self) -> str:
         """What to type into a browser."""
-        return f"http://{self._host}:{self.port}/"
+        scheme = "http" if self._tls is None else "https"
+        token = "" if self._token is None else f"?token={self._token}"
+        return f"{scheme}://{self._host}:{self.port}/{token}"
 
     @property
     def has_viewers(self) -> bool:
@@ -110,8 +121,8 @@ class PageServer:
 
     async def _serve(self) -> None:
         self._stopping = asyncio.Event()
-        app = web.Application(middlewares=[_refuse_other_origins])
-        app.router.add_get("/", _index)
+        app = web.Application(middlewares=[_refuse_other_origins, self._refuse_without_token])
+        app.router.add_get("/", self._index)
         app.router.add_get("/scene", self._scene)
         app.router.add_get("/rigid", self._rigid)
         app.router.add_get("/state", self._state)
@@ -119,7 +130,7 @@ class PageServer:
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         try:
-            site = web.TCPSite(runner, self._host, self._asked)
+            site = web.TCPSite(runner, self._host, self._asked, ssl_context=self._tls)
             await site.start()
             self.port = runner.addresses[0][1]
             self._started.set()
@@ -134,6 +145,22 @@ class PageServer:
     def _wake(self) -> None:
         for event in self._fresh:
             event.set()
+
+    @web.middleware
+    async def _refuse_without_token(
+        self, request: web.Request, handler: Callable[..., Any]
+    ) -> web.StreamResponse:  # fmt: skip
+        """The token comes in the address once, and as a cookie from then on."""
+        given = request.query.get("token", request.cookies.get("token", ""))
+        if self._token is not None and not hmac.compare_digest(given.encode(), self._token.encode()):
+            raise web.HTTPForbidden(text="open the address with its token, as the client has printed it")
+        return await handler(request)
+
+    async def _index(self, _: web.Request) -> web.FileResponse:
+        page = web.FileResponse(PAGE / "index.html", headers={"Cache-Control": "no-cache"})
+        if self._token is not None:
+            page.set_cookie("token", self._token, httponly=True, samesite="Strict", secure=self._tls is not None)
+        return page
 
     async def _scene(self, _: web.Request) -> web.Response:
         return _binary(self._world.scene())
@@ -185,10 +212,6 @@ class PageServer:
             self._world.take(page, said)
             fresh.set()
         fresh.set()
-
-
-async def _index(_: web.Request) -> web.FileResponse:
-    return web.FileResponse(PAGE / "index.html", headers={"Cache-Control": "no-cache"})
 
 
 def _binary(body: bytes) -> web.Response:
