@@ -9,6 +9,7 @@ import pytest
 from tests.support.browser import browser_page
 from tests.support.waiting import wait
 from vinesim import frames
+from vinesim.avatar.gestures import GESTURES, Gestures
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
@@ -21,6 +22,7 @@ from vinesim.web.page_server import WINDOW, PageServer
 MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
 """Of one picture for one eye, and of the vineyard that a page loads [B]."""
 BUNCH = 10
+VICTORY = (1.0, 0.0, 0.0, 1.0, 1.0)
 HEADSET = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
 """Put there by tools/build_page."""
 
@@ -36,7 +38,7 @@ class LiveVineyard:
         person = None
         if is_person:
             start = frames.pose(np.array([self.bunch[0] - 0.75, self.bunch[1], 0.0]))
-            person = TrackedHuman(start, 1.75)
+            person = TrackedHuman(start, 1.75, gestures=Gestures(GESTURES, {"a": VICTORY}))
             self.client = Client(scene, model, None, bus, name="viewer", pose=start, source=person)
         else:
             eye = frames.pose(self.bunch - np.array([0.7, 0.0, 0.0]))
@@ -134,6 +136,9 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
         page.key("KeyR", down=True)
         page.key("KeyR", down=False)
         wait(lambda: physics.hand("viewer", "right").touching, "the hand reaches the bunch")
+        page.key("Digit3", down=True)
+        wait(lambda: live.client.humans["viewer"].pose.right_fingers == GESTURES["point"], "the hand points")
+        page.key("Digit3", down=True)
         page.key("Space", down=True)
         page.key("Space", down=False)
         wait(lambda: page.run("vinesim.haptics.right?.[0] > 0"), "the page is told to vibrate")
@@ -176,6 +181,9 @@ def test_a_headset_moves_head_and_hands():
         page.run("device.controllers.right.updateButtonValue('squeeze', 1), 0")
         wait(lambda: human.pose.right_closed, "the hand closes")
         assert human.pose.right_fingers[2:] == (1.0, 1.0, 1.0)
+        page.run("device.controllers.right.updateButtonValue('squeeze', 0), 0")
+        page.run("device.controllers.right.updateButtonValue('a-button', 1), 0")
+        wait(lambda: human.pose.right_fingers == VICTORY, "a button makes the person's own pose")
         page.run("device.controllers.left.updateAxes('thumbstick', 0, -1), 0")
         wait(lambda: np.dot(human.pose.head[:2] - head[:2], ahead) > 0.5, "the stick walks ahead")
         page.run("device.controllers.left.updateAxes('thumbstick', 0, 0), 0")

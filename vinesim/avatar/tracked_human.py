@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim import frames
-from vinesim.avatar.gestures import OPEN_HAND, FingerBend
+from vinesim.avatar.gestures import OPEN_HAND, FingerBend, Gestures
 from vinesim.avatar.leg_estimator import LegEstimator
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanPose
@@ -42,10 +42,17 @@ class TrackedHuman:
     """
 
     def __init__(
-        self, root: np.ndarray, height: float = 1.75, dt: float = 0.01, clock: Callable[[], float] | None = None
+        self,
+        root: np.ndarray,
+        height: float = 1.75,
+        dt: float = 0.01,
+        clock: Callable[[], float] | None = None,
+        gestures: Gestures | None = None,
     ) -> None:
         """Stands at ``root`` [7] until the first input; ``clock`` [s] measures their intervals: unless given, steps."""
         self.dt = dt
+        self.gestures = gestures or Gestures()
+        """The finger poses that this person can make."""
         self.pose = standing_pose(root, height)
         self._below_head = frames.compose(frames.inverse(self.pose.head), np.stack([self.pose.left, self.pose.right]))
         """Of hands that hang down, in the upright frame of the head."""

@@ -166,15 +166,22 @@ class GoalSender:
 
     def wait(self, seconds: float) -> None:
         """Wait in the robot's time [s], until its joint states have come so far as well."""
-        end = self.stamp + seconds
+        end = self.now() + seconds
         self.until(lambda: self.stamp >= end and self.history[-1][0] >= end, "the robot's time")
+
+    def now(self) -> float:
+        """Time of the robot's world [s], by a message of /clock that comes from now on."""
+        for _ in range(2):  # one may have waited
+            before = self.stamp
+            self.until(lambda before=before: self.stamp != before, "the robot's time")
+        return self.stamp
 
     def send(self, one: Plan) -> tuple[Any, float]:
         """Send a goal; its accepted handle, and the stamp of its start [s]."""
         from control_msgs.action import FollowJointTrajectory
         from control_msgs.msg import JointTolerance
 
-        begin = self.stamp + DELAY
+        begin = self.now() + DELAY
         goal = FollowJointTrajectory.Goal(trajectory=JointTrajectory(joint_names=one.joints))
         goal.trajectory.header.stamp.sec, goal.trajectory.header.stamp.nanosec = divmod(round(begin * 1e9), 10**9)
         for t, position, velocity in zip(one.times, one.positions, one.velocities, strict=True):

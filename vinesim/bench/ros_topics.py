@@ -33,7 +33,7 @@ TOPICS = (
     "/wrist_right_ft/wrench", "/vine/contacts",
 )  # fmt: skip
 """Topics of every step of vinebot."""
-JOINTS = 20
+JOINTS = 21
 """In a message of the stock publisher; vinebot has as many."""
 WINDOW = 20.0
 """Measured time before and after the other subscriber is stopped [s]."""

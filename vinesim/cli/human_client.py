@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from vinesim.avatar.gestures import Gestures
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions
@@ -21,14 +22,16 @@ REACH = 0.55
 def run(options: ClientOptions) -> int:
     """Be the person in front of the page, or by a script walk, reach for a bunch, hold it, pull at it, let go; until a
     signal; then write report.json; the exit code."""
+    gestures = None if options.gestures is None else Gestures.load(options.gestures)
     with ClientSession(options) as session:
         validate_bunch(session.model, options.reach)
         if options.out is not None:
             with writing(options.out):
                 options.out.mkdir(parents=True, exist_ok=True)
         start = start_pose(session.scene, session.spawn)
-        scripted = options.page is None or options.walk is not None or options.reach is not None
-        human = ScriptedHuman(start, options.height) if scripted else TrackedHuman(start, options.height)
+        human = ScriptedHuman(start, options.height)
+        if options.is_for_page:
+            human = TrackedHuman(start, options.height, gestures=gestures)
         client = Client(
             session.scene, session.model, None, session.bus(session.name), pose=start, source=human,
             height=options.height, **session.client_options(),

@@ -8,6 +8,7 @@ from typing import Any
 
 import rclpy.node
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.parameter import Parameter
 
 
@@ -20,6 +21,7 @@ class Parameters:
         self.set_by_user = dict(values or {})
         """Values of the parameters that were ever set, by name; replaced, never changed."""
         self._values: dict[str, Any] = {}
+        self._defaults: dict[str, Any] = {}
         self._changed: dict[str, Callable[[], None]] = {}
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
@@ -32,7 +34,9 @@ class Parameters:
         between: tuple[float, float] | None = None,
         changed: Callable[[], None] | None = None,
     ) -> None:
-        """Declare a parameter of the type of its ``default``: bool, int or float; a value that was set before counts.
+        """Declare a parameter of the type of its ``default``: bool, int or float.
+
+        A value that was set before counts, else that of the node's parameter file; :class:`ValueError` if that is none.
 
         ``between``: the least and the greatest value of a number. ``changed`` is called after it was set.
         """  # fmt: skip
@@ -43,15 +47,23 @@ class Parameters:
             descriptor.floating_point_range = [FloatingPointRange(from_value=between[0], to_value=between[1])]
         before = self.set_by_user
         self._values[name] = before.get(name, default)
-        self._node.declare_parameter(name, self._values[name], descriptor)
+        self._defaults[name] = default
+        try:
+            declared = self._node.declare_parameter(
+                name, self._values[name], descriptor, ignore_override=name in before
+            )
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            raise ValueError(" ".join(str(error).split())) from error
+        self._values[name] = declared.value
         self.set_by_user = before  # rclpy calls a declaration a setting, too
         if changed is not None:
             self._changed[name] = changed
 
     def apply(self) -> None:
-        """When all are declared: call what is to be called for those that were set before."""
-        for name in self.set_by_user.keys() & self._changed.keys():
-            self._changed[name]()
+        """When all are declared: call what is to be called for those that have not their defaults."""
+        for name, changed in self._changed.items():
+            if self._values[name] != self._defaults[name]:
+                changed()
 
     def __getitem__(self, name: str) -> Any:
         return self._values[name]

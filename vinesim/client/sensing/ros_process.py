@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import pathlib
 import types
 from collections.abc import Sequence
 from typing import Any, Self
@@ -37,10 +38,11 @@ class RosProcess:
     """The ROS node of one robot of the client, in a process of its own. A context: the process ends with it."""
 
     def __init__(
-        self, name: str, model: Model, description: RobotDescription, *, namespace: str = "", clock: bool = True
-    ) -> None:
+        self, name: str, model: Model, description: RobotDescription, *, namespace: str = "",
+        params_file: pathlib.Path | None = None, clock: bool = True,
+    ) -> None:  # fmt: skip
         """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock, and
-        serves simulation_interfaces."""
+        serves simulation_interfaces. ``params_file``: ROS parameters of its node."""
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
         self._sent: dict[str, int] = {}
@@ -61,7 +63,7 @@ class RosProcess:
             frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
             model.bunch_of_body(),
             description.controllers, tuple(mount.name for mount in description.imus),
-            tuple(mount.name for mount in description.wrenches),
+            tuple(mount.name for mount in description.wrenches), params_file,
         )  # fmt: skip
         self._visuals: tuple[RigidVisual, ...] | None = None
         """All rigid bodies when the list of those in the truth was made."""

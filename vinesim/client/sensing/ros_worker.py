@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import pathlib
 import queue
 import time
 from multiprocessing.connection import Connection
@@ -61,6 +62,8 @@ class RosConfig:
     controllers: tuple[ControllerSpec, ...]
     imus: tuple[str, ...]
     wrenches: tuple[str, ...]
+    params_file: pathlib.Path | None = None
+    """ROS parameters of the node."""
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Values of the node's parameters that were set; the client changes it, and each run starts with it."""
 
@@ -115,6 +118,7 @@ class RosWorker:
             ros_name(config.name), config.urdf, namespace=config.namespace, static_transforms=config.static_transforms,
             controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
             bunch_of_body=config.bunch_of_body, base=config.base, clock=config.clock,
+            params_file=config.params_file,
             parameters=config.parameters,
         )  # fmt: skip
         self._requests: queue.SimpleQueue[SimulationRequest] = queue.SimpleQueue()

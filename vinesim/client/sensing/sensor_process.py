@@ -51,6 +51,7 @@ class SensorProcess:
         description: RobotDescription,
         *,
         namespace: str = "",
+        params_file: pathlib.Path | None = None,
         ros: bool = True,
         keep_pictures: bool = False,
         sensor_hz: float | None = None,
@@ -79,7 +80,7 @@ class SensorProcess:
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
             name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer,
-            device, wind=wind_of(scene),
+            device, wind=wind_of(scene), params_file=params_file,
         )  # fmt: skip
         self._frames = tuple(config.sensor_frames.values())
         self._parameters = config.parameters

@@ -71,6 +71,8 @@ class SensorConfig:
     """Where they compute; the CPU from the next start on if a GPU fails."""
     wind: Wind | None = None
     """That of the scene."""
+    params_file: pathlib.Path | None = None
+    """ROS parameters of its node."""
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
     """Values of the node's parameters that were set; the client changes it, and each run starts with it."""
 
@@ -160,7 +162,7 @@ class SensorWorker:
             SensorNode(
                 f"{ros_name(config.name)}_sensors", namespace=config.namespace,
                 cameras=[m.name for m in description.cameras], lidars=[m.name for m in description.lidars],
-                rates=self._rates(), parameters=config.parameters,
+                rates=self._rates(), params_file=config.params_file, parameters=config.parameters,
             )
         )  # fmt: skip
 

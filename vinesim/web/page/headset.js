@@ -11,7 +11,8 @@ const FORWARD = new THREE.Quaternion(-0.5, 0.5, 0.5, 0.5);
 
 export class Headset {
   /** `rig` carries camera and controllers: the floor that the person stands on. */
-  constructor(renderer, rig, camera) {
+  constructor(renderer, rig, camera, poses) {
+    this.poses = poses; // finger poses of the buttons a and b
     this.renderer = renderer;
     this.rig = rig;
     this.turned = false;
@@ -82,9 +83,10 @@ export class Headset {
     this.sources.forEach((source, k) => {
       if (!source || !(source.handedness in hands)) return;
       const buttons = source.gamepad?.buttons ?? [], trigger = buttons[0]?.value ?? 0, grip = buttons[1]?.value ?? 0;
+      const own = buttons[4]?.pressed ? this.poses.a : buttons[5]?.pressed ? this.poses.b : undefined;
       const thumb = buttons.slice(3).some((button) => button.touched) || grip > 0.8 ? 1 : 0;
       hands[source.handedness] = { pose: worldPose(this.rays[k].matrixWorld), closed: grip > 0.5 || trigger > 0.5,
-        fingers: [thumb, trigger, grip, grip, grip] };
+        fingers: own ?? [thumb, trigger, grip, grip, grip] };
     });
     return hands;
   }

@@ -25,10 +25,10 @@ class Viewer {
     this.camera = new THREE.PerspectiveCamera(60, 1, 0.03, 500);
     this.isPerson = world.header.person !== null;
     this.eyes = new (this.isPerson ? WalkingEyes : FlyingEyes)(this.renderer.domElement, start);
-    this.hand = this.isPerson ? new DeskHand(this.renderer.domElement) : null;
+    this.hand = this.isPerson ? new DeskHand(this.renderer.domElement, world.header.gestures) : null;
     this.rig = new THREE.Group();
     this.scene.add(this.rig);
-    this.headset = new Headset(this.renderer, this.rig, this.camera);
+    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons);
     this.offerHeadset();
     this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
     this.help.hidden = false;

@@ -33,7 +33,14 @@ export class WalkingEyes extends FlyingEyes {
 
 /** The right hand of a person at a desk: it reaches to where the cursor points. */
 export class DeskHand {
-  constructor(element) {
+  /** `gestures`: finger poses by name; the digits make them, in their order. */
+  constructor(element, gestures) {
+    this.fingers = null;
+    const poses = Object.values(gestures);
+    addEventListener("keydown", (event) => {
+      const pose = event.code.startsWith("Digit") ? poses[event.code.slice(5) - 1] : undefined;
+      if (pose) this.fingers = this.fingers === pose ? null : pose;
+    });
     this.reaching = this.closed = false;
     this.distance = 0.5; // m from the eyes
     this.cursor = [0, 0]; // -1 to 1, right and up
@@ -70,6 +77,7 @@ export class DeskHand {
     const heading = this.reaching ? Math.atan2(ray[1], ray[0]) : yaw;
     const [cy, sy, cp, sp] = [Math.cos(heading / 2), Math.sin(heading / 2), Math.cos(pitch / 2), Math.sin(-pitch / 2)];
     const place = this.offset.map((value, axis) => eye[axis] + value);
-    return { pose: [...place, -sy * sp, cy * sp, sy * cp, cy * cp], closed: this.closed, fingers: this.closed ? FIST : OPEN };
+    return { pose: [...place, -sy * sp, cy * sp, sy * cp, cy * cp], closed: this.closed,
+      fingers: this.fingers ?? (this.closed ? FIST : OPEN) };
   }
 }
