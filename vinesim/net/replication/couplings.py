@@ -24,8 +24,8 @@ ARM_REACH = 2.5
 """Farthest anchor of a coupling from the base of its actor on the ground [m]: a long arm. GUESSED."""
 
 MAX_AGE = 0.2
-"""Couplings hold for so long after they arrived [s], unless newer ones do. They are springs, which stay stable when they
-are old; over a link of 100 +- 40 ms that loses 4 %, messages come up to 0.15 s apart, and 0.1 s let the bunch jump."""
+"""Couplings hold for so long after they arrived [s], unless newer ones do. They are springs, stable also when they are
+old; over a link of 100 +- 40 ms that loses 4 %, messages come up to 0.15 s apart, and 0.1 s let the bunch jump."""
 
 SPECTATOR = "spectator"
 
