@@ -323,6 +323,9 @@ def test_three_roles_join_one_server_each_in_its_own_process():
         assert sorted(server.figures()["actors"]) == ["vineyard/eva", "vineyard/guest", "vineyard/picker"]
         for client in clients.values():
             client.send_signal(signal.SIGINT)
-        for client in clients.values():
+        for name, client in clients.items():
             _, errors = client.communicate(timeout=TIMEOUT)
             assert client.returncode == 0, errors
+            assert ("in a browser: http://127.0.0.1:" in errors) == (name != "picker"), (
+                "people and spectators have a page"
+            )

@@ -12,6 +12,7 @@ import pytest
 from tests.support.contact_scenes import bar, cane
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.rigid.pair_friction import PairFriction
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.step import Physics
 from vinesim.robot.description.errors import DescriptionError
@@ -27,9 +28,13 @@ TRAY = f"""<robot name="tray"><link name="base">{INERTIAL}</link><link name="tra
 <limit lower="-1" upper="1" effort="5000" velocity="1"/></joint>GAZEBO</robot>"""
 
 
-def tray(folder: pathlib.Path, *, gazebo: str = "", contact: str = "", toml: str = "") -> pathlib.Path:
-    """A robot with a tray that tilts."""
+def tray(
+    folder: pathlib.Path, *, gazebo: str = "", contact: str = "", toml: str = "", surface: str = ""
+) -> pathlib.Path:
+    """A robot with a tray that tilts; ``surface``: material of what is seen of it."""
     file = folder / "tray.urdf"
+    seen = TRAY[TRAY.index("<origin") : TRAY.index("</collision>")]
+    contact += f'<visual>{seen}<material name="{surface}"/></visual>' if surface else ""
     file.write_text(TRAY.replace("GAZEBO", gazebo).replace("CONTACT", contact))
     group = '[groups.arm]\njoints = ["tilt"]\nstiffness = [1e6]\ndamping = [1e5]\nhome = [0.0]\n'
     (folder / "tray.toml").write_text(toml + group)
@@ -76,6 +81,41 @@ def test_a_crate_slides_on_a_tray_from_the_slope_that_its_friction_says(
 def test_a_link_without_friction_of_its_own_has_that_of_the_scene(tmp_path: pathlib.Path) -> None:
     assert not slides(tray(tmp_path), 0.7)
     assert slides(tray(tmp_path), 0.9)
+
+
+def test_a_crate_slides_on_a_tray_from_the_slope_that_their_materials_say(tmp_path: pathlib.Path) -> None:
+    """On a tray of steel as the shipped file says of plastic on steel; on one with its own coefficient by that."""
+    coefficient = float(pair_table("friction", 0.8)[Material.PLASTIC, Material.STEEL])
+    file = tray(tmp_path, surface="steel")
+    assert not slides(file, 0.8 * coefficient)
+    assert slides(file, 1.25 * coefficient)
+    assert not slides(tray(tmp_path, surface="steel", gazebo=GAZEBO), 1.25 * coefficient)
+
+
+def test_a_listed_pair_with_the_usual_coefficient_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A crate dropped and pushed: constraints that are written anew with the same coefficient are the same."""
+
+    def run() -> list[np.ndarray]:
+        model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=2)
+        model.box_pose[:] = frames.pose(np.array([[0.0, 0.0, 0.05], [0.05, 0.0, 0.3]]))
+        model.box_size[:], model.box_mass[:] = (0.4, 0.3, 0.2), 2.0
+        rigid, states = RigidWorld(model), []
+        for step in range(150):
+            rigid.mj_data.xfrc_applied[1, 0] = 12.0 if step > 100 else 0.0
+            rigid.predict()
+            rigid.integrate()
+            states.append(rigid.mj_data.qpos.copy())
+        return states
+
+    before = run()
+    monkeypatch.setattr(PairFriction, "__init__", list_all_pairs)
+    assert all((a == b).all() for a, b in zip(before, run(), strict=True))
+
+
+def list_all_pairs(friction: PairFriction, parameters: PhysicsParameters) -> None:
+    """In place of ``PairFriction.__init__``: every pair is listed, with the coefficient of all others."""
+    friction._table = np.full((len(Material), len(Material)), parameters.friction)
+    friction._is_listed = np.ones_like(friction._table, bool)
 
 
 def sliding_ratio(visual: str, own: str = "") -> float:

@@ -23,7 +23,7 @@ PROGRAMS = ("chromium", "google-chrome")
 OPTIONS = (
     "--headless", "--no-sandbox", "--no-first-run", "--disable-quic", "--disable-background-networking",
     "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--remote-debugging-port=0", "--window-size=640,480",
+    "--disable-dev-shm-usage", "--remote-debugging-port=0", "--window-size=640,480",
 )  # fmt: skip
 
 

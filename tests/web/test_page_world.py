@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from vinesim import frames
+from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
-from vinesim.client.spectator import Spectator, standing_view
+from vinesim.client.spectator import FOLLOW_YAW, Spectator, standing_view
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
@@ -128,3 +131,35 @@ def test_the_eyes_of_a_spectator_follow_the_page(shown):
     world.take(1, PageInput(1, there))
     client.tick()
     assert tuple(client.pose) == there
+
+
+def test_the_page_of_a_robot_far_away_looks_over_its_shoulder_to_the_vines():
+    with MemoryHub().bus("visitor") as bus:
+        scene = load_scene("demo")
+        model = generate(scene)
+        start = frames.pose(np.array([-12.0, 3.0, 0.0]), frames.from_yaw(2.5))
+        client = Client(scene, model, load_description("vinebot"), bus, name="visitor", pose=start)
+        view = decode(PageWorld(client).scene())[1]["start"]
+    ahead = frames.rotate(view[3:], np.array([1.0, 0.0, 0.0]))[:2]
+    ways = model.tree_pose[:, :2] - view[:2]
+    angles = np.arccos(ways @ ahead / np.linalg.norm(ways, axis=1))
+    assert angles.min() < FOLLOW_YAW + 0.1
+    assert np.linalg.norm(view[:2] - start[:2]) < 3.0
+
+
+def test_of_a_large_vineyard_a_page_loads_what_is_nearest(shown):
+    client, _ = shown
+    whole = decode(PageWorld(client).scene())[1]
+    part = decode(PageWorld(client, most=5000).scene())[1]
+    assert 4900 < len(part["material"]) <= 5000
+    np.testing.assert_array_equal(part["first"], np.cumsum(part["size"]) - part["size"])
+
+    def away(arrays):
+        return np.linalg.norm(arrays["ball"].reshape(-1, 4)[:, :3] - client.pose[:3], axis=1)
+
+    left_out = np.sort(away(whole))[len(part["size"]) :]
+    assert away(part).max() <= left_out.min() + 1e-6
+    cluster = len(part["size"]) // 2
+    same = np.flatnonzero((whole["ball"].reshape(-1, 4) == part["ball"].reshape(-1, 4)[cluster]).all(1))[0]
+    rows = [slice(int(a["first"][k]), int(a["first"][k] + a["size"][k])) for a, k in ((part, cluster), (whole, same))]
+    np.testing.assert_array_equal(part["shape"].reshape(-1, 16)[rows[0]], whole["shape"].reshape(-1, 16)[rows[1]])

@@ -121,6 +121,12 @@ def _live(rows: Sequence[str] = ()) -> Iterator[Measurement]:
     return live(rows, _announce)
 
 
+def _page() -> Iterator[Measurement]:
+    from vinesim.bench.page_latency import page
+
+    return page()
+
+
 def _ros() -> Iterator[Measurement]:
     from vinesim.bench.ros_topics import ros
 
@@ -165,6 +171,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "sensors": _sensors,
     "live": _live,
     "ros": _ros,
+    "page": _page,
     "sync": _sync,
     "link": _link,
     "traffic": _traffic,

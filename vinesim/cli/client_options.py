@@ -70,11 +70,17 @@ class ClientOptions:
     renderer: str
     tick_log: pathlib.Path | None
     page: int | None = None
-    """Port of the page; 0: any that is free; None: no page."""
+    """Port of the page; 0: any that is free; None: a free one if this client exists for its page, else no page."""
     page_lan: bool = False
     """Whether other machines of the network may open the page."""
     gestures: pathlib.Path | None = None
     """File of a person's own finger poses."""
+
+    @property
+    def is_for_page(self) -> bool:
+        """Whether it is a person without a script, or a spectator that writes no pictures: of use by its page only."""
+        is_person = self.role == "human" and self.walk is None and self.reach is None
+        return is_person or (self.role == "spectator" and self.out is None)
 
 
 def check_role(role: str, given: Collection[str]) -> None:
@@ -97,7 +103,7 @@ def check_status(status: str) -> None:
 def check_options(options: ClientOptions) -> None:
     """Refuse what can be refused before anything is built: :class:`UsageError`, or DeviceError for a missing device."""
     check_status(options.status)
-    if options.page_lan and options.page is None:
+    if options.page_lan and options.page is None and not options.is_for_page:
         raise UsageError("--page-lan without a page: give --page PORT, too")
     if options.tls is not None and options.connect is None:
         raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7447")

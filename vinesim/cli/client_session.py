@@ -108,10 +108,16 @@ class ClientSession:
         return client.trace
 
     def show_page(self, client: Client, person: TrackedHuman | None = None) -> None:
-        """Show the vineyard in browsers until the session ends, if ``--page`` is given. The first page moves a
-        spectator's eyes, or the ``person``."""
-        if self.options.page is None:
-            return
+        """Show the vineyard in browsers until the session ends, if ``--page`` is given or the client exists for its
+        page. The first page moves a spectator's eyes, or the ``person``."""
+        port = self.options.page
+        if port is None:
+            if not self.options.is_for_page:
+                return
+            if (missing := page_files.missing()) is not None:
+                print(f"no page: {missing}", file=sys.stderr, flush=True)
+                return
+            port = 0
         page_files.check()
         from vinesim.client.page_world import PageWorld
         from vinesim.web.page_server import PageServer
@@ -122,11 +128,11 @@ class ClientSession:
 
             access = network_access()
             server = self.enter(
-                PageServer(world, self.options.page, access.host, tls=access.tls, token=access.token)
+                PageServer(world, port, access.host, tls=access.tls, token=access.token)
             )  # fmt: skip
             print_code(server.address)
         else:
-            server = self.enter(PageServer(world, self.options.page))
+            server = self.enter(PageServer(world, port))
         print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
         client.post_step.append(lambda _: world.collect(server))
 

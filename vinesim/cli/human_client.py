@@ -29,9 +29,8 @@ def run(options: ClientOptions) -> int:
             with writing(options.out):
                 options.out.mkdir(parents=True, exist_ok=True)
         start = start_pose(session.scene, session.spawn)
-        scripted = options.page is None or options.walk is not None or options.reach is not None
         human = ScriptedHuman(start, options.height)
-        if not scripted:
+        if options.is_for_page:
             human = TrackedHuman(start, options.height, gestures=gestures)
         client = Client(
             session.scene, session.model, None, session.bus(session.name), pose=start, source=human,

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from vinesim import frames
 from vinesim.avatar.gestures import OPEN_HAND
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator, follow_view
 from vinesim.physics.plants.sway import Sway
+from vinesim.scene.model import Model
 from vinesim.scene.values import Haptic, Snapshot
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
@@ -23,6 +25,10 @@ from vinesim.web.page_server import PageServer
 
 GRASS = 25.0
 """Tufts a square metre: a browser draws fewer than the cameras."""
+NEAR = 3.0
+"""An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
+MAX_PRIMITIVES = 400_000
+"""Of plants and ground that a page loads: 32 MB."""
 _TURN_STEPS = 32767
 """Steps of a component of a quaternion from 0 to 1."""
 
@@ -34,9 +40,10 @@ class PageWorld:
     tick each tree has last moved; a page is sent the trees that have moved since the last state that was sent to it.
     """
 
-    def __init__(self, client: Client, person: TrackedHuman | None = None) -> None:
-        """``person``: the source of the client's own human, whom the first page moves."""
-        self._client, self._person = client, person
+    def __init__(self, client: Client, person: TrackedHuman | None = None, most: int = MAX_PRIMITIVES) -> None:
+        """``person``: the source of the client's own human, whom the first page moves; ``most``: primitives of plants
+        and ground that a page loads, those nearest to where it looks from at first."""
+        self._client, self._person, self._most = client, person, most
         self._at_rest = client.physics.snapshot().body_q.copy()
         self._moved_at = np.full(len(client.model.tree_first), -1)
         """[tree] tick"""
@@ -97,8 +104,7 @@ class PageWorld:
                 "gestures": {} if self._person is None else dict(self._person.gestures.poses),
                 "buttons": {} if self._person is None else dict(self._person.gestures.buttons),
             },
-            _columns(primitives, slice(0, primitives.plant_count))
-            | _clusters(primitives, slice(0, len(primitives.cluster_first) - len(primitives.rigid_clusters)))
+            _nearest(primitives, self._start_view()[:3], self._most)
             | {
                 "poses": self._at_rest.astype(np.float32), "outline": outline, "hull": hull,
                 "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(self._start_view(), np.float32),
@@ -169,10 +175,21 @@ class PageWorld:
         client = self._client
         if isinstance(client, Spectator):
             return client.pose
-        if client.robots:
-            return follow_view(client.physics.rigid.base_state(next(iter(client.robots)))[0])
-        human = client.humans[client.name].pose
-        return human.head if self._person is not None else follow_view(human.root)
+        if self._person is not None:
+            return client.humans[client.name].pose.head
+        name = next(iter(client.robots), client.name)
+        root = client.physics.rigid.base_state(name)[0] if client.robots else client.humans[name].pose.root
+        return follow_view(_towards_plants(np.asarray(root, float), client.model))
+
+
+def _towards_plants(root: np.ndarray, model: Model) -> np.ndarray:
+    """A pose [7], turned to the nearest tree if that is far."""
+    ways = model.tree_pose[:, :2] - root[:2]
+    distances = np.linalg.norm(ways, axis=1)
+    if not len(distances) or distances.min() < NEAR:
+        return root
+    x, y = ways[np.argmin(distances)]
+    return frames.pose(root[:3], frames.from_yaw(np.arctan2(y, x)))
 
 
 def _tracked(person: TrackedPerson) -> TrackedPoints:
@@ -201,6 +218,23 @@ def _columns(primitives: Primitives, rows: slice) -> dict[str, np.ndarray]:
         "shape": shape, "surface": surface, "material": columns["material"].astype(np.uint8),
         "carrier": columns["carrier"].astype(np.uint32),
     }  # fmt: skip
+
+
+def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> dict[str, np.ndarray]:
+    """Primitives of the clusters of plants and ground nearest to a ``place`` [3] m, at most ``most``; the clusters."""
+    count = len(primitives.cluster_first) - len(primitives.rigid_clusters)
+    clusters = _clusters(primitives, slice(0, count))
+    columns = _columns(primitives, slice(0, primitives.plant_count))
+    if primitives.plant_count <= most:
+        return columns | clusters
+    order = np.argsort(np.linalg.norm(clusters["ball"][:, :3] - place, axis=1), kind="stable")
+    kept = np.sort(order[np.cumsum(clusters["size"][order]) <= most])
+    clusters = {name: values[kept] for name, values in clusters.items()}
+    first, size = clusters["first"].astype(int), clusters["size"].astype(int)
+    start = np.cumsum(size) - size
+    rows = np.repeat(first - start, size) + np.arange(size.sum())
+    clusters["first"] = start.astype(np.uint32)
+    return {name: values[rows] for name, values in columns.items()} | clusters
 
 
 def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, np.ndarray]:

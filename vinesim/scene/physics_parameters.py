@@ -36,8 +36,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     gravity: NotNegative = 9.81
     """[m/s^2] Downwards. READ: standard gravity, 9.80665, rounded. The rest shape of plants is computed with 9.81."""
     friction: Positive = 0.8
-    """[1] Coulomb coefficient of two rigid bodies, and of a plant and anything if ``data/materials`` does not list the
-    pair. GUESSED for rubber pads, plastic crates and berries alike."""
+    """[1] Coulomb coefficient of every contact whose pair of materials ``data/materials`` does not list. GUESSED for
+    rubber pads, plastic crates and berries alike."""
     sleep: bool = True
     """Whether plants that are at rest are put to sleep. Off: every plant that was woken stays awake."""
 

@@ -53,7 +53,9 @@ SensorRate = Annotated[
 ]
 Page = Annotated[
     int | None,
-    typer.Option(min=0, max=65535, help="Show the vineyard in a browser, on this port of this machine; 0: a free one."),
+    typer.Option(
+        min=0, max=65535, help="Show the vineyard in a browser, on this port; people and spectators: on a free one."
+    ),
 ]
 PageLan = Annotated[
     bool, typer.Option("--page-lan", help="Let other machines of the network open the page, by https with a token.")
@@ -95,7 +97,7 @@ def client(
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
       vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
       vinesim client --role spectator --connect tcp/127.0.0.1:7447 --pose 2 0 1.57 --out pictures
-      vinesim client --role spectator --connect tcp/127.0.0.1:7447 --page 8080
+      vinesim client --role spectator --connect tcp/127.0.0.1:7447
       vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva
     """
     gc.disable()  # a sixth of the time of the start; the loop enables it

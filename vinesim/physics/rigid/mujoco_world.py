@@ -26,6 +26,7 @@ from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_posture import VISUAL_PARTS
 from vinesim.physics.rigid.link_sensors import LinkSensors
+from vinesim.physics.rigid.pair_friction import PairFriction
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.scene.model import Model
@@ -87,6 +88,7 @@ class WorldCore:
         self.owners: dict[int, tuple[str, str]] = {}
         """Actor and link of every MuJoCo body that can be added, removed or moved, as in :class:`RigidGeoms`."""
         self._link_sensors = LinkSensors()
+        self._pair_friction = PairFriction(parameters)
         _log_mujoco_warnings()
         self._recompile()
 
@@ -255,6 +257,7 @@ class WorldCore:
         for actor in (*self._robots.values(), *self._humans.values()):
             actor.find_indices(m, self._names)
         self._link_sensors.find_indices(m, self._robots)
+        self._pair_friction.find_materials(m)
         for human in self._humans.values():
             for hand in human.hands:
                 self._restore_grasp(hand)

@@ -174,6 +174,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         self._valid_qpos[:] = d.qpos
         # qfrc_applied is still that of the last step: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
+        self._pair_friction.apply(m, d)
         d.qfrc_applied[:] = 0.0
         # the whole forward pass after the velocity stage: single calls of its parts leave out dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
@@ -245,6 +246,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         for robot in self._robots.values():
             robot.find_indices(mj_model, self._names)
         self._link_sensors.find_indices(mj_model, self._robots)
+        self._pair_friction.find_materials(mj_model)
 
     def _stop_faulty_trees(self) -> None:
         """Stop the kinematic trees with a number that is not finite, or a rate beyond :data:`MAX_RATE`, where the step
