@@ -120,6 +120,37 @@ def test_a_killed_process_is_started_again(robot, caplog):
     ]
 
 
+def test_the_process_that_stands_by_takes_the_place_of_a_killed_one(robot, monkeypatch):
+    """It has imported all before, and has the niceness of the client until it is ready, so that it is back soon."""
+    monkeypatch.setattr(worker_process, "STANDBY_DELAY", 0.0)
+    worker = robot.sensors.worker
+    robot.run_for_pictures(1)
+    wait(lambda: worker.standby_pid, "a process that stands by")
+    other = worker.standby_pid
+    assert other is not None
+    assert other != worker.pid
+    assert os.getpriority(os.PRIO_PROCESS, other) == os.getpriority(os.PRIO_PROCESS, 0)
+    robot.kill_sensors()
+    robot.run_until(lambda: worker.pid == other, "a restart")
+    robot.run_for_pictures(2)
+
+
+def test_pictures_go_on_when_the_process_that_stands_by_is_killed(robot, monkeypatch):
+    monkeypatch.setattr(worker_process, "STANDBY_DELAY", 0.0)
+    monkeypatch.setattr(worker_process, "LONGEST_PAUSE", 0.0)
+    worker = robot.sensors.worker
+    wait(lambda: worker.standby_pid, "a process that stands by")
+    former = worker.standby_pid
+    assert former is not None
+    os.kill(former, signal.SIGKILL)
+    wait(lambda: worker.standby_pid not in (former, None), "another one")
+    assert worker.standby_pid is not None
+    os.kill(worker.standby_pid, signal.SIGKILL)
+    robot.kill_sensors()
+    robot.run_until(lambda: robot.sensors.report()["sensor_restarts"] == 1, "a restart")
+    robot.run_for_pictures(1)
+
+
 def test_pictures_go_on_after_a_process_that_hangs(robot, monkeypatch):
     robot.run_for_pictures(1)
     monkeypatch.setattr(worker_process, "HANG_TIMEOUT", 3)

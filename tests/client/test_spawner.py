@@ -19,6 +19,7 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.sidecar import encode_sidecar
+from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 
@@ -85,6 +86,55 @@ def test_no_tick_waits_for_a_robot_that_joins(vinebot):
     np.testing.assert_allclose(position, update_at(vinebot, 0.5).position, atol=1e-12)
     assert not velocity.any()
     assert physics.rigid.base_state("guest")[0][0] == pytest.approx(0.5)
+
+
+def test_no_tick_waits_for_a_robot_that_leaves(vinebot):
+    """Its copy stays until the world without it is compiled; then the others have the bits of a removal at once. Who
+    comes back under the name meanwhile gets a body of its own."""
+    waiting, at_once = world(vinebot), world(vinebot)
+    deferred = DeferredExecutor()
+    spawner = RemoteSpawner(waiting.rigid, vinebot, deferred)
+    pose = frames.pose([0.0, 0.0, 0.0])
+    for physics in (waiting, at_once):
+        physics.rigid.add_robot(vinebot.to_spec("guest", 7, pose))
+        physics.step()
+    copy = RemoteRobot(waiting.rigid, vinebot, "guest", 7, pose, is_in_world=True)
+    spawner.remove("guest", copy)
+    assert spawner.spawn({}) == {}
+    assert spawner.removed() == []
+    for physics in (waiting, at_once):
+        physics.step()
+    assert waiting.rigid.robots == ("host", "guest")
+    deferred.work()
+    assert spawner.spawn({}) == {}
+    assert spawner.removed() == ["guest"]
+    at_once.rigid.remove_robot("guest")
+    for physics in (waiting, at_once):
+        for _ in range(3):
+            physics.step()
+        assert physics.rigid.robots == ("host",)
+    assert waiting.rigid.mj_data.qpos.tobytes() == at_once.rigid.mj_data.qpos.tobytes()
+    assert spawner.spawn({}) == {}
+    assert not deferred.waiting
+
+
+def test_a_robot_that_comes_back_before_its_copy_was_removed_is_placed_anew(vinebot):
+    physics, deferred = world(vinebot), DeferredExecutor()
+    spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
+    pose = frames.pose([0.0, -3.0, 0.0])
+    physics.rigid.add_robot(vinebot.to_spec("guest", 7, pose))
+    spawner.remove("guest", RemoteRobot(physics.rigid, vinebot, "guest", 7, pose, is_in_world=True))
+    spawner.enqueue(hello(vinebot))
+    updates = {"guest": update_at(vinebot, 1.0)}
+    assert spawner.spawn(updates) == {}
+    deferred.work()
+    guest = spawner.spawn(updates)["guest"]
+    assert spawner.removed() == ["guest"]
+    assert physics.rigid.robots == ("host", "guest")
+    assert np.allclose(physics.rigid.base_state("guest")[0][:3], (1.0, 0.0, 0.0))
+    physics.step()
+    guest.remove()
+    assert physics.rigid.robots == ("host",)
 
 
 def test_a_prepared_and_an_immediate_join_give_the_same_bits(vinebot):

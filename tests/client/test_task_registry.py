@@ -18,7 +18,7 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes
 from vinesim.robot.tasks.task import Task
-from vinesim.ros.commands.types import Command, JointPositions, JointTrajectory
+from vinesim.ros.commands.types import Command, ForwardCommand, JointTrajectory
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
@@ -150,7 +150,7 @@ def test_newer_empty_and_position_commands_replace_a_trajectory():
     np.testing.assert_allclose(commanded.run(1.0), stopped, atol=0.01)
     setpoint = commanded.robot.setpoint.copy()
     setpoint[commanded.joints] = start
-    commanded.queue = [trajectory(start + FAR, seconds=2.0), JointPositions("forward_position_controller", setpoint)]
+    commanded.queue = [trajectory(start + FAR, seconds=2.0), ForwardCommand("forward_position_controller", setpoint)]
     np.testing.assert_allclose(commanded.run(2.0), start, atol=1e-3)
 
 

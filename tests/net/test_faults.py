@@ -122,6 +122,24 @@ def test_a_frozen_client_leaves_within_2_5_s_and_rejoins(clients, record_propert
     wait(lambda: clients.agree(1), "all to name the same owner")
 
 
+def test_what_a_frozen_client_owned_before_is_not_believed_when_it_comes_back(clients):
+    """Another one has grasped its tree meanwhile; the others have gone on."""
+    ada, bob, cleo = clients["ada"], clients["bob"], clients["cleo"]
+    ada.command(touch=[2])
+    wait(lambda: clients.owners(2) == {"ada"}, "ada to own the tree")
+    ada.process.send_signal(signal.SIGSTOP)
+    wait(lambda: "ada" not in bob.command()["others"] and "ada" not in cleo.command()["others"], "ada to leave")
+    since, ticks = bob.command(grab=[2], touch=[2])["now"], cleo.command()["ticks"]
+    wait(lambda: cleo.command()["owner"]["2"] == "bob", "bob to own the tree")
+    wait(lambda: cleo.command()["ticks"] > ticks + 60, "the others to go on")
+    ada.process.send_signal(signal.SIGCONT)
+    wait(lambda: bob.command()["joined_at"]["ada"] > since, "ada to be back")
+    wait(lambda: clients.agree(2), "all to name the same owner")
+    assert clients.owners(2) == {"bob"}
+    for one in (ada, bob):
+        one.command(touch=[])
+
+
 def test_streams_resume_within_a_second_of_a_server_restart(clients, record_property):
     ada, bob = clients["ada"], clients["bob"]
     ada.command(touch=[6])

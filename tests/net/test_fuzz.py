@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+import zenoh
 
 from tests.support.live_server import ServerProcess, wait
 from vinesim.bench import message_fuzz
@@ -23,8 +24,10 @@ from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.model_check import check_record
 from vinesim.net.replication.streams import object_counts
+from vinesim.net.server.server import Server
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.net.transport.zenoh_bus import ZenohBus
+from vinesim.net.transport.zenoh_session import close_session, config, open_session
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import ObjectKind, object_id
@@ -266,6 +269,39 @@ def test_zenoh_sessions_and_the_server_survive_malformed_messages():
             ada.command(touch=[3])
             wait(lambda: bob.command()["owner"].get("3") == "ada", "the stream to continue")
         assert server.process.poll() is None
+
+
+def test_no_message_without_a_session_that_joined_is_believed():
+    """A program that uses Zenoh alone puts all kinds of messages under the names of others and its own, without TLS.
+
+    Its puts say no source, unlike those of actors. Zenoh itself drops what it cannot send at once unless told to wait.
+    """
+    model = tree_row()
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as bus:
+        ada = FakeClient(bus, model, (1.0, 0.0))
+        wait(lambda: ada.tick(time.monotonic()) or bus.admissions > 0, "the actor to be admitted")
+        raw = open_session(config("client", connect__endpoints=[server.endpoint]))
+        names = ["ada", "bob", ATTACKER]
+        for number, (key, payload) in enumerate(
+            itertools.islice(storm(model, ada, 7, names=names, pool_size=200), 1_500)
+        ):
+            raw.put(f"vs/1/vineyard/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)
+            if number % 50 == 0:
+                ada.tick(time.monotonic())
+        raw.put("vs/1/vineyard/fact/0/0/last", b"")
+        wait(lambda: "vineyard/fact/0/0/last" in server._warned, "the last message to be refused")
+        close_session(raw)
+        counters = ada.replicator.counters
+        wait(lambda: ada.tick(time.monotonic()) or counters.foreign > 1_000, "the client to refuse them")
+        families = counters.actor, counters.environment, counters.event, counters.retained, counters.force
+        assert [family.messages_in for family in families] == [0] * 5
+        assert server.foreign > 150
+        assert server.figures()["facts_heard"] == server.figures()["facts"] == 0
+        assert ada.replicator.peers == {}
+        assert ada.replicator.known == frozenset()
+        pings = server.pings
+        wait(lambda: ada.tick(time.monotonic()) or server.pings > pings, "the server to go on answering")
+        assert server.actors == ["vineyard/ada"]
 
 
 def test_bytes_of_other_protocols_do_not_stop_the_server():

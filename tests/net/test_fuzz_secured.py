@@ -53,14 +53,24 @@ def test_over_tls_no_message_of_any_kind_or_key_stops_a_thread_or_is_believed_ag
 
         wait(both_see_each_other, "the two to join")
         locator = parse(server.endpoint, secured=True).locator
-        strangers = {"connect__endpoints": [locator], "connect__timeout_ms": 300, "connect__exit_on_failure": True}
+        strangers = {"connect__endpoints": [locator], "connect__timeout_ms": 300, "connect__exit_on_failure": False}
+        heard = ada.replicator.counters.to_report(), server.figures()
         for credentials in (
             tls_config(other, ATTACKER),
             {"transport__link__tls": {"root_ca_certificate": str(certs / "ca.pem")}},
         ):
             with contextlib.suppress(zenoh.ZError):  # refused, or open to nothing
-                close_session(open_session(config("client", **strangers, **credentials)))
+                stranger = open_session(config("client", **strangers, **credentials))
+                for key, payload in itertools.islice(storm(model, evil, 8, names=["ada", "bob", ATTACKER]), 300):
+                    stranger.put(f"vs/1/vineyard/{key}", payload, congestion_control=zenoh.CongestionControl.BLOCK)
+                assert list(stranger.info.routers_zid()) == []
+                close_session(stranger)
+        ada.tick(time.monotonic())
         assert server.actors == ["vineyard/ada", f"vineyard/{ATTACKER}"]
+        for what in ("foreign", "malformed", "facts_heard"):
+            assert server.figures()[what] == heard[1][what], "nothing arrives at the server"
+        for what in ("foreign", "malformed", "dropped"):
+            assert ada.replicator.counters.to_report()[what] == heard[0][what], "and nothing at a client"
 
         raw = open_session(config("client", connect__endpoints=[locator], **tls_config(certs, ATTACKER)))
         threads = {thread.name for thread in threading.enumerate()}

@@ -352,6 +352,20 @@ def test_objects_are_decoded_within_quantisation(seed, count, where, speed):
         assert (np.abs(received.velocity - sent.velocity)[:, part].max(1) <= np.maximum(fastest / 126.0, least)).all()
 
 
+@pytest.mark.parametrize(("column", "limit"), [(0, 64.0), (3, 256.0)])
+def test_an_object_at_an_absurd_speed_is_refused_and_never_sent(column, limit):
+    """A box that was believed to spin at 16,000 rad/s, as the format could say, made MuJoCo unstable where it hit."""
+    sent = objects(np.random.default_rng(0), 2)
+    sent.velocity[1, column] = 4000.0
+    (payload,), received = messages.encode_objects(sent, (0, 0))
+    assert 0.9 * limit < received.velocity[1, column] < limit
+    assert messages.decode_objects(payload, (0, 0)).velocity.tobytes() == received.velocity.tobytes()
+    scale = messages.HEADER.size + 26 + 9  # of the second object
+    payload = payload[:scale] + bytes([0xFF]) + payload[scale + 1 :]
+    with pytest.raises(MessageError, match="faster than anything"):
+        messages.decode_objects(payload, (0, 0))
+
+
 @pytest.mark.parametrize("number", [5, 3 * ids.OBJECT_STRIDE])
 def test_an_invalid_object_id_is_refused(number):
     batch = objects(np.random.default_rng(0), 1)
@@ -417,3 +431,17 @@ def test_an_invalid_record_is_refused_with_the_reason(change, reason):
 def test_too_many_records_are_refused():
     with pytest.raises(MessageError, match="at most 4096"):
         messages.decode_records(messages.encode_records([record()] * 4097))
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        messages.encode_part(messages.MeshPart("0" * 40, 36, 0, b"\xff" * 36)),
+        messages.encode_request(5),
+        messages.encode_wanted(messages.MeshWanted(5)),
+    ],
+)
+def test_messages_about_meshes_have_no_time(payload):
+    """Their first bytes were once taken for one, and replaced when a recording was played at another time."""
+    assert messages.time_of(payload) is None
+    assert messages.shift_time(payload, 5.0) == payload

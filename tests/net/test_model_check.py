@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from tests.net.test_replicator import TICK, Client, run, vineyard
+from vinesim import frames
+from vinesim.bench.support.fake_client import FakeClient, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError, RetainedRecord, TreeStates
 from vinesim.net.replication.model_check import check_record, check_tree_states
+from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import ObjectKind, object_id
@@ -80,6 +83,32 @@ def test_a_berry_cluster_cannot_be_cut_off_alone() -> None:
     )  # fmt: skip
     with pytest.raises(MessageError, match="berry cluster"):
         check_tree_states(states, model)
+
+
+def test_what_moves_beyond_the_range_of_positions_is_still_published() -> None:
+    """Another actor may leave an object 10 m before the bound. The record of who moves it on is read by all."""
+    hub = MemoryHub()
+    server = hub.bus("server", live=False)
+    server.subscribe("fact/**", KEEP_ALL)
+    ada = FakeClient(hub.bus("ada"), tree_row(), (1.0, 0.0))
+    bunch = object_id(ObjectKind.BUNCH, 1)
+    ada.carried_state = lambda _: (frames.pose([1e5 + 5.0, -1e9, 0.5]), np.zeros(6))  # type: ignore[method-assign]
+    ada.picking = {bunch}
+    records = []
+    for step in range(200):
+        hub.advance(TICK)
+        ada.carrying -= {bunch} if step == 100 else set()
+        ada.tick(hub.time)
+        records += [one for _, payload in server.poll() for one in messages.decode_records(payload)]
+    positions = [one.pose[:3] for one in records if one.object == bunch]
+    assert positions == 2 * [(99_999.0, -99_999.0, 0.5)], "when it was picked, and at rest"
+
+
+def test_a_body_beyond_the_range_of_positions_is_still_published() -> None:
+    far = state_of(TREE, roots=np.array([1]), root=np.array([3]), root_x=np.array([[1e9, 0.0, -1e5]]),
+                   root_xd=np.zeros((1, 3)))  # fmt: skip
+    check_record(record(trees=far), vineyard(), COUNTS)
+    assert messages.decode_trees(far).root_x.tolist() == [[99_999.0, 0.0, -99_999.0]]
 
 
 def test_the_other_records_of_a_message_are_received() -> None:

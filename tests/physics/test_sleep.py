@@ -10,10 +10,10 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.sleep import SleepMonitor
-from vinesim.physics.plants.wind import Wind
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
+from vinesim.scene.wind import Wind
 
 
 def row(count: int) -> ArticulationSolver:

@@ -8,13 +8,16 @@ from vinesim import frames
 from vinesim.kernels.articulation.forces import AIR_DENSITY
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.wind import Wind
+from vinesim.physics.plants.shelter import TreeDrag
+from vinesim.physics.plants.wind import FADE_DURATION, WindOnPlants
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+from vinesim.scene.wind import Wind
 
 CHECK_STEPS = PhysicsParameters().steps(PhysicsParameters().wind_check_period)
+FADE_STEPS = PhysicsParameters().steps(2.0 * FADE_DURATION)
 
 
 def leafy(count: int, area: float = 0.004, **wood: float) -> Model:
@@ -159,9 +162,9 @@ def test_a_storm_is_stable(area: float) -> None:
     model = leafy(3, area=area, damping=0.004)
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(3))
-    wind = Wind([32.0, 24.0, 0.0], gusts=16.0, seed=2)
+    wind, blown = Wind([32.0, 24.0, 0.0], gusts=16.0, seed=2), WindOnPlants(plants)
     for tick in range(1000):
-        wind.update(plants, 0.01 * tick)
+        blown.update(wind, 0.01 * tick)
         step(plants, 1)
         assert plants.tree_rate.max() < 300.0
         assert np.linalg.norm(plants.velocity_free[:, :3], axis=1).max() < 80.0
@@ -181,41 +184,67 @@ def test_wind_wakes_only_trees_that_it_moves() -> None:
     model = leafy(100)
     model.body_drag[model.bodies_of(7)] = 0.0
     plants = ArticulationSolver(model, State.at_rest(model))
-    breeze = Wind([0.05, 0.0, 0.0])
+    breeze, blown = Wind([0.05, 0.0, 0.0]), WindOnPlants(plants)
     for tick in range(CHECK_STEPS):
-        breeze.update(plants, 0.01 * tick)
+        blown.update(breeze, 0.01 * tick)
     assert len(plants.awake) == 0
-    wind = Wind([4.0, 0.0, 0.0], gusts=1.0)
+    wind, blown = Wind([4.0, 0.0, 0.0], gusts=1.0), WindOnPlants(plants)
     for tick in range(CHECK_STEPS):
-        wind.update(plants, 0.01 * tick)
+        blown.update(wind, 0.01 * tick)
     assert plants.awake.tolist() == [t for t in range(100) if t != 7]
-    wind.update(plants, 1.0)
-    np.testing.assert_allclose(plants.tree_air[50], wind.velocity_at(np.array([0.0, 50.0, 0.0]), 1.0), rtol=1e-5)
+    share = TreeDrag.of(model, plants.state.body_q).air_share(wind.mean)[50]
+    growing = []
+    for _ in range(FADE_STEPS):
+        blown.update(wind, 1.0)
+        growing.append(float(np.linalg.norm(plants.tree_air[50])))
+    assert np.diff(growing).min() >= -1e-6  # no gust front hits a tree that has just been woken
+    np.testing.assert_allclose(plants.tree_air[50], share * wind.velocity_at(model.tree_pose[50, :3], 1.0), rtol=1e-5)
 
 
-def test_beyond_the_radius_there_is_no_wind() -> None:
+def test_beyond_the_radius_there_is_no_simulated_wind() -> None:
     model = leafy(100)
     plants = ArticulationSolver(model, State.at_rest(model))
-    plants.wake(90)
-    plants.tree_air[90] = [1.0, 0.0, 0.0]
-    wind = Wind([4.0, 0.0, 0.0], gusts=1.0)
+    wind, blown = Wind([4.0, 0.0, 0.0], gusts=1.0), WindOnPlants(plants)
     for tick in range(CHECK_STEPS):
-        wind.update(plants, 0.01 * tick, (np.array([[0.0, 10.0, 0.0], [0.0, 40.0, 0.0]]), 2.5))
-    assert plants.awake.tolist() == [8, 9, 10, 11, 12, 38, 39, 40, 41, 42, 90]
-    assert plants.tree_air[90].tolist() == [1.0, 0.0, 0.0]
+        blown.update(wind, 0.01 * tick, (np.array([[0.0, 10.0, 0.0], [0.0, 40.0, 0.0]]), 2.5))
+    assert plants.awake.tolist() == [8, 9, 10, 11, 12, 38, 39, 40, 41, 42]
+    assert not plants.tree_air[90].any()
+    assert blown.state is not None
+    drawn = blown.state.tree_drawn
+    assert (np.delete(drawn, plants.awake) == 1.0).all()  # sensors draw all others in it
 
 
 def test_a_tree_asleep_in_steady_wind_stays_asleep() -> None:
     model = leafy(1)
     plants = ArticulationSolver(model, State.at_rest(model))
-    wind = Wind([2.0, 0.0, 0.0])
-    for tick in range(CHECK_STEPS):
-        wind.update(plants, 0.01 * tick)
+    wind, blown = Wind([2.0, 0.0, 0.0]), WindOnPlants(plants)
+    for tick in range(CHECK_STEPS + FADE_STEPS):
+        blown.update(wind, 0.01 * tick)
     assert plants.awake.tolist() == [0]
     plants.put_to_sleep(0)
     for tick in range(CHECK_STEPS):
-        wind.update(plants, 0.01 * tick)
+        blown.update(wind, 0.01 * tick)
     assert len(plants.awake) == 0
+
+
+def test_trees_come_to_rest_again_when_the_wind_ends() -> None:
+    """They neither keep the last air that they felt, nor are they let go at once."""
+    physics = Physics(leafy(1, damping=0.2))
+    physics.wind = Wind([3.0, 0.0, 0.0])
+    for _ in range(600):
+        physics.step()
+    tip = physics.model.bodies_of(0).stop - 1
+    assert physics.snapshot().body_q[tip, 0] > 0.005
+    physics.wind = None
+    before = physics.snapshot().body_q[tip, 0]
+    for _ in range(1500):
+        physics.step()
+        now = physics.snapshot().body_q[tip, 0]
+        assert abs(now - before) < 1e-3
+        before = now
+    assert before == pytest.approx(0.0, abs=1e-4)
+    assert physics.snapshot().wind is None
+    assert len(physics.plants.awake) == 0
 
 
 def test_a_step_applies_wind_near_robots() -> None:
@@ -223,7 +252,7 @@ def test_a_step_applies_wind_near_robots() -> None:
     physics = Physics(leafy(10))
     physics.add_robot(bar((1.0, -0.5, 0.2)))
     physics.wind = Wind(np.array([0.0, 6.0, 0.0]), gusts=1.0)
-    for _ in range(200):
+    for _ in range(400):
         physics.step()
     model = physics.model
     rest_pose = model.forward_kinematics(model.joint_settled)

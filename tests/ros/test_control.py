@@ -53,7 +53,12 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
     def head_of(message: JointState) -> float:
         return message.position[message.name.index("head_1_joint")]
 
-    with RobotNode("robot", robot.description.urdf, base=robot.description.base) as node, StockNode() as peer:
+    with (
+        RobotNode(
+            "robot", robot.description.urdf, base=robot.description.base, controllers=robot.description.controllers
+        ) as node,
+        StockNode() as peer,
+    ):
         client.pre_step.append(RosCommandHandler(robot, node.commands))
         client.post_step.append(lambda c: node.publish_robot_state(robot.sample(c.physics.time, c.physics.contacts)))
         peer.node.create_subscription(JointState, "/joint_states", received.append, 10)

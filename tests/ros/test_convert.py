@@ -25,10 +25,20 @@ from sensor_msgs.msg import Image, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from vinesim.ros.commands import convert as commands
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.messages.transforms import SerializedTransforms, split_time
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.values import CameraFrame, CameraInfo, ComponentStatus, Contact, JointSample, LidarScan, RobotSample
+from vinesim.scene.values import (
+    CameraFrame,
+    CameraInfo,
+    ComponentStatus,
+    Imu,
+    JointSample,
+    LidarScan,
+    RobotSample,
+    Wrench,
+)
 
 INFO = CameraInfo(64, 48, 50.0, 51.0, 31.5, 23.5, "head_front_camera_optical")
 
@@ -245,15 +255,17 @@ def test_odometry_velocity_is_in_the_axes_of_the_base():
     assert twist.angular.z == pytest.approx(0.3)
 
 
-def test_wrench_is_the_same_force_seen_from_the_link():
-    link = frames.pose(np.array([1.0, 0.0, 1.0]), frames.from_yaw(math.pi / 2))
-    force, position = np.array([0.0, 2.0, 0.0]), np.array([1.5, 0.0, 1.0])
-    contact = Contact("r", "finger", 3, position, force, -0.001)
-    message = over_the_wire(convert.wrench(contact, 1.0, "finger", link)).wrench
-    assert (message.force.x, message.force.y, message.force.z) == pytest.approx((2.0, 0.0, 0.0), abs=1e-12)
-    world_torque = np.cross(position - link[:3], force)
-    seen = np.array([message.torque.x, message.torque.y, message.torque.z])
-    assert frames.rotate(link[3:], seen) == pytest.approx(world_torque, abs=1e-12)
+def test_wrench_and_imu_keep_their_frames():
+    read = Wrench(1.5, "wrist", "wrist_link", np.array([1.0, 2.0, 3.0]), np.array([0.1, 0.2, 0.3]))
+    message = over_the_wire(convert.wrench(read))
+    assert (message.header.frame_id, message.header.stamp.nanosec) == ("wrist_link", 500_000_000)
+    assert (message.wrench.force.z, message.wrench.torque.x) == (3.0, 0.1)
+    unit = Imu(
+        2.0, "imu", "imu_link", np.array([0.0, 0.0, 0.6, 0.8]), np.array([0.0, 0.0, 0.5]), np.array([0, 0, 9.81])
+    )
+    message = over_the_wire(convert.imu(unit))
+    assert (message.orientation.z, message.orientation.w, message.angular_velocity.z) == (0.6, 0.8, 0.5)
+    assert message.linear_acceleration.z == 9.81
 
 
 def test_transforms_equal_stock_serialisation_field_for_field():
@@ -286,20 +298,24 @@ def test_transforms_want_one_pose_per_frame():
 def test_base_velocity_comes_back():
     message = TwistStamped(header=convert.header(3.5, "base_footprint"))
     message.twist.linear.x, message.twist.angular.z = 0.4, -0.2
-    velocity = convert.base_velocity(over_the_wire(message))
+    velocity = commands.base_velocity(over_the_wire(message))
     assert velocity.time == 3.5
     assert velocity.linear.tolist() == [0.4, 0.0, 0.0]
     assert velocity.angular.tolist() == [0.0, 0.0, -0.2]
     message.twist.linear.y = math.nan
-    with pytest.raises(convert.CommandError, match="not finite"):
-        convert.base_velocity(message)
+    with pytest.raises(commands.CommandError, match="not finite"):
+        commands.base_velocity(message)
 
 
-def test_joint_positions_come_back():
-    commands = convert.joint_positions(over_the_wire(Float64MultiArray(data=[1.0, -2.5])), "forward")
-    assert commands.positions.tolist() == [1.0, -2.5]
-    with pytest.raises(convert.CommandError, match="not finite"):
-        convert.joint_positions(Float64MultiArray(data=[math.inf]), "forward")
+def test_forward_commands_come_back():
+    """One value for each joint; NaN leaves a joint alone, infinity and a wrong number of values are refused."""
+    command = commands.forward_command(over_the_wire(Float64MultiArray(data=[1.0, -2.5])), "forward", ("a", "b"))
+    assert command.values.tolist() == [1.0, -2.5]
+    assert math.isnan(commands.forward_command(Float64MultiArray(data=[math.nan]), "f", ("a",)).values[0])
+    with pytest.raises(commands.CommandError, match="not finite"):
+        commands.forward_command(Float64MultiArray(data=[math.inf]), "forward", ("a",))
+    with pytest.raises(commands.CommandError, match="forward: 1 values; give one for each of a, b"):
+        commands.forward_command(Float64MultiArray(data=[1.0]), "forward", ("a", "b"))
 
 
 def trajectory(*points: tuple[float, list[float], list[float]]) -> JointTrajectory:
@@ -313,14 +329,14 @@ def trajectory(*points: tuple[float, list[float], list[float]]) -> JointTrajecto
 
 def test_joint_trajectory_comes_back():
     message = trajectory((0.5, [1.0, 2.0], [0.1, 0.2]), (1.25, [3.0, 4.0], [0.0, 0.0]))
-    value = convert.joint_trajectory(over_the_wire(message), "arm_left_controller")
+    value = commands.joint_trajectory(over_the_wire(message), "arm_left_controller", ("a", "b"))
     assert value.joints == ("a", "b")
     assert value.times.tolist() == [0.5, 1.25]
     assert value.positions.tolist() == [[1.0, 2.0], [3.0, 4.0]]
     assert value.velocities is not None
     assert value.velocities.tolist() == [[0.1, 0.2], [0.0, 0.0]]
-    assert convert.joint_trajectory(trajectory((1.0, [1.0, 2.0], [])), "c").velocities is None
-    assert convert.joint_trajectory(trajectory(), "c").positions.shape == (0, 2)
+    assert commands.joint_trajectory(trajectory((1.0, [1.0, 2.0], [])), "c", ("a", "b")).velocities is None
+    assert commands.joint_trajectory(trajectory(), "c", ("a", "b")).positions.shape == (0, 2)
 
 
 @pytest.mark.parametrize(
@@ -330,11 +346,13 @@ def test_joint_trajectory_comes_back():
         (trajectory((0.5, [1.0, 2.0], [1.0])), "point 0 has 2 positions and 1 velocities"),
         (trajectory((0.5, [1.0, 2.0], []), (0.5, [1.0, 2.0], [])), "does not rise"),
         (trajectory((0.5, [1.0, math.nan], [])), "not finite"),
+        (trajectory((-0.5, [1.0, 2.0], [])), "does not rise from 0 on"),
+        (JointTrajectory(joint_names=["a", "c"]), "a trajectory for a, c; it moves each of a, b once"),
     ],
 )
 def test_bad_trajectories_are_refused_in_words(message, words):
-    with pytest.raises(convert.CommandError, match=words):
-        convert.joint_trajectory(message, "arm_left_controller")
+    with pytest.raises(commands.CommandError, match=words):
+        commands.joint_trajectory(message, "arm_left_controller", ("a", "b"))
 
 
 def test_diagnostics_carry_the_figures():

@@ -44,7 +44,7 @@ context.shutdown()
 BUILD = """
 import sys
 from vinesim.ros.messages import message_packages
-sys.stdout.write(str(message_packages.build('tf2_msgs')))
+sys.stdout.write(str(message_packages.build(['tf2_msgs'])['tf2_msgs']))
 """
 
 
@@ -84,7 +84,7 @@ def test_what_can_be_imported_is_not_built(own_cache, monkeypatch):
     def refuse(package: str):
         raise AssertionError(f"built {package}")
 
-    monkeypatch.setattr(message_packages, "build", refuse)
+    monkeypatch.setattr(message_packages, "_build", refuse)
     message_packages.ensure_importable(["std_msgs", "sensor_msgs"])
 
 
@@ -92,7 +92,7 @@ def test_unknown_package_names_the_folder():
     with pytest.raises(
         message_packages.InterfacesError, match=r"'no_such_msgs'.*add its \.msg files to .*msgs/no_such_msgs"
     ):
-        message_packages.build("no_such_msgs")
+        message_packages.build(["no_such_msgs"])
 
 
 def test_missing_compiler_names_the_remedy(tmp_path, monkeypatch):
@@ -100,7 +100,7 @@ def test_missing_compiler_names_the_remedy(tmp_path, monkeypatch):
     which = shutil.which
     monkeypatch.setattr(shutil, "which", lambda name: None if name == "g++" else which(name))
     with pytest.raises(message_packages.InterfacesError, match=r"g\+\+ is missing; apt install g\+\+"):
-        message_packages.build("tf2_msgs")
+        message_packages.build(["tf2_msgs"])
 
 
 def test_missing_generators_name_the_extra(tmp_path, monkeypatch):
@@ -108,13 +108,13 @@ def test_missing_generators_name_the_extra(tmp_path, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "rosidl_generator_py" else find(name))
     with pytest.raises(message_packages.InterfacesError, match=r"vinesim\[ros\]"):
-        message_packages.build("tf2_msgs")
+        message_packages.build(["tf2_msgs"])
 
 
 def test_a_changed_definition_changes_the_key(tmp_path, monkeypatch):
-    before = message_packages._key("tf2_msgs")
+    before = message_packages.key("tf2_msgs")
     monkeypatch.setattr(message_packages, "DEFINITIONS", tmp_path)
     folder = tmp_path / "tf2_msgs" / "msg"
     folder.mkdir(parents=True)
     (folder / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\nuint8 more\n")
-    assert message_packages._key("tf2_msgs") != before
+    assert message_packages.key("tf2_msgs") != before

@@ -24,19 +24,29 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 import rclpy
-from geometry_msgs.msg import TwistStamped, WrenchStamped
+from geometry_msgs.msg import TwistStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import Image, JointState
+from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tests.support.stock_node import TIMEOUT, StockNode, wait_until
-from vinesim.ros.commands.types import BaseVelocity, JointPositions
+from vinesim.ros.commands.types import BaseVelocity, ForwardCommand
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
 from vinesim.ros.robot_node import RobotNode
 from vinesim.ros.sensor_node import SensorNode
 from vinesim.ros.tools.topic_monitor import SimulationClock, TopicStats
-from vinesim.scene.values import CameraFrame, CameraInfo, ComponentStatus, Contact, JointSample, LidarScan, RobotSample
+from vinesim.scene.values import (
+    CameraFrame,
+    CameraInfo,
+    ComponentStatus,
+    Contact,
+    ControllerKind,
+    ControllerSpec,
+    JointSample,
+    LidarScan,
+    RobotSample,
+)
 
 REST = frames.pose(np.zeros(3))
 JOINTS = tuple(f"arm_left_{i}_joint" for i in range(1, 8))
@@ -191,7 +201,7 @@ TYPES = {
     "/tf_environment": "tf2_msgs/msg/TFMessage",
     "/tf_environment_static": "tf2_msgs/msg/TFMessage",
     "/mobile_base_controller/odom": "nav_msgs/msg/Odometry",
-    "/vine/contacts": "geometry_msgs/msg/WrenchStamped",
+    "/vine/contacts": "sensor_msgs/msg/PointCloud2",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/lidar/points": "sensor_msgs/msg/PointCloud2",
     "/head_front_camera/rgb/image_raw": "sensor_msgs/msg/Image",
@@ -244,8 +254,14 @@ def test_subscribers_are_counted_by_family_and_knows_its_topics():
             node.has_subscribers("right")
 
 
+CONTROLLERS = (
+    ControllerSpec("arm_left_controller", ControllerKind.JOINT_TRAJECTORY, JOINTS),
+    ControllerSpec("forward_position_controller", ControllerKind.FORWARD_POSITION, JOINTS[:2]),
+)
+
+
 def test_commands_come_back():
-    with RobotNode("vinebot", URDF) as node, StockNode() as peer:
+    with RobotNode("vinebot", URDF, controllers=CONTROLLERS) as node, StockNode() as peer:
         velocity = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 10)
         forward = peer.node.create_publisher(Float64MultiArray, "/forward_position_controller/commands", 10)
         arm = peer.node.create_publisher(JointTrajectory, "/arm_left_controller/joint_trajectory", 10)
@@ -262,7 +278,7 @@ def test_commands_come_back():
         commands = []
         wait_until(lambda: commands.extend(node.commands()) or len(commands) >= 4)
         assert [c.linear.tolist() for c in commands if isinstance(c, BaseVelocity)] == [[0.25, 0.0, 0.0]]
-        assert [c.positions.tolist() for c in commands if isinstance(c, JointPositions)] == [[0.1, 0.2]]
+        assert [c.values.tolist() for c in commands if isinstance(c, ForwardCommand)] == [[0.1, 0.2]]
         trajectories = [c for c in commands if isinstance(c, Trajectory)]
         assert [(c.controller, c.joints, c.times.tolist()) for c in trajectories] == [
             ("arm_left_controller", ("arm_left_1_joint",), [1.0]),
@@ -351,19 +367,27 @@ def test_frames_lead_from_the_map_to_the_fingers():
         assert frames.compose(*chain) == pytest.approx(robot_sample(0.0).base_q)
 
 
-def test_contacts_are_wrenches_of_the_touching_link():
+def test_contacts_are_one_cloud_a_step():
+    """Each contact as a point with its force on the robot, the plant's body, its bunch, and the number of the link."""
     contact = Contact("vinebot", "vinebot/tip", 5, np.array([1.0, 3.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.0)
-    nowhere = Contact("vinebot", "vinebot/unknown", 5, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 5.0]), 0.0)
-    static = [("base_footprint", "tip", frames.pose(np.array([0.5, 0.0, 0.0])))]
-    with RobotNode("vinebot", URDF, static_transforms=static) as node, StockNode() as peer:
-        heard: list[WrenchStamped] = []
-        peer.node.create_subscription(WrenchStamped, "/vine/contacts", heard.append, 10)
+    nowhere = Contact("vinebot", "vinebot/unknown", 2, np.array([1.0, 0.0, 0.0]), np.array([0.0, 4.0, 0.0]), 0.0)
+    urdf = "<robot name='vinebot'><link name='base_footprint'/><link name='tip'/></robot>"
+    bunch_of_body = np.array([-1, -1, -1, 0, 0, 1], np.int32)
+    with RobotNode("vinebot", urdf, bunch_of_body=bunch_of_body) as node, StockNode() as peer:
+        heard: list[PointCloud2] = []
+        peer.node.create_subscription(PointCloud2, "/vine/contacts", heard.append, 10)
         sample = robot_sample(1.0, contacts=(contact, nowhere))
-        wait_until(lambda: len(heard) >= 2, lambda: (node.publish_robot_state(sample), peer.spin()))
-        by_frame = {message.header.frame_id: message.wrench for message in heard}
-        # The base stands at (1, 2) and looks along +y: the tip is at (1, 2.5), the contact half a metre ahead of it.
-        assert (by_frame["tip"].force.z, by_frame["tip"].torque.y) == pytest.approx((5.0, -2.5))
-        assert (by_frame["map"].force.z, by_frame["map"].torque.y) == pytest.approx((5.0, -5.0))
+        wait_until(lambda: heard, lambda: (node.publish_robot_state(sample), peer.spin()))
+        assert heard[0].header.frame_id == "map"
+        kinds = {PointField.FLOAT32: "f4", PointField.INT32: "i4"}
+        point = np.dtype([(field.name, kinds[field.datatype]) for field in heard[0].fields])
+        assert [point.fields[field.name][1] for field in heard[0].fields] == [field.offset for field in heard[0].fields]
+        first, second = np.frombuffer(bytes(heard[0].data), point)
+        assert first.tolist() == (1.0, 3.0, 0.0, 0.0, 0.0, 5.0, 5, 1, 1)
+        assert second.tolist() == (1.0, 0.0, 0.0, 0.0, 4.0, 0.0, 2, -1, -1)
+        heard.clear()
+        without = robot_sample(1.01)
+        wait_until(lambda: heard and heard[-1].width == 0, lambda: (node.publish_robot_state(without), peer.spin()))
 
 
 def test_the_newest_replaces_what_waits_and_is_counted():
@@ -417,7 +441,7 @@ def test_closing_leaves_nothing_behind():
     [
         ({"name": "vine bot"}, "vine bot"),
         ({"name": "vinebot", "namespace": "robot-1"}, "robot-1"),
-        ({"name": "vinebot", "controllers": ["left arm"]}, "left arm"),
+        ({"name": "vinebot", "controllers": [ControllerSpec("left arm", ControllerKind.GRIPPER, ())]}, "left arm"),
     ],
 )
 def test_names_that_ros_refuses_are_said_in_one_line(arguments, words):

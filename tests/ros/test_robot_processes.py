@@ -49,10 +49,10 @@ class Robot:
         self.loop = RateLoop(self.client.physics.dt)
         self.status = Status(self.client, self.loop, self.processes.sent_messages, sensors=self.processes.status)
 
-    def subscribe(self, message: type, topic: str) -> list:
-        """Messages from now on, received with the default QoS of rclpy."""
+    def subscribe(self, message: type, topic: str, queue: int = 10) -> list:
+        """Messages from now on, received with the default QoS of rclpy and a queue of so many messages."""
         received: list = []
-        self.peer.node.create_subscription(message, topic, received.append, 10)
+        self.peer.node.create_subscription(message, topic, received.append, queue)
         return received
 
     def step(self) -> None:
@@ -87,12 +87,12 @@ def nanoseconds(message: Clock) -> int:
 
 def test_every_step_is_published_once_and_in_order_or_counted_as_lost(robot):
     """Exactly by the counts of the process. A stock reader receives all within one of a few windows of 3 s: without
-    a processor for 0.1 s it loses messages of its own queue of ten, which no publisher can count."""
+    a processor for a second it loses messages, as the publisher keeps no more than a hundred."""
     wanted = []
     robot.client.post_step.append(
         lambda _: wanted.append(robot.processes.ros.worker.current().shared.wanted["steps"][0])
     )
-    clocks, joints = robot.subscribe(Clock, "/clock"), robot.subscribe(JointState, "/joint_states")
+    clocks, joints = robot.subscribe(Clock, "/clock", 1000), robot.subscribe(JointState, "/joint_states")
     robot.run_until(lambda: len(clocks) >= 20 and joints)
     missing = []
     while 0 not in missing and len(missing) < 5:
@@ -175,7 +175,7 @@ def test_a_record_holds_a_sample_exactly(robot):
         for i, link in enumerate((*list(client.robot.description.link_anchors)[:3], "unknown"))
     ]
     sample = client.robot.sample(client.physics.time, contacts)
-    records = StepRecords("robot", client.robot.description)
+    records = StepRecords("robot", client.robot.description, client.robot.series_stiffness)
     row = np.zeros(1, records.dtype)[0]
     assert records.write(row, client.physics.time, sample) == 0
     copy = records.read(row)
@@ -186,5 +186,9 @@ def test_a_record_holds_a_sample_exactly(robot):
     assert (copy.actor, copy.transforms, copy.joints.names) == (sample.actor, sample.transforms, sample.joints.names)
     assert [c.link for c in copy.contacts] == [*[c.link for c in contacts[:3]], ""]
     assert [c.force.tolist() for c in copy.contacts] == [c.force.tolist() for c in contacts]
+    np.testing.assert_allclose(copy.elements.motor, sample.elements.motor, rtol=1e-12)
+    np.testing.assert_allclose(copy.elements.torque, sample.elements.torque, rtol=1e-12)
+    assert [(w.name, w.force.tolist()) for w in copy.wrenches] == [(w.name, w.force.tolist()) for w in sample.wrenches]
+    assert [u.linear_acceleration.tolist() for u in copy.imus] == [u.linear_acceleration.tolist() for u in sample.imus]
     many = client.robot.sample(client.physics.time, contacts[:1] * (MAX_CONTACTS + 5))
     assert records.write(row, client.physics.time, many) == 5

@@ -19,7 +19,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.api.energy import Energy, Momentum, energy, momentum
 from vinesim.errors import UsageError, checked_index
-from vinesim.physics.plants.wind import Wind
+from vinesim.physics.plants.sway import Sway
 from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
@@ -32,6 +32,7 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
 from vinesim.scene.values import Contact, Detachment, Snapshot
+from vinesim.scene.wind import wind_of
 
 if TYPE_CHECKING:
     from vinesim.sensors.scene.primitives import Primitives
@@ -88,12 +89,12 @@ class Simulation:
         """The solver below, for what this class does not offer."""
         self.robots: dict[str, Robot] = {}
         """Robots by name; their commands take effect in the next step."""
-        if self.scene is not None and (any(self.scene.wind.mean) or self.scene.wind.gusts > 0.0):
-            wind = self.scene.wind
-            self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=self.scene.seed)
+        if self.scene is not None:
+            self.physics.wind = wind_of(self.scene)
         self._loads: dict[int, np.ndarray] = {}
         self._detachments: list[Detachment] = []
         self._primitives: Primitives | None = None
+        self._sway = Sway(model)
         self.physics.sleep_monitor.wake_unbalanced()
 
     # ------------------------------------------------------------------ time
@@ -265,7 +266,7 @@ class Simulation:
             from vinesim.sensors.scene.primitives import Primitives
 
             self._primitives = Primitives(self.model, device=self.device)
-        self._primitives.update(self.snapshot())
+        self._primitives.update(self._sway.apply(self.snapshot()))
         return self._primitives
 
     # ------------------------------------------------------------------

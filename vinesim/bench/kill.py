@@ -1,4 +1,8 @@
-"""``vinesim bench kill``: programs of a shared vineyard are killed at random moments, and all others must go on."""
+"""``vinesim bench kill``: programs of a shared vineyard are killed at random moments, and all others must go on.
+
+Kills come in rounds: in each, one of every kind is killed at a random moment, in random order and no matter what the
+kill before has left undone; then all must go on, and what was killed must be back.
+"""
 
 from __future__ import annotations
 
@@ -21,22 +25,24 @@ KINDS = ("server", "router", "client", "sensors", "ROS node", "ROS listener")
 """What is killed: a program, or a worker of a robot client."""
 ROS_KINDS = ("ROS node", "ROS listener")
 """These are there only where ROS 2 is."""
-LONGEST_PAUSE = 1.5
-"""A kill comes at a random moment within this time after a bunch was picked [s]."""
+WORKERS = ("sensors", "ROS node")
+"""Processes of a robot client."""
+MEAN_PAUSE = 0.75
+"""Kills of a round come at random moments within this time for each of them [s]."""
 GO_ON_TIMEOUT = 180.0
-"""All must go on within this time after a kill [s]; a client that is started again takes most of it."""
+"""All must go on within this time after a round [s]; a client that is started again takes most of it."""
 RESTART_BOUND = 3.0
 """The sensors of a robot are back within this time [s]."""
 
 
 @dataclasses.dataclass
-class Kill:
-    """One kill and its effect."""
+class Round:
+    """Kills of one round and their effect."""
 
-    kind: str
-    victim: str
+    kinds: tuple[str, ...]
+    """In their order."""
     took: float
-    """Until all went on, with what was killed among them [s]."""
+    """From the last kill until all went on, with what was killed among them [s]."""
     missing: list[str]
     """What did not go on in time."""
     sensor_restart: float | None = None
@@ -47,9 +53,9 @@ def kill(
     times: int, seed: int, announce: Callable[[str], None] = lambda _: None, *, ros: bool = True,
     kinds: Sequence[str] = KINDS,
 ) -> Iterator[Measurement]:  # fmt: skip
-    """Kill ``times`` programs of the ``kinds`` in random order, as evenly as possible, with SIGKILL.
+    """Kill ``times`` programs or a few more, of each of the ``kinds`` as many, with SIGKILL.
 
-    Before each kill a bunch is picked. ``announce`` takes a line for each kill. :class:`ProcessFailed` if a program
+    Before each round a bunch is picked. ``announce`` takes a line for each round. :class:`ProcessFailed` if a program
     ends that was not killed.
     """
     random = np.random.default_rng(seed)
@@ -62,33 +68,41 @@ def kill(
         missing = _wait_until_all_go_on(vineyard, START_TIMEOUT)[1]
         if missing:
             raise ProcessFailed(f"not ready after {START_TIMEOUT:.0f} s: {', '.join(missing)}")
-        order = random.permutation([possible[i % len(possible)] for i in range(times)])
-        kills = []
-        for number, kind in enumerate(order, 1):
-            kills.append(_kill_one(vineyard, str(kind), random))
-            last = kills[-1]
+        rounds: list[Round] = []
+        count = -(-times // len(possible))
+        for number in range(1, count + 1):
+            rounds.append(last := _run_round(vineyard, possible, random))
             effect = f"MISSING {', '.join(last.missing)}" if last.missing else f"all go on after {last.took:.1f} s"
-            announce(f"{number} of {times}: {last.victim} killed; {effect}")
+            announce(f"round {number} of {count}: {', '.join(last.kinds)} killed; {effect}")
         picked = len(vineyard.picked)
-    yield from _rows(kills, possible, picked)
+    yield from _rows(rounds, possible, picked)
 
 
-def _kill_one(vineyard: Vineyard, kind: str, random: np.random.Generator) -> Kill:
+def _run_round(vineyard: Vineyard, kinds: Sequence[str], random: np.random.Generator) -> Round:
+    """Kill one of each kind; a worker of the robot whose client is not killed."""
     vineyard.pick()
-    end = time.monotonic() + random.uniform(0.0, LONGEST_PAUSE)
-    while time.monotonic() < end:
-        vineyard.step()
-    robot = str(random.choice(ROBOTS))
-    is_worker = kind in ("sensors", "ROS node")
-    name, worker = robot if is_worker or kind == "client" else kind, kind if is_worker else ""
-    ended = [vineyard.workers(robot)[worker]] if is_worker else []
-    if kind == "client":
-        ended = list(vineyard.workers(robot).values())
-    moment = vineyard.kill(name, worker)
+    killed, other = (str(name) for name in random.permutation(ROBOTS))
+    order = [str(kind) for kind in random.permutation(list(kinds))]
+    start = time.monotonic()
+    moments = np.sort(random.uniform(0.0, MEAN_PAUSE * len(kinds), len(kinds)))
+    ended: list[int] = []
+    restarts = vineyard.sensor_restarts(other)
+    moment = start
+    for kind, after in zip(order, moments, strict=True):
+        while time.monotonic() < start + after:
+            vineyard.step()
+        if kind in WORKERS:
+            ended.append(vineyard.workers(other)[kind])
+            moment = vineyard.kill(other, kind)
+        else:
+            if kind == "client":
+                ended += vineyard.workers(killed).values()
+            moment = vineyard.kill(killed if kind == "client" else kind)
     took, missing = _wait_until_all_go_on(vineyard, GO_ON_TIMEOUT, moment, ended)
-    result = Kill(kind, f"{kind} of {robot}" if is_worker else name, took, missing)
-    if kind == "sensors" and not missing:
-        result.sensor_restart = vineyard.programs[robot].lines[-1][1]["sensor_restart_s"]
+    result = Round(tuple(order), took, missing)
+    if "sensors" in kinds and not missing:
+        assert vineyard.sensor_restarts(other) > restarts
+        result.sensor_restart = vineyard.programs[other].lines[-1][1]["sensor_restart_s"]
     return result
 
 
@@ -111,19 +125,17 @@ def _wait_until_all_go_on(
             return took, missing
 
 
-def _rows(kills: Sequence[Kill], kinds: Sequence[str], picked: int) -> Iterator[Measurement]:
+def _rows(rounds: Sequence[Round], kinds: Sequence[str], picked: int) -> Iterator[Measurement]:
+    good = [one.took for one in rounds if not one.missing]
     for kind in kinds:
-        mine = [one for one in kills if one.kind == kind]
-        if not mine:
-            continue
-        good = [one.took for one in mine if not one.missing]
         yield Measurement(
-            "kill", f"{kind}: kills after which all went on", len(good), "1", "kills", len(mine), len(good) / len(mine)
-        )
-        if good:
-            yield Measurement("kill", f"{kind}: until all went on, p50", statistics.median(good), "s")
-            yield Measurement("kill", f"{kind}: until all went on, at most", max(good), "s")
-    restarts = [one.sensor_restart for one in kills if one.sensor_restart is not None]
+            "kill", f"{kind}: kills after which all went on", len(good), "1", "kills", len(rounds),
+            len(good) / len(rounds),
+        )  # fmt: skip
+    if good:
+        yield Measurement("kill", "from the last kill of a round until all went on, p50", statistics.median(good), "s")
+        yield Measurement("kill", "from the last kill of a round until all went on, at most", max(good), "s")
+    restarts = [one.sensor_restart for one in rounds if one.sensor_restart is not None]
     if restarts:
         yield Measurement("kill", "sensors: from the new start to ready, p50", statistics.median(restarts), "s")
         worst = max(restarts)
@@ -131,4 +143,4 @@ def _rows(kills: Sequence[Kill], kinds: Sequence[str], picked: int) -> Iterator[
             "kill", "sensors: from the new start to ready, at most", worst, "s", "budget, at most", RESTART_BOUND,
             RESTART_BOUND / worst,
         )  # fmt: skip
-    yield Measurement("kill", "bunches picked, and so on all clients after every kill", picked, "1")
+    yield Measurement("kill", "bunches picked, and so on all clients after every round", picked, "1")

@@ -137,6 +137,10 @@ class Vineyard:
         lines = self.programs[robot].lines
         return {what.removesuffix(f" of {robot}"): pid for what, pid in lines[-1][1]["processes"].items()}
 
+    def sensor_restarts(self, robot: str) -> int:
+        """How often the sensor process of a robot was started again, as its client said last."""
+        return int(self.programs[robot].lines[-1][1]["sensor_restarts"])
+
     # ------------------------------------------------------------------ a kill
 
     def kill(self, name: str, worker: str = "") -> float:
@@ -177,6 +181,8 @@ class Vineyard:
             missing.append(f"picked bunches ({newest['bunches_picked']} of {len(self.picked)})")
         if not newest["sensors_ready"]:
             missing.append("sensors")
+        if f"standby of {name}" not in newest["processes"]:
+            missing.append("standby process")
         return missing
 
     def _missing_of_server(self, moment: float) -> list[str]:

@@ -1,24 +1,30 @@
-"""``vinesim bench fuzz``: a hundred thousand corrupted messages from an admitted actor, and their effect.
+"""``vinesim bench fuzz``: corrupted messages and well-formed lies from admitted actors and strangers, and their effect.
 
 Every message begins as a well-formed one of any kind, whose content may be impossible (records with cuts, parents and
 states of trees, objects that there are not), and is then corrupted: bits flipped, cut off, extended, spliced with
 another, filled with extreme values, sent again later, sent under the key of another kind or under an odd key, or
-replaced by noise or by a megabyte. It comes from an admitted actor, or from a stranger under any name.
+replaced by noise or by a megabyte. It comes from an admitted actor, or from a stranger under any name. It reaches a
+client with physics, another client without, and the server's store of records; after every step they are held against
+the laws of :mod:`vinesim.bench.support.fuzz_world`. Well-formed lies: :mod:`vinesim.bench.support.lies`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import random
 import struct
 import time
 from collections.abc import Iterator, Sequence
+from typing import Protocol
 
 import msgspec
 import numpy as np
 
 from vinesim import frames
 from vinesim.bench.support.fake_client import FakeClient, swinging_state, tree_row
+from vinesim.bench.support.fuzz_world import ATTACKER, DT, WORLD, FuzzWorld
+from vinesim.client.client import Client
 from vinesim.net.codec import messages
 from vinesim.net.codec.couplings import MAX_COUPLINGS, CouplingMessage, encode_couplings
 from vinesim.net.codec.human import encode_pose
@@ -30,10 +36,11 @@ from vinesim.net.replication.streams import object_counts
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
-from vinesim.scene.values import Coupling, Measurement
+from vinesim.scene.values import Coupling, HumanUpdate, Measurement, RobotUpdate
 
-ATTACKER = "evil"
 MESSAGE_COUNT = 100_000
+MESSAGES_PER_TICK = 200
+"""Messages in one step of a world under attack: 20,000 a second."""
 MESSAGES_PER_STEP = 50
 """Messages in one step: 5,000 a second, as many as eighty robots send."""
 
@@ -43,7 +50,16 @@ _EXTREMES = (
 )  # fmt: skip
 
 
-def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Random) -> tuple[str, bytes]:
+class Sender(Protocol):
+    """In whose name messages are made."""
+
+    @property
+    def name(self) -> str: ...
+
+    def pose(self, now: float) -> RobotUpdate | HumanUpdate: ...
+
+
+def valid_message(model: Model, actor: Sender, now: float, chance: random.Random) -> tuple[str, bytes]:
     """A family of keys and a well-formed message as ``actor`` might send it; what it says may be impossible."""
     kind = chance.choice(("a", "tree", "things", "own", "fact", "force", "control"))
     claim = Claim(chance.randrange(3), chance.randrange(1 << 16), actor.name)
@@ -79,6 +95,9 @@ def valid_message(model: Model, actor: FakeClient, now: float, chance: random.Ra
         messages.encode_hello(Hello(actor.name, scene="fake_clients", digest="fake_clients")),
         messages.encode_time(now, chance.uniform(-1e9, 1e9)),
         messages.encode_welcome(messages.Welcome("go away")),
+        messages.encode_part(messages.MeshPart("0" * 40, 36, 0, chance.randbytes(36))),
+        messages.encode_request(chance.randrange(100)),
+        messages.encode_wanted(messages.MeshWanted(chance.randrange(100))),
     ))  # fmt: skip
 
 
@@ -195,21 +214,35 @@ def corrupt(payload: bytes, other: bytes, chance: random.Random) -> bytes:
 
 
 def storm(
-    model: Model, actor: FakeClient, seed: int, now: float = 0.0, names: Sequence[str] = ()
-) -> Iterator[tuple[str, bytes]]:
+    model: Model, actor: Sender, seed: int, now: float = 0.0, names: Sequence[str] = (), *, pool_size: int = 0,
+    period: float = 0.001,
+) -> Iterator[tuple[str, bytes]]:  # fmt: skip
     """Corrupted messages without end, each with the key it is sent under; ``names`` of senders instead of the actor's
-    own."""
+    own.
+
+    ``pool_size``: so many well-formed messages are used many times, each time corrupted anew and with the present time,
+    and replaced one after the other; 0: each is made anew. ``period`` [s]: time between two messages.
+    """
     chance = random.Random(seed)
     cells = sorted({interest.cell_of(pose[:3]) for pose in model.tree_pose.astype(float)})
     earlier = [encode_pose(actor.pose(now))]
+    pool: list[tuple[str, bytes, float]] = []
     while True:
-        family, payload = valid_message(model, actor, now, chance)
+        if len(pool) < pool_size or not pool_size or chance.random() < 0.1:
+            family, payload = valid_message(model, actor, now, chance)
+            if pool_size:
+                pool.append((family, payload, now))
+                if len(pool) > pool_size:
+                    pool[chance.randrange(pool_size)] = pool.pop()
+        else:
+            family, payload, made = chance.choice(pool)
+            payload = messages.shift_time(payload, now - made)
         bad = corrupt(payload, chance.choice(earlier), chance)
         if len(bad) < 1000:
             earlier = [*earlier[-50:], bad]
         if chance.random() < 0.1:
             bad = chance.choice(earlier)
-        now += 0.001
+        now += period
         yield key_of(family, chance.choice(names or (actor.name,)), cells, chance), bad
 
 
@@ -268,24 +301,95 @@ def run_storm(
     return Storm((ada, bob), np.array(spent), received_count(ada) - before)
 
 
-def received_count(fake_client: FakeClient) -> int:
+def received_count(fake_client: FakeClient | Client) -> int:
     """Messages that arrived."""
     counters = fake_client.replicator.counters
     families = (counters.actor, counters.environment, counters.event, counters.retained, counters.force)
     return sum(family.messages_in for family in families)
 
 
-def fuzz() -> Iterator[Measurement]:
-    """Rows of the benchmark."""
-    result = run_storm(MESSAGE_COUNT)
-    counters, spent, arrived = result.clients[0].replicator.counters, result.step_times, result.arrived
-    for case, value, unit in (
-        ("broken messages sent", MESSAGE_COUNT, ""),
-        ("arrived at a subscriber, newest poses only", arrived, ""),
-        ("counted as malformed", counters.malformed, ""),
-        ("counted as sound and of no use", counters.dropped, ""),
-        ("a tick with 50 of them, p50", 1e3 * np.percentile(spent, 50), "ms"),
-        ("a tick with 50 of them, p99", 1e3 * np.percentile(spent, 99), "ms"),
-        ("a tick with 50 of them, max", 1e3 * spent.max(), "ms"),
+@dataclasses.dataclass(slots=True)
+class Attack:
+    """What became of the messages of one attack."""
+
+    sent: int = 0
+    arrived: int = 0
+    """... at the client with physics; of poses and states those that were not replaced before the step."""
+    malformed: int = 0
+    """... and were refused by it."""
+    records: int = 0
+    """Messages with records that reached the server's store."""
+    checks: int = 0
+    """How often all laws were checked, and held."""
+    tick: float = 0.0
+    """[s] Processor time of a tick of the client, mean."""
+
+
+def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool = False) -> Attack:
+    """Send that many corrupted messages into a :class:`FuzzWorld`, from an actor of this ``kind`` or from a stranger.
+
+    Every tenth step the actor's greeting is corrupted as well, and every hundredth one it leaves and comes back. Raises
+    what the product raises, or :class:`vinesim.bench.support.fuzz_world.LawBroken`.
+    """
+    done, chance = Attack(), random.Random(seed)
+    with FuzzWorld(kind=kind, is_stranger=is_stranger, seed=seed) as world:
+        names = (
+            [f"stranger_{number}" for number in range(200)] if is_stranger else [ATTACKER] * 17 + ["ada", "bob", "x"]
+        )
+        wild = storm(
+            world.model, world, seed, world.now, [ATTACKER, *names], pool_size=2000, period=DT / MESSAGES_PER_TICK
+        )
+        before = received_count(world.client)
+        greeting = messages.encode_hello(world.hello(kind))
+        for step in range(-(-count // MESSAGES_PER_TICK)):
+            for key, payload in itertools.islice(wild, MESSAGES_PER_TICK):
+                world.put(key, payload)
+                world.offer(payload)
+            bad = corrupt(greeting, payload, chance)
+            if step % 10 == 0:
+                world.admission.decide(WORLD, ATTACKER, "another", bad, world.now)
+            if step % 100 == 50:
+                world.greet(bad)
+            elif step % 100 == 99:
+                world.admit(kind)
+            begin = time.thread_time()
+            world.step()
+            done.tick += time.thread_time() - begin
+            if step % 5 == 0:
+                world.check()
+                done.checks += 1
+        world.run(1.0)  # and the world goes on
+        world.check()
+        counters = world.client.replicator.counters
+        done.sent, done.arrived = (step + 1) * MESSAGES_PER_TICK, received_count(world.client) - before
+        done.malformed, done.records, done.tick = (
+            counters.malformed,
+            world.store.counters.received,
+            done.tick / (step + 1),
+        )
+        world.check_store()
+    return done
+
+
+def fuzz(count: int = MESSAGE_COUNT, lies: int = 0) -> Iterator[Measurement]:
+    """Rows of the benchmark: ``count`` corrupted messages and ``lies`` series of well-formed lies."""
+    for case, share, kind, is_stranger in (
+        ("a person that was admitted", 0.45, "human", False),
+        ("a robot that was admitted", 0.45, "robot", False),
+        ("a stranger", 0.1, "human", True),
     ):
-        yield Measurement("fuzz", case, float(value), unit)
+        done = attack(round(share * count), kind=kind, is_stranger=is_stranger) if count else Attack()
+        for what, value, unit in (
+            ("broken messages sent", done.sent, ""),
+            ("arrived at a client", done.arrived, ""),
+            ("of those refused as malformed", done.malformed, ""),
+            ("reached the store of the server", done.records, ""),
+            ("checks of all laws, none broken", done.checks, ""),
+            (f"a step with {MESSAGES_PER_TICK} of them, two clients, mean", 1e3 * done.tick, "ms"),
+        ):
+            yield Measurement("fuzz", f"{case}: {what}", float(value), unit)
+    for kind in ("human", "robot") if lies else ():
+        from vinesim.bench.support.lies import tell_lies  # needs hypothesis
+
+        told = tell_lies(lies // 2, kind=kind)
+        yield Measurement("fuzz", f"a {kind} that lies: well-formed lies told, no law broken", float(told), "")

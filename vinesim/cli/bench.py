@@ -98,10 +98,13 @@ def _actors() -> Iterator[Measurement]:
     return actors()
 
 
-def _fuzz() -> Iterator[Measurement]:
+def _fuzz(messages: int = 100_000, lies: int = 0) -> Iterator[Measurement]:
     from vinesim.bench.message_fuzz import fuzz
 
-    return fuzz()
+    for option, value in (("messages", messages), ("lies", lies)):
+        if value < 0:
+            raise UsageError(f"--{option} is {value}: give 0 or more")
+    return fuzz(messages, lies)
 
 
 def _link() -> Iterator[Measurement]:
@@ -171,7 +174,14 @@ class NoSuchBench(ValueError):
 
 
 def _measurements(
-    name: str, plot: pathlib.Path | None, rows: Sequence[str], minutes: float | None, times: int, seed: int
+    name: str,
+    plot: pathlib.Path | None,
+    rows: Sequence[str],
+    minutes: float | None,
+    times: int,
+    seed: int,
+    messages: int,
+    lies: int,
 ) -> Iterator[Measurement]:
     drawn = {"sync": _sync, "sensors": _sensors}.get(name)
     try:
@@ -181,10 +191,12 @@ def _measurements(
             yield from _soak(minutes)
         elif name == "kill":
             yield from _kill(times, seed)
+        elif name == "fuzz":
+            yield from _fuzz(messages, lies)
         else:
             yield from drawn(plot) if drawn else BENCHES[name]()
     except ModuleNotFoundError as missing:
-        if not (missing.name or "").startswith("vinesim.bench.support"):
+        if not (missing.name or "").startswith(("vinesim.bench.support", "hypothesis")):
             raise
         raise NoSuchBench(
             f"bench {name} needs load generators that are not installed; run it in a checkout of vinesim"
@@ -193,12 +205,12 @@ def _measurements(
 
 def run(
     names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = (),
-    minutes: float | None = None, times: int = 50, seed: int = 1,
+    minutes: float | None = None, times: int = 50, seed: int = 1, messages: int = 100_000, lies: int = 0,
 ) -> int:  # fmt: skip
     """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
     ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none;
-    ``minutes`` of soak; ``times`` and ``seed`` of kill.
+    ``minutes`` of soak; ``times`` and ``seed`` of kill; ``messages`` and ``lies`` of fuzz.
     """
     if rows and "live" not in names:
         raise NoSuchBench("--row chooses rows of the bench live; leave it out")
@@ -208,7 +220,7 @@ def run(
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in _measurements(name, plot, rows, minutes, times, seed):
+        for m in _measurements(name, plot, rows, minutes, times, seed, messages, lies):
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

@@ -37,6 +37,8 @@ STATUS_PERIOD = 1.0
 """Wall time between two status lines [s]."""
 FIRST_STATUS = 0.1
 """Wall time from the first step to the first status line [s]: shows early that the client runs."""
+CLOCK_TIMEOUT = 2.0
+"""How long the first step waits for the server's clock [s]."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -112,6 +114,8 @@ class ClientSession:
         ``sent`` counts the ROS messages by topic, ``sensors`` gives the status of sensors, ``publish`` takes every
         status for /diagnostics.
         """
+        if self.options.connect is not None:
+            client.wait_for_clock(CLOCK_TIMEOUT)
         loop = RateLoop(client.physics.dt)
         status = Status(client, loop, sent, task, sensors)
         reporter = threading.Thread(

@@ -60,6 +60,7 @@ def run(
     people: Sequence[str] = (),
     crates: Sequence[str] = (),
     hour: float | None = None,
+    time: float = 0.0,
     renderer: str = "warp",
     device: str = "cpu",
 ) -> int:
@@ -75,6 +76,7 @@ def run(
     from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
+    from vinesim.scene.wind import wind_of
     from vinesim.sensors.camera.camera import CameraSpec
     from vinesim.sensors.export.dataset import resized_intrinsics
     from vinesim.sensors.raster import renderer_selection
@@ -90,11 +92,15 @@ def run(
     compile_kernels(SENSOR_PACKAGES, device)
     model = generate(plan)
     view = staged.compose(model, plan.physics)
+    if (wind := wind_of(plan)) is not None:
+        from vinesim.physics.plants.sway import windblown  # the kernels of plants: half a second
+
+        view = windblown(model, view, wind, time)
     primitives = Primitives(model, renderer=renderer, device=device)
     primitives.update(view)
     for viewpoint in viewpoints:
         _check_not_enclosed(primitives, viewpoint)
-    stage = _Stage(plan, model, staged, view, primitives, RayCaster(primitives), spec, info)
+    stage = _Stage(plan, model, staged, view, primitives, RayCaster(primitives), spec, info, time)
     try:
         with concurrent.futures.ThreadPoolExecutor(1, "png") as writer:
             written: list[concurrent.futures.Future[None]] = []
@@ -145,6 +151,8 @@ class _Stage:
     caster: RayCaster
     spec: CameraSpec
     info: CameraInfo
+    time: float
+    """[s] Simulated, for the sun."""
 
     def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
         """The picture from a viewpoint, and in words what is in sight."""
@@ -159,7 +167,12 @@ class _Stage:
         truths = ground_truth.bunch_truths(self.primitives, self.view, seen, self.caster)
         # a camera for each picture: none depends on those before it
         camera = Camera(
-            self.spec, self.info, "camera", self.plan.sun.direction(), quality="still", device=self.primitives.device
+            self.spec,
+            self.info,
+            "camera",
+            self.plan.sun.direction(self.time),
+            quality="still",
+            device=self.primitives.device,
         )
         frame = camera.render(self.primitives, pose)
         assert frame.exact_depth is not None, "a camera that renders by itself gives exact depth"

@@ -71,7 +71,7 @@ def _start_sensors(
         process = RobotProcesses(
             name, session.scene, session.model, description, namespace="/".join(filter(None, parts)), ros=options.ros,
             keep_pictures=options.out is not None and i == 0, sensor_hz=options.sensor_hz,
-            clock=not options.namespace and i == 0, renderer=options.renderer, device=options.device,
+            clock=i == 0, renderer=options.renderer, device=options.device,
         )  # fmt: skip
         processes.append(session.enter(process))
     return processes

@@ -29,12 +29,12 @@ from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
 from vinesim.client.remote.plant_couplings import PlantCouplings
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
+from vinesim.client.world_time import WorldTime
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
-from vinesim.physics.plants.wind import Wind
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.urdf import RobotError
 from vinesim.physics.step import Physics
@@ -46,6 +46,7 @@ from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 from vinesim.scene.values import Coupling, HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.wind import wind_of
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +57,10 @@ def label_index(name: str) -> int:
     With 64 actors the chance that two have the same is 0.2 %.
     """
     return zlib.crc32(name.encode()) % LABEL_STRIDE
+
+
+CLOCK_POLL_PERIOD = 0.005
+"""Time between two looks for the server's first reply [s]."""
 
 
 class Client:
@@ -90,9 +95,7 @@ class Client:
         """
         self.name, self.model, self.scene = name, model, scene
         self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking)
-        if any(scene.wind.mean) or scene.wind.gusts > 0.0:
-            wind = scene.wind
-            self.physics.wind = Wind(np.array(wind.mean), gusts=wind.gusts, scale=wind.scale, seed=scene.seed)
+        self.physics.wind = wind_of(scene)
         self.robots: dict[str, Robot] = {}
         """Robots that this client simulates, by name; the first is :attr:`robot`."""
         self.humans: dict[str, LocalHuman] = {}
@@ -119,6 +122,8 @@ class Client:
         self.trace: Trace | None = None
         """If set, force on and displacement of one bunch are recorded in it."""
         self.interest_audit = InterestAudit()
+        self.world_time = WorldTime(self.physics.dt)
+        """Time of the world, in which ROS messages are stamped."""
         self._clock = clock
         self._remote_trees: dict[int, TreeUpdate] = {}
         self.spawner = RemoteSpawner(self.physics.rigid, description, executor, self.meshes)
@@ -183,12 +188,22 @@ class Client:
         """Simulate one step of ``physics.dt``."""
         now = self._clock()
         self.receive(now)
+        if self.replicator.has_clock:
+            self.world_time.follow(self.physics.time, now + self.replicator.offset)
+        self.physics.wind_time_offset = self.world_time.offset
         self.control()
         self.physics.step()
         self.sense()
         self.send(now)
         for callback in self.wake_readers:
             callback()
+
+    def wait_for_clock(self, timeout: float) -> None:
+        """Before the first step: wait up to ``timeout`` [s] for the server's clock, so that no stamp jumps later."""
+        until = self._clock() + timeout
+        while not self.replicator.has_clock and self._clock() < until:
+            self.receive(self._clock())
+            time.sleep(CLOCK_POLL_PERIOD)
 
     # ------------------------------------------------------------------ the parts of a tick
 
@@ -203,12 +218,12 @@ class Client:
             self.spawner.cancel(name)
             self.meshes.forget(name)
             if (other := self.remote_actors.pop(name, None)) is not None:
-                other.remove()
-                self.physics.contact_solver.remote_actors.discard(name)
+                self.spawner.remove(name, other)
                 log.info("%s left", name)
         updates: dict[str, RobotUpdate | HumanUpdate] = {**inbox.robots, **inbox.people}
         spawned = self.spawner.spawn(updates)
         self.remote_actors.update(spawned)
+        self.physics.contact_solver.remote_actors.difference_update(self.spawner.removed())
         self.physics.contact_solver.remote_actors.update(spawned)
         for name, update in updates.items():
             match self.remote_actors.get(name), update:
@@ -395,9 +410,9 @@ class InterestAudit:
             self._seen = sent
             return
         rigid = client.physics.rigid
-        here = [rigid.actor_position(name)[:2] for name in client.replicators]
-        there = [rigid.actor_position(name)[:2] for name in client.remote_actors]
-        distance = min((float(np.hypot(*(a - b))) for a in here for b in there), default=np.inf)
+        here = np.array([rigid.actor_position(name)[:2] for name in client.replicators])
+        there = np.array([rigid.actor_position(name)[:2] for name in client.remote_actors])
+        distance = float(np.linalg.norm(here[:, None] - there, axis=-1).min())
         if distance > client.replicator.interest_radius + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching

@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 DESCRIPTIONS = {
     "trees_stopped": "trees moved too fast, or by a number that is not finite, and were put to rest",
     "trees_slowed": "trees turned faster than max_joint_rate and were slowed below it, which takes energy from them",
-    "robots_stopped": "robots or boxes moved by a number that is not finite and were put back",
+    "robots_stopped": "robots or boxes moved by a number that is not finite, or too fast, and were put back",
     "contacts_dropped": "contacts were left out, as there were more than there is room for",
     "geoms_skipped": "static geoms near a tree were left out, as there are more than max_static_geoms_per_tree",
     "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",

@@ -14,6 +14,7 @@ from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.replication_state import SPECTATOR
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
+from vinesim.physics.plants.sway import Sway
 from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
 from vinesim.sensors.camera.camera import Camera, CameraSpec
@@ -102,6 +103,7 @@ class PictureWriter:
             CameraSpec.load("pinhole"), info, "viewpoint", sun, quality="full", shadow_period=0.0, device=device
         )
         self._primitives = Primitives(spectator.model, renderer=renderer, device=device)
+        self._sway = Sway(spectator.model)
         self._moved = np.zeros(len(spectator.model.tree_first), bool)
         self._every = max(round(period / spectator.physics.dt), 1)
         spectator.post_step.append(self._after_step)
@@ -114,8 +116,8 @@ class PictureWriter:
             self._draw(client)
 
     def _draw(self, spectator: Spectator) -> None:
-        view = spectator.physics.snapshot()
-        self._primitives.update(view, np.flatnonzero(self._moved))
+        view = self._sway.apply(spectator.physics.snapshot(), np.flatnonzero(self._moved))
+        self._primitives.update(view, view.moved_trees)
         self._moved[:] = False
         ahead = frames.rotate(spectator.pose[3:], np.array([1.0, 0.0, 0.0]))
         eye = images.look_at(spectator.pose[:3], spectator.pose[:3] + ahead)

@@ -61,6 +61,7 @@ class Status:
         return {
             "name": client.name,
             "time": client.physics.time,
+            "world_time": client.physics.time + client.world_time.offset,
             "tick_hz": loop.hz,
             "tick_p50_ms": p50,
             "tick_p99_ms": p99,

@@ -19,7 +19,7 @@ from vinesim.physics.plants.fault_guard import FaultGuard
 from vinesim.physics.plants.level_of_detail import LevelOfDetail
 from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.physics.plants.validation import warn_of_raised_damping
-from vinesim.physics.plants.wind import Wind
+from vinesim.physics.plants.wind import WindOnPlants
 from vinesim.physics.rigid.dormant_bunches import DormantBunches
 from vinesim.physics.rigid.hand_grasp import GraspManager
 from vinesim.physics.rigid.rigid_world import RigidWorld
@@ -36,6 +36,7 @@ from vinesim.scene.values import (
     RobotSpec,
     Snapshot,
 )
+from vinesim.scene.wind import Wind
 
 
 class Physics:
@@ -75,7 +76,11 @@ class Physics:
         self.sleep_monitor = SleepMonitor(self.plants, p)
         self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
-        """The wind, None for calm; may be set at any time between steps."""
+        """The wind, None for calm; may be set at any time between steps, and then begins or ends in two seconds."""
+        self.wind_time_offset = 0.0
+        """[s] Time of the wind minus :attr:`time`: makes gusts those of other clients."""
+        self.wind_on_plants = WindOnPlants(self.plants, p)
+        """Which trees feel the wind."""
         self.detachments: tuple[Detachment, ...] = ()
         """What left its plant in the last step, or by command before it; sorted by body."""
         self.remotely_posed = np.zeros(0, np.int32)
@@ -127,10 +132,10 @@ class Physics:
     # ------------------------------------------------------------------ stages that pass values between parts
 
     def _set_wind(self) -> None:
-        if self.wind is not None:
-            actors = [self.rigid.actor_position(name) for name in self.rigid.actors]
-            observers = (np.array(actors), self.parameters.wind_radius) if actors else None
-            self.wind.update(self.plants, self.time, observers, self.parameters)
+        observers = None
+        if self.wind is not None and (actors := self.rigid.actors):
+            observers = np.array([self.rigid.actor_position(name) for name in actors]), self.parameters.wind_radius
+        self.wind_on_plants.update(self.wind, self.time + self.wind_time_offset, observers)
 
     def _refine_bunches(self) -> None:
         coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
@@ -214,6 +219,7 @@ class Physics:
             visuals=self.visuals(),
             visual_q=self.visual_q(),
             moved_trees=np.union1d(self.plants.awake, self.remotely_posed),
+            wind=self.wind_on_plants.state,
         )
 
     def visuals(self) -> tuple[RigidVisual, ...]:

@@ -77,6 +77,9 @@ class Node:
     def _wake(self) -> None:
         """Wake the node's own threads."""
 
+    def _look_around(self) -> None:
+        """Called by the receiving thread every :data:`SUBSCRIPTION_COUNT_PERIOD`."""
+
     def has_subscribers(self, family: str) -> bool:
         """Whether a topic, or one below it, has subscribers: ``"head_front_camera/depth"``, ``"lidar"``, ``"tf"``.
 
@@ -119,8 +122,15 @@ class Node:
 
     def _advertise(self, message: type, name: str, qos: QoSProfile = RELIABLE) -> Topic:
         topic = Topic(name, self._node.create_publisher(message, name, qos))
+        if (before := self._topics.get(name)) is not None:
+            topic.sent, topic.dropped = before.sent, before.dropped
         self._topics[name] = topic
         return topic
+
+    def _withdraw(self, topic: Topic) -> None:
+        """Take a topic's publisher out of the ROS graph; what was counted of it stays."""
+        topic.close()
+        self._node.destroy_publisher(topic.publisher)
 
     def _receive(self) -> None:
         """The receiving thread: commands, the services that every node has, and counts of subscribers."""
@@ -131,6 +141,7 @@ class Node:
             except Exception:
                 log.exception("a ROS callback failed; the node goes on")
             if wall.monotonic() >= next_count:
-                for topic in self._topics.values():
+                self._look_around()
+                for topic in list(self._topics.values()):
                     topic.update_subscription_count()
                 next_count = wall.monotonic() + SUBSCRIPTION_COUNT_PERIOD

@@ -6,30 +6,38 @@ Every message is built and sent by the thread that passes its values, in order.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from xml.etree import ElementTree
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 
-from vinesim.ros.commands.subscriptions import CommandSubscriptions
-from vinesim.ros.commands.types import Command
+from vinesim.ros.commands.actions import ControllerActions
+from vinesim.ros.commands.subscriptions import CommandQueue, CommandSubscriptions
+from vinesim.ros.commands.types import Command, GoalResult
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.node import Node
-from vinesim.ros.publishers.clock import ClockPublisher
+from vinesim.ros.publishers.clock import CLOCK, ClockPublisher
+from vinesim.ros.publishers.contacts import ContactPublisher
+from vinesim.ros.publishers.control import ControlPublisher
 from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
+from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
 from vinesim.ros.publishers.robot import RobotPublisher
 from vinesim.ros.topic import RELIABLE, PendingMessage
-from vinesim.scene.values import ComponentStatus, RobotSample
+from vinesim.scene.values import ComponentStatus, ControllerSpec, RobotSample
 
-TRAJECTORY_CONTROLLERS = ("arm_left_controller", "arm_right_controller", "torso_controller", "head_controller")
-"""Names of the controllers that take joint trajectories, as vinebot has them."""
+FEEDBACK_PERIOD = 5
+"""Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
+OWN_MESSAGES = ("tf2_msgs", "control_msgs")
+"""Message packages that no wheel has."""
 
 
 class RobotNode(Node):
     """One robot's topics but those of its cameras and lidars (:mod:`vinesim.ros.sensor_node`).
 
-    ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``controllers`` those that take
-    trajectories. All topics but /clock stand under the namespace, tf too (as Nav2 does with several robots); a second
-    robot of a ROS domain should be made with ``clock=False``.
+    ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
+    sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none. All topics but /clock
+    stand under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether this node may publish it,
+    which one node of a ROS domain does.
     """
 
     def __init__(
@@ -39,32 +47,64 @@ class RobotNode(Node):
         *,
         namespace: str = "",
         static_transforms: Sequence[tuple[str, str, np.ndarray]] = (),
-        controllers: Sequence[str] = TRAJECTORY_CONTROLLERS,
+        controllers: Sequence[ControllerSpec] = (),
+        imus: Sequence[str] = (),
+        wrenches: Sequence[str] = (),
+        bunch_of_body: np.ndarray | None = None,
         base: str = "base_footprint",
         clock: bool = True,
     ) -> None:
-        message_packages.ensure_importable(["tf2_msgs"])
+        message_packages.ensure_importable(OWN_MESSAGES)
         self._urdf, self._static_transforms, self._base = urdf, static_transforms, base
         self._has_clock, self._controllers = clock, controllers
-        super().__init__(name, namespace, controllers)
+        self._imus, self._wrenches = imus, wrenches
+        self._bunch_of_body = np.zeros(0, np.int32) if bunch_of_body is None else bunch_of_body
+        self._commands = CommandQueue()
+        self._steps = 0
+        names = [spec.name for spec in controllers]
+        super().__init__(name, namespace, [*names, *imus, *wrenches])
 
     def _open(self) -> None:
         from tf2_msgs.msg import TFMessage
 
-        self._clock = ClockPublisher(self._advertise) if self._has_clock else None
+        self._clock = ClockPublisher(self._node, self._advertise, self._withdraw) if self._has_clock else None
         self._robot = RobotPublisher(self._advertise, TFMessage, self._urdf, self._static_transforms, self._base)
         self._ground_truth = GroundTruthPublisher(self._advertise, TFMessage)
         self._diagnostics = self._advertise(DiagnosticArray, "diagnostics", RELIABLE)
-        self._commands = CommandSubscriptions(self._node, self._controllers)
+        self._proprioception = ProprioceptionPublisher(self._advertise, self._imus, self._wrenches)
+        self._control = ControlPublisher(self._advertise, self._controllers)
+        links = ElementTree.fromstring(self._urdf).iterfind("link")
+        numbers = {link.get("name", ""): number for number, link in enumerate(links)}
+        self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers)
+        self._actions = ControllerActions(self._node, self._controllers, self._commands)
+        CommandSubscriptions(self._node, self._controllers, self._commands)
+
+    def has_subscribers(self, family: str) -> bool:
+        return self.has_clock_subscribers if family == CLOCK else super().has_subscribers(family)
+
+    @property
+    def has_clock_subscribers(self) -> bool:
+        """Whether this node publishes /clock, and has subscribers to it."""
+        return self._clock is not None and self._clock.has_subscribers
+
+    def _look_around(self) -> None:
+        if self._clock is not None:
+            self._clock.update()
 
     def publish_clock(self, time: float) -> None:
-        """Publish /clock at simulation time ``time`` [s], if this node has it; for every step."""
+        """Publish /clock at ``time`` [s], if this node is the one that does; for every step."""
         if self._clock is not None:
             self._send(self._clock.pending(time))
 
     def publish_robot_state(self, sample: RobotSample) -> None:
-        """Publish joint states, transforms, odometry and contacts; for every step."""
+        """Publish joint states, transforms, odometry, sensors of the body, controllers and contacts; for every step."""
         self._send(self._robot.pending(sample))
+        self._send(self._proprioception.pending(sample))
+        self._send(self._control.pending(sample))
+        self._send(self._contacts.pending(sample))
+        self._steps += 1
+        if self._steps % FEEDBACK_PERIOD == 0 and sample.reference is not None:
+            self._actions.publish_feedback(sample)
 
     def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
         """Publish true poses [name, 7] m, 1 in the map of what moves; 10 to 30 Hz will do.
@@ -87,6 +127,15 @@ class RobotNode(Node):
     def commands(self) -> list[Command]:
         """Commands that arrived since the last call, in order."""
         return self._commands.drain()
+
+    @property
+    def has_goals(self) -> bool:
+        """Whether goals of actions are being executed, whose clients want feedback."""
+        return bool(self._actions.goals)
+
+    def finish_goal(self, result: GoalResult) -> None:
+        """Tell the client of an action how its goal ended."""
+        self._actions.finish(result)
 
     def _send(self, messages: Iterable[PendingMessage], *, always: bool = False) -> None:
         for topic, build in messages:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -11,9 +12,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 log = logging.getLogger(__name__)
 
-RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-TRANSFORMS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""QoS that tf2 listeners expect of /tf."""
+RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+"""A second of messages of every step waits for a subscriber that has no processor; tf2 listeners expect it of /tf."""
 TRANSIENT_LOCAL = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
@@ -37,11 +37,19 @@ class Topic:
         """Messages."""
         self.dropped = 0
         """Messages that were replaced by newer ones before their turn, or that could not be built or sent."""
-        self._publisher = publisher
+        self.publisher = publisher
+        self._lock, self._is_closed = threading.Lock(), False
 
     def update_subscription_count(self) -> None:
         """Query the middleware for the number of subscribers."""
-        self.subscription_count = self._publisher.get_subscription_count()
+        if not self._is_closed:
+            self.subscription_count = self.publisher.get_subscription_count()
+
+    def close(self) -> None:
+        """Send nothing any more; returns when nothing is being sent."""
+        with self._lock:
+            self._is_closed = True
+            self.subscription_count = 0
 
     def build_and_send(self, build: Build) -> None:
         """Build a message and publish it; a failure is counted, and logged once."""
@@ -55,7 +63,10 @@ class Topic:
     def send(self, message: Any) -> None:
         """Publish a message, its serialised bytes, or each message of a list."""
         for one in message if isinstance(message, list) else (message,):
-            self._publisher.publish(one)
+            with self._lock:
+                if self._is_closed:
+                    return
+                self.publisher.publish(one)
             self.sent += 1
 
 

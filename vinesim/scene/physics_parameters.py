@@ -73,7 +73,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     # ------------------------------------------------------------------ wind
     wind_radius: Positive = 4.0
-    """[m] With robots or people in the world, wind moves only the trees whose foot is nearer to one of them than this.
+    """[m] With robots or people in the world, wind is simulated on trees whose foot is nearer to one of them than this.
     DERIVED: gusts let nothing sleep, and a step has time for some hundred awake trees."""
     wind_wake_load: Positive = 0.05
     """[1] A sleeping tree wakes when the drag on it has changed by this share of its weight. TUNED."""
@@ -91,6 +91,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     # ------------------------------------------------------------------ detachment
     detachment_duration: Positive = 0.03
     """[s] A peduncle breaks when it has been overloaded for so long. GUESSED: the peak of one step is no pull."""
+    cutting_strength: Positive = 13.16e6
+    """[Pa] Force of a blade over the cross-section that it cuts. READ: canes of Okuzgozu, JKSUS 2024 36:103034."""
 
     # ------------------------------------------------------------------ contacts with plants
     contact_stiffness: Positive = 2e4

@@ -115,7 +115,7 @@ class Wind(_Part, frozen=True, kw_only=True):
     """How the air moves; see :class:`vinesim.physics.plants.wind.Wind`. Calm unless said."""
 
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """[m/s] world axes"""
+    """[m/s] World axes, at the top of the canopy before the first row."""
     gusts: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
     """Standard deviation of each component about the mean [m/s]."""
     scale: Length = 4.0

@@ -14,6 +14,7 @@ import warp as wp
 
 from vinesim.kernels.raster import lidar_raster, transform_primitives
 from vinesim.kernels.sensing import lidar_echoes
+from vinesim.physics.plants.sway import Sway
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot
 from vinesim.sensors.camera.camera import Camera, load_camera_kernels
@@ -74,6 +75,7 @@ class SensorScheduler:
         self._is_first = dict.fromkeys(names, True)
         """Whether a sensor has delivered at most one frame since it became wanted; the first may take longer."""
         self._scans = {m.name: SpinningScan(m.sensor, m.rate) for m in sensors if isinstance(m.sensor, Lidar)}
+        self._sway = Sway(model)
         self._moved = np.zeros(len(model.tree_first), bool)
         """[tree] whether it moved since the primitives were posed."""
 
@@ -83,7 +85,7 @@ class SensorScheduler:
         The first of each takes many times as long as the others: buffers, tables and the last kernels are made.
         """
         outputs = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
-        self._update_primitives(snapshot)
+        self._update_primitives(snapshot, poses)
         for scheduled in self.sensors:
             yield scheduled.name
             pose = poses[scheduled.name]
@@ -110,14 +112,16 @@ class SensorScheduler:
         due = [m for m in self.sensors if self._is_due(m, snapshot.time, poses)]
         if not due:
             return
-        self._update_primitives(snapshot)
+        self._update_primitives(snapshot, poses)
         for scheduled in due:
             for result in self._results(scheduled, snapshot.time, poses[scheduled.name]):
                 scheduled.deliver(result)
                 self.frames[scheduled.name] += 1
 
-    def _update_primitives(self, snapshot: Snapshot) -> None:
-        self.primitives.update(snapshot, np.flatnonzero(self._moved))
+    def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> None:
+        eye = next((pose[:3] for pose in poses.values()), None)
+        seen = self._sway.apply(snapshot, np.flatnonzero(self._moved), eye)
+        self.primitives.update(seen, seen.moved_trees)
         self._moved[:] = False
 
     def _results(self, scheduled: ScheduledSensor, now: float, pose: np.ndarray) -> Iterator[CameraFrame | LidarScan]:

@@ -41,6 +41,7 @@ def render(
     hour: Annotated[
         float | None, typer.Option(min=0.0, max=24.0, help="Solar time [h], instead of the scene's own sun.")
     ] = None,
+    time: Annotated[float, typer.Option(min=0.0, help="Simulated time [s]: wind and sun.")] = 0.0,
     out: Annotated[pathlib.Path, typer.Option(help="Folder for the picture and its truth.")] = pathlib.Path("render"),
     robot: Annotated[list[str] | None, typer.Option(help="NAME@X,Y[,YAW]: a robot there [m, rad]; may repeat.")] = None,
     person: Annotated[
@@ -69,8 +70,8 @@ def render(
     from vinesim.cli.render import run
 
     code = run(
-        scene, camera=camera, at=at, look=look, path=path, size=size, hour=hour, seed=seed, out=out, renderer=renderer,
-        device=device, robots=robot or (), people=person or (), crates=crate or (),
+        scene, camera=camera, at=at, look=look, path=path, size=size, hour=hour, time=time, seed=seed, out=out,
+        renderer=renderer, device=device, robots=robot or (), people=person or (), crates=crate or (),
     )  # fmt: skip
     raise typer.Exit(code)
 

@@ -23,6 +23,8 @@ def bench(
     ] = None,
     times: Annotated[int, typer.Option(help="Of kill: how many programs are killed.")] = 50,
     seed: Annotated[int, typer.Option(help="Of kill: of the order and the moments.")] = 1,
+    messages: Annotated[int, typer.Option(help="Of fuzz: corrupted messages.")] = 100_000,
+    lies: Annotated[int, typer.Option(help="Of fuzz: series of well-formed lies (needs hypothesis).")] = 0,
 ) -> None:
     """Measure, beside a peer that runs in the same process on the same scene.
 
@@ -31,7 +33,7 @@ def bench(
     sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
     beside budgets). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links;
     needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz
-    (broken messages), kill (programs killed at random moments, while all others go on).
+    (broken messages and well-formed lies), kill (programs killed at random moments, while all others go on).
     Of a long run: soak (memory, threads and open files of robots, people and a recorder; Linux).
 
     \b
@@ -41,27 +43,34 @@ def bench(
       vinesim bench live --json
       vinesim bench live --row demo --row camera
       vinesim bench kill --times 12 --json
+      vinesim bench fuzz --messages 1000000 --lies 2000
       vinesim bench sync --json --plot docs/pictures/network-sync.png
       vinesim bench sensors --plot docs/pictures
       vinesim bench soak --minutes 20 --json
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json, plot, row or (), minutes, times, seed))
+    raise typer.Exit(run(names, json, plot, row or (), minutes, times, seed, messages, lies))
 
 
 def ros_build_interfaces(
     quiet: Annotated[bool, typer.Option(help="Print nothing if all is well, or if ROS is not installed.")] = False,
+    wheel: Annotated[
+        pathlib.Path | None, typer.Option(help="Write wheels into this folder; installs nothing.", show_default=False)
+    ] = None,
 ) -> None:
-    """Build the ROS message packages that have no wheel (once; cached). Needs g++.
+    """Make ROS message packages that have no official wheel importable here (built once; cached). Needs g++.
+
+    They are installed by pip into this environment, for every node that runs in it. What is official stays as it is.
 
     \b
     Examples:
       vinesim ros build-interfaces
+      vinesim ros build-interfaces --wheel wheels
     """
     from vinesim.cli.ros import build
 
-    raise typer.Exit(build(quiet))
+    raise typer.Exit(build(quiet, wheel))
 
 
 def certs_new(

@@ -18,12 +18,13 @@ from vinesim.client.composition.scene_composer import (
     SceneComposer,
 )
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.wind import Wind
+from vinesim.physics.plants.sway import Sway
 from vinesim.physics.step import Physics
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import Snapshot
+from vinesim.scene.wind import Wind
 
 ROBOT_NAMES = ("vinebot", "logistic")
 FOOTPRINT_RADIUS = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}
@@ -35,7 +36,7 @@ CRATE_HEIGHTS = (0.15, 0.20, 0.24, 0.30)
 WIND_SHARE = 0.6
 """Share of the images with actors in which wind blows."""
 WIND_SPEED = (0.5, 3.5)
-"""Mean wind in the canopy [m/s]: GUESSED, calm to a fresh breeze above it."""
+"""Mean wind at the top of the canopy [m/s]: GUESSED, calm to a gentle breeze."""
 WIND_STEPS = (50, 130)
 """Steps of wind before the picture, lowest and highest."""
 _MAX_TRIES = 40
@@ -70,7 +71,7 @@ class SceneRandomizer:
             happens: dict[str, Any] = {"actors": stage.actor_records(model)}
             if rng.uniform() < WIND_SHARE:
                 happens["wind"] = _simulate_wind(physics, rng)
-            return physics.snapshot(), middle, happens
+            return Sway(model).apply(physics.snapshot()), middle, happens
         return None
 
 

@@ -1,4 +1,4 @@
-"""Adds the robots and humans of other clients: an executor loads and compiles them, and no step waits for it."""
+"""Adds and removes robots and humans of other clients: an executor loads and compiles, and no step waits for it."""
 
 from __future__ import annotations
 
@@ -60,6 +60,9 @@ class RemoteSpawner:
         self.rigid, self.own = rigid, own
         self._executor = executor
         self._enqueued: dict[str, Hello] = {}
+        self._leaving: dict[str, RemoteRobot | RemoteHuman] = {}
+        """Copies of actors that have left, until the world without them is compiled."""
+        self._removed: list[str] = []
         self._compiling: concurrent.futures.Future[Prepared] | None = None
 
     def __contains__(self, name: str) -> bool:
@@ -75,6 +78,19 @@ class RemoteSpawner:
         self._spawned.pop(name, None)
         self._outdated.discard(name)
 
+    def remove(self, name: str, copy: RemoteRobot | RemoteHuman) -> None:
+        """Remove the copy of an actor that has left; :meth:`removed` says when that is done."""
+        if self._executor is None:
+            copy.remove()
+            self._removed.append(name)
+        else:
+            self._leaving[name] = copy
+
+    def removed(self) -> list[str]:
+        """Actors whose copies were removed since the last call."""
+        names, self._removed = self._removed, []
+        return names
+
     def spawn(self, updates: Mapping[str, RobotUpdate | HumanUpdate]) -> dict[str, RemoteRobot | RemoteHuman]:
         """The bodies of enqueued actors that became ready, at their poses in ``updates``; between steps.
 
@@ -85,9 +101,10 @@ class RemoteSpawner:
             room_is_short = (
                 self._executor is not None and 2 * self.rigid.bunch_room < self.rigid.parameters.bunch_pool_size
             )
-            if not arrived and not room_is_short:
+            without = tuple(self._leaving)
+            if not arrived and not room_is_short and not without:
                 return {}
-            self._compiling = self._submit(lambda: self._prepare(arrived))
+            self._compiling = self._submit(lambda: self._prepare(arrived, without))
         if not self._compiling.done():
             return {}
         done, self._compiling = self._compiling, None
@@ -101,6 +118,9 @@ class RemoteSpawner:
             return {}  # one has left meanwhile: compiled again from the next step on
         if prepared.world is None or not self.rigid.adopt(prepared.world):
             return {}  # another actor joined or left meanwhile: the same
+        for actor in prepared.world.removed:
+            self._leaving.pop(actor.spec.name)
+            self._removed.append(actor.spec.name)
         spawned: dict[str, RemoteRobot | RemoteHuman] = {}
         for hello, description in prepared.actors:
             self.cancel(hello.name)
@@ -171,8 +191,8 @@ class RemoteSpawner:
         done.set_result(work())
         return done
 
-    def _prepare(self, arrived: list[tuple[Hello, RobotUpdate | HumanUpdate]]) -> Prepared:
-        """Compile a world with all actors that can be compiled."""
+    def _prepare(self, arrived: list[tuple[Hello, RobotUpdate | HumanUpdate]], without: tuple[str, ...]) -> Prepared:
+        """Compile a world with all actors that can be compiled, ``without`` those that leave."""
         refused: list[tuple[Hello, ValueError | OSError]] = []
         loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]] = []
         for hello, update in arrived:
@@ -181,20 +201,22 @@ class RemoteSpawner:
             except (ValueError, OSError) as error:  # OSError: no room for the file of its URDF
                 refused.append((hello, error))
         try:
-            world = self._compile(loaded)
+            world = self._compile(loaded, without)
         except ValueError:  # MuJoCo does not say which one it is
             fine = []
             for one in loaded:
                 try:
-                    self._compile([one])
+                    self._compile([one], without)
                     fine.append(one)
                 except ValueError as error:
                     refused.append((one[0], error))
-            loaded, world = fine, self._compile(fine) if fine else None
+            loaded, world = fine, self._compile(fine, without) if fine or without else None
         return Prepared(tuple((hello, description) for hello, description, _ in loaded), tuple(refused), world)
 
-    def _compile(self, loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]]) -> CompiledWorld:
-        return self.rigid.compile_with(*(spec for _, _, spec in loaded), is_remote=True)
+    def _compile(
+        self, loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]], without: tuple[str, ...]
+    ) -> CompiledWorld:
+        return self.rigid.compile_with(*(spec for _, _, spec in loaded), is_remote=True, without=without)
 
     def _load(
         self, hello: Hello, update: RobotUpdate | HumanUpdate

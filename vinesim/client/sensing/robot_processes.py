@@ -34,7 +34,8 @@ class RobotProcesses:
         ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
         renderer: str = "warp", device: str = "cpu",
     ) -> None:  # fmt: skip
-        """``clock``: publish /clock; a ROS domain has one. For the others see :class:`SensorProcess`."""
+        """``clock``: may publish /clock, as one node of a ROS domain does. For the others see
+        :class:`SensorProcess`."""
         if ros and (reason := middleware.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
@@ -78,6 +79,8 @@ class RobotProcesses:
         """Whether the sensors are ready, what was lost so far, and process ids; for the status of a client."""
         report, awaited = self.sensors.report(), self.awaited()
         pids = {f"sensors of {self.sensors.name}": self.sensors.worker.pid}
+        if (standby := self.sensors.worker.standby_pid) is not None:
+            pids[f"standby of {self.sensors.name}"] = standby
         if self.ros is not None:
             pids[f"ROS node of {self.sensors.name}"] = self.ros.worker.pid
         return {
@@ -102,7 +105,7 @@ class RobotProcesses:
             return
         report, awaited = self.report(), self.sensors.awaited()
         self.ros.publish_diagnostics(
-            status["time"],
+            status["world_time"],
             [
                 loop_status(status),
                 ComponentStatus(

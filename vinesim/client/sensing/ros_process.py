@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import dataclasses
 import types
 from collections.abc import Sequence
 from typing import Any, Self
@@ -11,17 +12,18 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.client.sensing.ros_worker import STEP_TOPICS, RosChannel, RosConfig, run_ros_worker
+from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, run_ros_worker
 from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import WorkerProcess
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import series_stiffness
 from vinesim.ros.commands.types import Command
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.values import ComponentStatus
+from vinesim.scene.values import ComponentStatus, JointReference
 
 START_TIMEOUT = 120.0
 """How long the process may take to start; a first run builds message packages [s]."""
@@ -35,7 +37,7 @@ class RosProcess:
     def __init__(
         self, name: str, model: Model, description: RobotDescription, *, namespace: str = "", clock: bool = True
     ) -> None:
-        """Starts the process; :meth:`attach` connects it with a client. ``clock``: publish /clock."""
+        """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock."""
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
         self._sent: dict[str, int] = {}
@@ -43,17 +45,23 @@ class RosProcess:
         self._sent_before: collections.Counter[str] = collections.Counter()
         self._dropped_before: collections.Counter[str] = collections.Counter()
         """Counts of the runs of the process before this one."""
-        self._lost = np.zeros(len(STEP_TOPICS), np.int64)
-        """[topic] messages of steps that found no room on the way to the process."""
         self._contacts_left_out = 0
+        self._is_restarted = False
         self._missed_truth = 0
         poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
         fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
-        self._records = StepRecords(name, description)
+        self._records = StepRecords(name, description, series_stiffness(description.drives))
         config = RosConfig(
             name, description.urdf, description.base, namespace, clock, tuple((p, c, q) for (p, c), q in fixed),
-            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
+            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body), model.bunch_of_body(),
+            description.controllers, tuple(mount.name for mount in description.imus),
+            tuple(mount.name for mount in description.wrenches),
         )  # fmt: skip
+        self._step_topics = config.step_topics
+        self._lost = np.zeros(len(self._step_topics), np.int64)
+        """[topic] messages of steps that found no room on the way to the process."""
+        body_sensors = {*config.imus, *config.wrenches}
+        self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
         self.worker = WorkerProcess(
             f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
             lambda context: RosChannel(config, context), self._receive,
@@ -68,31 +76,46 @@ class RosProcess:
         self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
-        client.pre_step.insert(0, RosCommandHandler(self.robot, self._take_commands))
+        self.handler = RosCommandHandler(
+            self.robot, self._take_commands, lambda result: self.worker.send("finish", result), client.world_time
+        )
+        client.pre_step.insert(0, self._control)
 
     # ------------------------------------------------------------------ in the loop
+
+    def _control(self, time: float) -> None:
+        """Apply commands; goals of a process that is gone end."""
+        if self._is_restarted:
+            self._is_restarted = False
+            self.handler.cancel_all(time)
+        self.handler(time)
 
     def _after_step(self, client: Client) -> None:
         """Pass the state to the process, as far as its topics have subscribers."""
         physics, channel = client.physics, self.worker.current().shared
         wanted = channel.wanted["steps"]
-        if wanted.any():
-            has_state = wanted[1:].any()
-            sample = self.robot.sample(physics.time, physics.contacts, body_sensors=False) if has_state else None
+        has_goals = channel.wanted["goals"][0]
+        if has_goals or wanted.any():
+            sample = None
+            if has_goals or wanted[1:].any():
+                body_sensors = bool((wanted & self._reads_body_sensors).any())
+                sample = self.robot.sample(physics.time, physics.contacts, body_sensors=body_sensors)
+                controllers = self.handler.controllers
+                reference = JointReference(controllers.desired, controllers.desired_velocity)
+                sample = dataclasses.replace(sample, reference=reference)
             with channel.steps.put() as record:
                 if record is None:
                     self._lost += wanted
-                    if sample is None or not sample.contacts:
-                        self._lost[-1] -= wanted[-1]
                 else:
-                    self._contacts_left_out += self._records.write(record, physics.time, sample)
+                    now = physics.time + client.world_time.offset
+                    self._contacts_left_out += self._records.write(record, now, sample)
         if physics.tick % TRUTH_PERIOD == 0 and channel.wanted["truth"][0]:
             physics.update_kinematics()
             with channel.truth.writing() as truth:
                 if truth is None:
                     self._missed_truth += 1
                 else:
-                    truth["time"][0] = physics.time
+                    truth["time"][0] = physics.time + client.world_time.offset
                     truth["attached"][:] = physics.state.bunch_attached
                     truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
 
@@ -113,6 +136,7 @@ class RosProcess:
         elif kind == "statistics":
             self._sent, self._dropped = value["sent"], value["dropped"]
         elif kind == "restarted":
+            self._is_restarted = True
             self._sent_before.update(self._sent)
             self._dropped_before.update(self._dropped)
             self._sent, self._dropped = dict.fromkeys(self._sent, 0), {}
@@ -124,7 +148,7 @@ class RosProcess:
     def dropped_messages(self) -> dict[str, int]:
         """Messages that had subscribers and were not sent, by topic."""
         dropped = collections.Counter(self._dropped) + self._dropped_before
-        dropped.update(dict(zip(STEP_TOPICS, self._lost.tolist(), strict=True)))
+        dropped.update(dict(zip(self._step_topics, self._lost.tolist(), strict=True)))
         dropped["vine/contacts"] += self._contacts_left_out
         dropped["tf_environment"] += self._missed_truth
         return dict(dropped)

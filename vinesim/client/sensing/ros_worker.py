@@ -19,9 +19,10 @@ from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import report_ready, serve
 from vinesim.ros.names import ros_name
+from vinesim.scene.values import ControllerKind, ControllerSpec
 
-STEP_TOPICS = ("/clock", "joint_states", "tf", "mobile_base_controller/odom", "vine/contacts")
-"""Topics with a message for every step."""
+STATE_TOPICS = ("joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "vine/markers")
+"""Topics that need a robot's state after a step, whatever robot it is."""
 TRUTH_TOPIC = "tf_environment"
 NICENESS = 5
 """Behind the client's loop, before the renderer."""
@@ -44,12 +45,24 @@ class RosConfig:
     namespace: str
     """Prefix of its topics."""
     clock: bool
-    """Whether the node publishes /clock."""
+    """Whether the node may publish /clock; one of a ROS domain does."""
     static_transforms: tuple[tuple[str, str, np.ndarray], ...]
     poles: np.ndarray
     """Poses [pole, 7] m, 1."""
     records: StepRecords
     bunch_count: int
+    bunch_of_body: np.ndarray
+    """[body] -1 for wood."""
+    controllers: tuple[ControllerSpec, ...]
+    imus: tuple[str, ...]
+    wrenches: tuple[str, ...]
+
+    @property
+    def step_topics(self) -> tuple[str, ...]:
+        """Topics that need the record of a step, or names above several such topics; /clock comes first."""
+        states = [one.name for one in self.controllers if one.kind is ControllerKind.JOINT_TRAJECTORY]
+        elastic = [one.name for one in self.controllers if one.kind is ControllerKind.SERIES_ELASTIC]
+        return ("/clock", *STATE_TOPICS, *self.imus, *self.wrenches, *states, *elastic)
 
 
 class RosChannel:
@@ -64,8 +77,10 @@ class RosChannel:
             },
             context,
         )  # fmt: skip
-        self.wanted = SharedArrays({"steps": ((len(STEP_TOPICS),), "?"), "truth": ((1,), "?")})
-        """Whether topics have subscribers, written by the process."""
+        self.wanted = SharedArrays(
+            {"steps": ((len(config.step_topics),), "?"), "truth": ((1,), "?"), "goals": ((1,), "?")}
+        )
+        """Whether topics have subscribers, and actions goals; written by the process."""
 
     def close(self) -> None:
         """Release the memory."""
@@ -89,11 +104,11 @@ class RosWorker:
         self.config, self.channel, self.pipe = config, channel, pipe
         self.node = RobotNode(
             ros_name(config.name), config.urdf, namespace=config.namespace, static_transforms=config.static_transforms,
-            base=config.base, clock=config.clock,
+            controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
+            bunch_of_body=config.bunch_of_body, base=config.base, clock=config.clock,
         )  # fmt: skip
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
-        self._step_topics = [name if config.clock or name != "/clock" else None for name in STEP_TOPICS]
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
         self._attached_names = self._bunch_names
         self._next_statistics = 0.0
@@ -122,6 +137,8 @@ class RosWorker:
                 return False
             if kind == "diagnose":
                 self.node.publish_diagnostics(*value)
+            elif kind == "finish":
+                self.node.finish_goal(value)
         return True
 
     def _publish_truth(self) -> None:
@@ -136,7 +153,8 @@ class RosWorker:
     def _report(self) -> None:
         """Tell the client what is subscribed to, and now and then what was sent."""
         wanted = self.channel.wanted
-        wanted["steps"][:] = [name is not None and self.node.has_subscribers(name) for name in self._step_topics]
+        wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
+        wanted["goals"][0] = self.node.has_goals
         wanted["truth"][0] = self.node.has_subscribers(TRUTH_TOPIC)
         now = time.monotonic()
         if now >= self._next_statistics:

@@ -17,7 +17,7 @@ import numpy as np
 from vinesim.client.client import Client
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.sensor_worker import POSE_HISTORY, SensorChannel, SensorConfig, run_sensor_worker
-from vinesim.client.sensing.spawned_process import sensor_modules
+from vinesim.client.sensing.spawned_process import SENSOR_REHEARSAL, sensor_modules
 from vinesim.client.sensing.worker_process import Run, WorkerProcess
 from vinesim.errors import WriteError
 from vinesim.robot.description.description import RobotDescription
@@ -25,6 +25,7 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.ros import middleware
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
+from vinesim.scene.wind import wind_of
 
 log = logging.getLogger(__name__)
 
@@ -78,12 +79,12 @@ class SensorProcess:
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
             name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer,
-            device,
+            device, wind=wind_of(scene),
         )  # fmt: skip
         self._frames = tuple(config.sensor_frames.values())
         self.worker = WorkerProcess(
             f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
-            lambda context: SensorChannel(config, context), self._receive,
+            lambda context: SensorChannel(config, context), self._receive, rehearsal=SENSOR_REHEARSAL,
         )  # fmt: skip
         self._run: Run[SensorChannel] | None = None
         """The run of the process that snapshots were last written for."""
@@ -137,7 +138,12 @@ class SensorProcess:
             shared["body_q"][bodies] = physics.state.body_q[bodies]
             shared["tree_number"][trees] = shared["number"][0] = self._snapshot_count
             shared["bunch_attached"][:] = physics.state.bunch_attached
+            shared["wind_strength"][0] = 0.0 if (wind := physics.wind_on_plants.state) is None else wind.strength
+            if wind is not None:
+                shared["wind_time"][0] = wind.time
+                shared["tree_air"][:], shared["tree_drawn"][:] = wind.tree_air, wind.tree_drawn
             shared["time"][0], shared["tick"][0] = physics.time, physics.tick
+            shared["world_offset"][0] = client.world_time.offset
             shared["frame_score"][0] = client.frame_score()
             visual_q = physics.visual_q()
             self._visuals.memory["visual_q"][: len(visual_q)] = visual_q

@@ -25,7 +25,8 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot, WindState
+from vinesim.scene.wind import Wind
 
 if TYPE_CHECKING:
     from vinesim.ros.sensor_node import SensorNode
@@ -67,6 +68,8 @@ class SensorConfig:
     renderer: str = "warp"
     device: str = "cpu"
     """Where they compute; the CPU from the next start on if a GPU fails."""
+    wind: Wind | None = None
+    """That of the scene."""
 
     @property
     def sensor_frames(self) -> dict[str, str]:
@@ -82,11 +85,13 @@ class SensorChannel:
         bodies, trees, bunches = len(model.body_mass), len(model.tree_first), len(model.bunch_body)
         self.snapshot = SharedSnapshot(
             {
-                "time": ((1,), "f8"), "frame_score": ((1,), "f8"),
+                "time": ((1,), "f8"), "world_offset": ((1,), "f8"), "frame_score": ((1,), "f8"),
                 "tick": ((1,), "i8"), "number": ((1,), "i8"),  # counts snapshots from 1
                 "visuals_version": ((1,), "i8"), "visual_count": ((1,), "i8"),
                 "body_q": ((bodies, 7), "f4"), "bunch_attached": ((bunches,), "?"),
                 "tree_number": ((trees,), "i8"),  # the snapshot in which each tree moved last
+                "wind_time": ((1,), "f8"), "wind_strength": ((1,), "f8"),  # 0: calm
+                "tree_air": ((trees, 3), "f4"), "tree_drawn": ((trees,), "f4"),
                 "pose_count": ((1,), "i8"), "pose_time": ((POSE_HISTORY,), "f8"),  # a ring of sensor poses
                 "pose": ((POSE_HISTORY, sensors, 7), "f8"),
             },
@@ -126,6 +131,8 @@ class SensorWorker:
         self._visuals = VisualListReceiver()
         self._missing_version: int | None = None
         """Version of the list of bodies that the newest snapshot belongs to, if that has not arrived."""
+        self._world_offset = 0.0
+        """World's time minus simulated time [s]."""
         self._last_number = 0
         self._pose_count = 0
         self._best_frame: CameraFrame | None = None
@@ -214,10 +221,10 @@ class SensorWorker:
                 else:
                     for name in self.scheduler.warm_up(snapshot, poses):
                         self._awaits(name)
-                    allocator.release_free_memory()
                     is_ready = True
                     self._awaits()
                     report_ready(self.pipe, NICENESS)
+                    allocator.release_free_memory()  # takes 0.1 s, which nothing has to wait for
             self.channel.wanted["renders"][0] = any(sensor.wanted() for sensor in self.scheduler.sensors)
             if time.monotonic() >= self._next_statistics:
                 self._next_statistics = time.monotonic() + STATISTICS_PERIOD
@@ -260,9 +267,16 @@ class SensorWorker:
             bodies = np.flatnonzero(has_moved[self.config.model.body_tree])
             self._state.body_q[bodies] = shared["body_q"][bodies]
             self._last_number = int(shared["number"][0])
+            wind = None
+            if self.config.wind is not None and shared["wind_strength"][0] > 0.0:
+                wind = WindState(
+                    self.config.wind, float(shared["wind_time"][0]), float(shared["wind_strength"][0]),
+                    shared["tree_air"].copy(), shared["tree_drawn"].copy(),
+                )  # fmt: skip
             self._state.bunch_attached[:] = shared["bunch_attached"]
             self._frame_score = float(shared["frame_score"][0])
             time, tick = float(shared["time"][0]), int(shared["tick"][0])
+            self._world_offset = float(shared["world_offset"][0])
             count = int(shared["pose_count"][0])
             rows = np.arange(max(self._pose_count, count - POSE_HISTORY), count) % POSE_HISTORY
             times, poses = shared["pose_time"][rows], shared["pose"][rows]
@@ -270,7 +284,7 @@ class SensorWorker:
         state, names = self._state, tuple(self.config.sensor_frames)
         snapshot = Snapshot(
             time, tick, state.body_q, state.bunch_attached, self._visuals.visuals, visual_q,
-            np.flatnonzero(has_moved),
+            np.flatnonzero(has_moved), wind,
         )  # fmt: skip
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 
@@ -288,7 +302,7 @@ class SensorWorker:
     def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
         assert isinstance(frame, CameraFrame)
         if self.node is not None:
-            self.node.publish_camera(frame)
+            self.node.publish_camera(dataclasses.replace(frame, time=frame.time + self._world_offset))
         is_kept = self.config.keep_pictures and frame.name == self.scheduler.sensors[0].name
         if is_kept and self._frame_score >= self._best_score:
             self._best_score, self._best_frame = self._frame_score, frame
@@ -296,7 +310,7 @@ class SensorWorker:
     def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
         assert isinstance(scan, LidarScan)
         if self.node is not None:
-            self.node.publish_lidar(scan)
+            self.node.publish_lidar(dataclasses.replace(scan, time=scan.time + self._world_offset))
 
     def _save_best_frame(self, folder: pathlib.Path) -> None:
         failure = ""

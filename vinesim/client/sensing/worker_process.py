@@ -21,14 +21,17 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
 from typing import Any, Generic, NoReturn, Protocol, TypeVar
 
-from vinesim.client.sensing.spawned_process import CONTEXT, spawn
+from vinesim.client.sensing.spawned_process import CONTEXT, SpawnedProcess, spawn
 
 log = logging.getLogger(__name__)
 
 EXIT_TIMEOUT = 1.2
 """How long a process may take to end [s]."""
-STABLE_TIME = 60.0
-"""A process that ran this long before it failed is started again at once [s]; else there is a pause before."""
+STABLE_TIME = 10.0
+"""A process that ran this long before it failed is started again at once [s]; else there is a pause before. A start
+takes two seconds of one core."""
+STANDBY_DELAY = 2.0
+"""A process has been ready for so long before another one stands by [s]."""
 HANG_TIMEOUT = 15
 """A process that was ready and then sends nothing for this long hangs, and is started again [s]. It reports to the
 client five times a second, unless it renders a picture or writes files."""
@@ -98,15 +101,14 @@ S = TypeVar("S", bound=Shared)
 class Run(Generic[S]):
     """One run of the process, from its start to its end."""
 
-    def __init__(self, title: str, modules: Sequence[str], target: Callable[..., None], config: Any, shared: S) -> None:
+    def __init__(self, spawned: SpawnedProcess, target: Callable[..., None], config: Any, shared: S) -> None:
         self.shared = shared
-        spawned = spawn(title, modules)
         self.pipe, self.process = spawned.pipe, spawned.process
         self.ready_since: float | None = None
         """Time at which the process was ready [s]."""
         spawned.run(target, config, shared)
         self._outgoing: queue.SimpleQueue[tuple[str, Any] | None] = queue.SimpleQueue()
-        threading.Thread(target=self._send, name=f"to {title}", daemon=True).start()
+        threading.Thread(target=self._send, name=f"to {spawned.process.name}", daemon=True).start()
 
     def send(self, kind: str, value: Any = None) -> None:
         """Send a message in order; a thread packs and writes it."""
@@ -135,11 +137,15 @@ class WorkerProcess(Generic[S]):
     While it is ready it sends some message at least every :data:`HANG_TIMEOUT`, else it is killed and started again.
     ``share(context)`` makes what is shared with one run. ``receive(kind, value)`` takes all other messages, and
     ("restarted", None) before those of a further run, in a thread.
+
+    With a ``rehearsal``, another process stands by while one is ready, and takes its place if it fails; see
+    :class:`SpawnedProcess`.
     """
 
     def __init__(
         self, title: str, modules: Sequence[str], target: Callable[..., None], config: Any,
         share: Callable[[BaseContext], S], receive: Callable[[str, Any], None],
+        *, rehearsal: str = "",
     ) -> None:  # fmt: skip
         self.title = title
         self.restarts = 0
@@ -147,7 +153,10 @@ class WorkerProcess(Generic[S]):
         self.restart_time = 0.0
         """From the start of the last further run until it was ready [s]."""
         self._modules, self._target, self._config = modules, target, config
-        self._share, self._receive = share, receive
+        self._share, self._receive, self._rehearsal = share, receive, rehearsal
+        self._standby: SpawnedProcess | None = None
+        self._standby_due = 0.0
+        """When another process may stand by, at the earliest [s]."""
         self._closing = threading.Event()
         self._started = 0.0
         """When the newest run started [s]."""
@@ -171,6 +180,12 @@ class WorkerProcess(Generic[S]):
     def pid(self) -> int | None:
         """Process id of the newest run."""
         return self._newest.process.pid
+
+    @property
+    def standby_pid(self) -> int | None:
+        """Process id of the one that stands by; None if there is none."""
+        standby = self._standby
+        return standby.process.pid if standby is not None and standby.stands_by else None
 
     @property
     def is_ready(self) -> bool:
@@ -209,9 +224,36 @@ class WorkerProcess(Generic[S]):
     # ------------------------------------------------------------------ the supervising thread
 
     def _start(self) -> Run[S]:
-        return Run(self.title, self._modules, self._target, self._config, self._share(CONTEXT))
+        """A run by the process that stands by, or by a new one."""
+        shared, standby = self._share(CONTEXT), self._standby
+        self._standby = None
+        if standby is not None:
+            standby.look()
+            if standby.stands_by:
+                with contextlib.suppress(OSError):  # it has ended just now
+                    return Run(standby, self._target, self._config, shared)
+            standby.end()
+        return Run(spawn(self.title, self._modules), self._target, self._config, shared)
+
+    def _keep_standby(self, run: Run[S]) -> None:
+        """Start a process that stands by when that is due, and again if it has ended."""
+        if not self._rehearsal or run.ready_since is None:
+            return
+        now = time.monotonic()
+        if self._standby is not None and not self._standby.look():
+            self._standby.end()
+            self._standby, self._standby_due = None, now + LONGEST_PAUSE
+        if self._standby is None and now > max(run.ready_since + STANDBY_DELAY, self._standby_due):
+            self._standby = SpawnedProcess(self.title, self._modules, self._rehearsal)
 
     def _supervise(self) -> None:
+        try:
+            self._keep_running()
+        finally:
+            if self._standby is not None:
+                self._standby.end()
+
+    def _keep_running(self) -> None:
         failures = 0
         while True:
             run = self._newest
@@ -246,6 +288,7 @@ class WorkerProcess(Generic[S]):
         reason = ""
         silent = 0  # seconds, counted one by one: when both processes were stopped for long, only one has passed
         while silent < (START_TIMEOUT if run.ready_since is None else HANG_TIMEOUT):
+            self._keep_standby(run)
             silent = 0 if connection.wait([run.pipe, run.process.sentinel], 1.0) else silent + 1
             try:
                 while run.pipe.poll():

@@ -5,27 +5,54 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable
 
-from vinesim.robot.control.trajectory_controller import Trajectory, TrajectoryController
+from vinesim.client.world_time import WorldTime
+from vinesim.robot.control import controller_manager
+from vinesim.robot.control.controller_manager import ControllerManager
+from vinesim.robot.control.trajectory_controller import Outcome, Tolerance, Trajectory
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.ros.commands.types import BaseVelocity, Command, JointPositions
+from vinesim.ros.commands.types import (
+    BaseVelocity,
+    CancelGoal,
+    Command,
+    ElasticCommand,
+    ForwardCommand,
+    GoalResult,
+    GoalStatus,
+    GripperGoal,
+    GripperResult,
+    ImpedanceCommand,
+    JointTolerances,
+    JointTrajectory,
+)
 
 log = logging.getLogger(__name__)
 
+_STATUS = {Outcome.SUCCESSFUL: GoalStatus.SUCCEEDED, Outcome.CANCELED: GoalStatus.CANCELED}
+
 
 class RosCommandHandler:
-    """Applies commands from ROS to a robot: base velocity, joint positions, trajectories (linear between points)."""
+    """Applies commands from ROS to a robot, by its controllers."""
 
-    def __init__(self, robot: Robot, commands: Callable[[], Iterable[Command]]) -> None:
-        """``commands`` returns the commands that have arrived since the last call."""
+    def __init__(
+        self,
+        robot: Robot,
+        commands: Callable[[], Iterable[Command]],
+        finish: Callable[[GoalResult], None] = lambda _: None,
+        world_time: WorldTime | None = None,
+    ) -> None:
+        """``commands`` returns the commands that have arrived since the last call; ``finish`` takes ended goals.
+
+        ``world_time``: in which commands are stamped; without it they are stamped in simulated time.
+        """
         self.robot = robot
+        self.controllers = ControllerManager(robot)
         self.rejected_count = 0
         """Commands that this robot cannot take."""
-        self._commands = commands
-        self._controllers: dict[str, TrajectoryController] = {}
+        self._commands, self._finish, self._world_time = commands, finish, world_time
 
     def __call__(self, time: float) -> None:
-        """Apply the new commands in the step that starts at ``time`` [s], and advance the trajectories."""
+        """Apply the new commands in the step that starts at ``time`` [s], and advance the controllers."""
         for command in self._commands():
             try:
                 self._apply(command, time)
@@ -33,23 +60,59 @@ class RosCommandHandler:
                 self.rejected_count += 1
                 if self.rejected_count == 1:
                     log.warning("refused a command, further ones are only counted: %s", error)
-        for controller in self._controllers.values():
-            controller(time)
+        self.controllers(time)
+        for result in self.controllers.take_results():
+            self._finish(_goal_result(result))
+
+    def cancel_all(self, time: float) -> None:
+        """Cancel all goals, as the process that serves them is gone."""
+        self.controllers.cancel_all(time)
+        self.controllers.take_results()
 
     def _apply(self, command: Command, time: float) -> None:
-        robot = self.robot
-        if isinstance(command, BaseVelocity):
-            robot.command_base(float(command.linear[0]), float(command.angular[2]), time)
-        elif isinstance(command, JointPositions):
-            for controller in self._controllers.values():
-                controller.cancel()
-            robot.command_position(command.positions)
-        else:
-            if command.controller not in self._controllers:
-                self._controllers[command.controller] = TrajectoryController(robot, robot.description.joints)
-            controller = self._controllers[command.controller]
-            if len(command.times):
-                trajectory = Trajectory(command.joints, command.times, command.positions, start_time=command.time)
-                controller.start(trajectory, time)
-            else:
-                controller.cancel()
+        controllers = self.controllers
+        match command:
+            case BaseVelocity():
+                self.robot.command_base(float(command.linear[0]), float(command.angular[2]), time)
+            case ForwardCommand():
+                controllers.forward(command.controller, command.values)
+            case ImpedanceCommand():
+                controllers.command_impedance(command.controller, command.what, command.values)
+            case ElasticCommand():
+                controllers.command_motor(command.controller, command.joint, command.position)
+            case GripperGoal():
+                controllers.start_gripper(command.controller, command.position, command.max_effort, time, command.goal)
+            case CancelGoal():
+                controllers.cancel(command.goal, time)
+            case JointTrajectory() if len(command.times) == 0:
+                controllers.stop_trajectory(command.controller)
+            case JointTrajectory():
+                offset = 0.0 if self._world_time is None else self._world_time.offset
+                trajectory = _trajectory(command, offset)
+                controllers.start_trajectory(command.controller, trajectory, time, command.goal)
+
+
+def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
+    """A trajectory with its start in simulated time; ``offset`` [s]: of the world's time against that."""
+
+    def tolerance(given: JointTolerances | None) -> Tolerance | None:
+        return None if given is None else Tolerance(given.position, given.velocity)
+
+    return Trajectory(
+        command.joints, command.times, command.positions, command.velocities,
+        start_time=max(command.time - offset, 1e-9) if command.time > 0.0 else 0.0,
+        path_tolerance=tolerance(command.path_tolerance), goal_tolerance=tolerance(command.goal_tolerance),
+        goal_time_tolerance=command.goal_time_tolerance,
+    )  # fmt: skip
+
+
+def _goal_result(result: controller_manager.GoalResult) -> GoalResult:
+    """A result as ROS has it. A goal that another one ended is aborted, with the code of ros2_controllers for that."""
+    outcome, gripper = result.outcome, result.gripper
+    code = {Outcome.PREEMPTED: Outcome.INVALID_GOAL, Outcome.CANCELED: Outcome.SUCCESSFUL}.get(outcome, outcome)
+    return GoalResult(
+        result.goal, _STATUS.get(outcome, GoalStatus.ABORTED), int(code), result.text,
+        None if gripper is None else GripperResult(
+            gripper.position, gripper.effort, gripper.stalled, gripper.reached_goal
+        ),
+    )  # fmt: skip

@@ -37,7 +37,10 @@ class MessageKind(enum.IntEnum):
     MESH_WANTED = 21
 
 
-_RARE = (MessageKind.CLAIMS, MessageKind.RETAINED, MessageKind.HELLO, MessageKind.CLOCK, MessageKind.WELCOME)
+_RARE = (
+    MessageKind.CLAIMS, MessageKind.RETAINED, MessageKind.HELLO, MessageKind.CLOCK, MessageKind.WELCOME,
+    MessageKind.MESH_PART, MessageKind.MESH_REQUEST, MessageKind.MESH_WANTED,
+)  # fmt: skip
 
 TIMESTAMPED = frozenset(MessageKind).difference(_RARE)
 """Kinds whose header holds the network time [s] at which the content was sampled."""
@@ -49,7 +52,11 @@ MAX_MESSAGE = 1 << 20
 """Largest message that is decoded [B]; a larger one is refused unread."""
 
 MAX_COORDINATE = 1e5
-"""Largest magnitude of a position [m]."""
+"""Magnitude that positions stay below [m]."""
+
+LARGEST_COORDINATE = MAX_COORDINATE - 1.0
+"""Positions beyond it are clipped to it where they are sent [m]: what one actor accepts near the bound, and then moves
+farther, no other would."""
 
 HEADER = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
 """Magic, version, kind, count, time [s]: 14 bytes."""

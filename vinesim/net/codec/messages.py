@@ -22,6 +22,7 @@ from vinesim.net.codec.control import encode_records as encode_records
 from vinesim.net.codec.control import encode_time as encode_time
 from vinesim.net.codec.control import encode_welcome as encode_welcome
 from vinesim.net.codec.header import HEADER as HEADER
+from vinesim.net.codec.header import LARGEST_COORDINATE as LARGEST_COORDINATE
 from vinesim.net.codec.header import MAGIC as MAGIC
 from vinesim.net.codec.header import MAX_COORDINATE as MAX_COORDINATE
 from vinesim.net.codec.header import MAX_DATAGRAM as MAX_DATAGRAM

@@ -26,6 +26,9 @@ CELL_ORIGIN_OFFSET = np.array([0.5 * CELL_SIZE, 0.5 * CELL_SIZE, 2.5])
 MIN_VELOCITY_LSB = np.array([2.0**-10, 2.0**-8])
 """Smallest quantisation steps of velocity [m/s] and angular velocity [rad/s]; a record scales them by powers of two."""
 
+MAX_EXPONENT = 9
+"""Largest such power: what is faster than 64 m/s or 254 rad/s is clipped. Twice as fast as anything that is thrown."""
+
 _OBJECT = np.dtype(
     [("object", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("scale", "u1"),
      ("position", "<i2", 3), ("turn", "<u4"), ("velocity", "i1", 3), ("spin", "i1", 3)]
@@ -79,7 +82,7 @@ def encode_objects(objects: ObjectStates, cell: Cell) -> tuple[list[bytes], Obje
     records["turn"] = pack_quaternions(objects.pose[:, 3:])
     velocity = objects.velocity.reshape(-1, 2, 3)
     fastest = np.maximum(np.abs(velocity).max(2) / (127.0 * MIN_VELOCITY_LSB), 1.0)
-    exponent = np.minimum(np.ceil(np.log2(fastest)), 15.0)
+    exponent = np.minimum(np.ceil(np.log2(fastest)), MAX_EXPONENT)
     steps = np.clip(np.rint(velocity / (MIN_VELOCITY_LSB * 2.0**exponent)[:, :, None]), -127.0, 127.0)
     records["velocity"], records["spin"] = steps[:, 0], steps[:, 1]
     records["scale"] = exponent[:, 0] + 16.0 * exponent[:, 1]
@@ -103,6 +106,8 @@ def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
         raise MessageError("objects that are trees, of no kind, or in an order that does not increase")
     if (records["flags"] > TOUCHED).any():
         raise MessageError("objects with unknown flags")
+    if (np.maximum(records["scale"] % 16, records["scale"] // 16) > MAX_EXPONENT).any():
+        raise MessageError("objects that are faster than anything in a vineyard")
     return _read_objects(time, records, cell)
 
 

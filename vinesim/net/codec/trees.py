@@ -14,6 +14,7 @@ import numpy as np
 
 from vinesim.net.codec.header import (
     HEADER,
+    LARGEST_COORDINATE,
     MAX_COORDINATE,
     MAX_DATAGRAM,
     MessageError,
@@ -155,7 +156,8 @@ def encode_trees(trees: TreeStates) -> tuple[list[bytes], TreeStates]:
                 f"trees with {cuts} bodies cut off (at most {MAX_DETACHED} each) and {len(roots)} places"
             )
         heads["flags"] += np.array(cuts, np.uint8) * DETACHED_COUNT_UNIT
-        roots["body"], roots["position"] = trees.root, trees.root_x
+        roots["body"] = trees.root
+        roots["position"] = np.clip(trees.root_x, -LARGEST_COORDINATE, LARGEST_COORDINATE)
         roots["velocity"] = np.clip(np.rint(trees.root_xd / BASE_VELOCITY_LSB), -32767, 32767)
 
     payloads, start, body, root = [], 0, 0, 0

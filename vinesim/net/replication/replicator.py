@@ -110,6 +110,11 @@ class Replicator:
         """Network time minus the client's own time [s]."""
         return self._state.peers.clock.offset
 
+    @property
+    def has_clock(self) -> bool:
+        """Whether a server has told its clock, so that network time is its time."""
+        return bool(self._state.peers.clock.estimate.pings)
+
     def receive(self, now: float, link_centre: LinkCentre | None = None) -> Inbox:
         """Everything that arrived since the last call.
 

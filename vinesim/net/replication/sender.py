@@ -275,12 +275,9 @@ class Sender:
         state.object_stream.positions((object_id,), step.read)
         parent, pose = step.pose_on_support(object_id)
         state.ownership[object_id].announced = True
-        x, y, z, qx, qy, qz, qw = pose.tolist()
         state.retained.publish(
             state.object_stream.cells((object_id,))[0],
-            RetainedRecord(
-                object_id, claim.ownership, claim.authority, state.hello.name, (x, y, z, qx, qy, qz, qw), parent
-            ),
+            RetainedRecord(object_id, claim.ownership, claim.authority, state.hello.name, _within_range(pose), parent),
         )
 
     def _publish_detachment(self, object_id: int, step: LocalStep) -> None:
@@ -296,7 +293,7 @@ class Sender:
             return
         state.object_stream.positions((object_id,), step.read)
         pose, _ = step.read(object_id)
-        record = msgspec.structs.replace(record, pose=tuple(np.asarray(pose, float).tolist()))
+        record = msgspec.structs.replace(record, pose=_within_range(pose))
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:
@@ -324,3 +321,10 @@ def _columns(objects: list[tuple[int, ObjectRecord]]) -> ClaimColumns:
     """Claims and flags of some objects."""
     entries = [entry for _, entry in objects]
     return ClaimColumns([entry.claim for entry in entries], [messages.TOUCHED * entry.touching for entry in entries])
+
+
+def _within_range(pose: np.ndarray) -> tuple[float, float, float, float, float, float, float]:
+    """A pose [7] as a record has it."""
+    x, y, z = np.clip(pose[:3], -messages.LARGEST_COORDINATE, messages.LARGEST_COORDINATE).tolist()
+    qx, qy, qz, qw = pose[3:].tolist()
+    return x, y, z, qx, qy, qz, qw

@@ -12,6 +12,9 @@ from typing import Self
 from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Reply, SampleStore, matches
 from vinesim.net.transport.name_holders import bound_name
 
+MAX_KNOWN_KEYS = 10_000
+"""Keys of which a bus remembers whether it subscribes to them."""
+
 
 class MemoryHub:
     """Carries samples between buses in memory; :meth:`advance` moves its clock. All randomness comes from ``seed``.
@@ -199,6 +202,8 @@ class MemoryBus:
         self.pending_replies: list[tuple[str, bytes, float]] = []
         self._store = SampleStore()
         self._subscriptions: list[MemorySubscription] = []
+        self._depths: dict[str, int] = {}
+        """Of the deepest subscription to each key that was asked for, 0 without one; until subscriptions change."""
 
     @property
     def dropped(self) -> int:
@@ -220,22 +225,32 @@ class MemoryBus:
     def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> MemorySubscription:
         subscription = MemorySubscription(self, pattern, depth)
         self._subscriptions.append(subscription)
+        self._depths.clear()
         self.hub.forget_subscribers()
         return subscription
 
     def unsubscribe(self, subscription: MemorySubscription) -> None:
         if subscription in self._subscriptions:
             self._subscriptions.remove(subscription)
+            self._depths.clear()
             self.hub.forget_subscribers()
 
     def is_subscribed(self, key: str) -> bool:
-        return any(matches(subscription.pattern, key) for subscription in self._subscriptions)
+        return self._depth_of(key) > 0
+
+    def _depth_of(self, key: str) -> int:
+        depth = self._depths.get(key)
+        if depth is None:
+            if len(self._depths) >= MAX_KNOWN_KEYS:
+                self._depths.clear()
+            depth = max((s.depth for s in self._subscriptions if matches(s.pattern, key)), default=0)
+            self._depths[key] = depth
+        return depth
 
     def deliver(self, key: str, payload: bytes) -> None:
-        depths = [s.depth for s in self._subscriptions if matches(s.pattern, key)]
-        if depths:
+        if depth := self._depth_of(key):
             self.bytes_in += len(payload)
-            self._store.put(max(depths), key, payload)
+            self._store.put(depth, key, payload)
 
     def poll(self) -> list[tuple[str, bytes]]:
         return self._store.take()
@@ -263,6 +278,7 @@ class MemoryBus:
 
     def close(self) -> None:
         self._subscriptions.clear()
+        self._depths.clear()
         self.queryables.clear()
         self.hub.remove(self.name)
 

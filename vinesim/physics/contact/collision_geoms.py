@@ -8,6 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
+_PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))  # NumPy would compare with MuJoCo's own type entry by entry
+    for name in ("PLANE", "SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
+)
 PLANE_HALF_SIZE = 1e6
 """[m] Half edge of the box around the ground."""
 
@@ -67,16 +71,16 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
     moved_by = m.body_weldid  # a body without joints moves with the one that it is welded to
     last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1)[moved_by]
     body, kind, size = m.geom_bodyid[ids], m.geom_type[ids].copy(), m.geom_size[ids].copy()
-    mesh = kind == mujoco.mjtGeom.mjGEOM_MESH
-    kind[mesh], size[mesh] = mujoco.mjtGeom.mjGEOM_BOX, m.geom_aabb[ids][mesh, 3:]
+    mesh = kind == _MESH
+    kind[mesh], size[mesh] = _BOX, m.geom_aabb[ids][mesh, 3:]
     center = np.where(mesh[:, None], m.geom_aabb[ids, :3], 0.0)
     radius = np.where(mesh, np.linalg.norm(size, axis=1), m.geom_rbound[ids])
     half = size.copy()
-    round_ = (kind == mujoco.mjtGeom.mjGEOM_SPHERE) | (kind == mujoco.mjtGeom.mjGEOM_CAPSULE)
+    round_ = (kind == _SPHERE) | (kind == _CAPSULE)
     half[round_] = size[round_, :1] + size[round_, 1:2] * [0.0, 0.0, 1.0]
-    cylinder = kind == mujoco.mjtGeom.mjGEOM_CYLINDER
+    cylinder = kind == _CYLINDER
     half[cylinder] = size[cylinder][:, [0, 0, 1]]
-    plane = kind == mujoco.mjtGeom.mjGEOM_PLANE
+    plane = kind == _PLANE
     half[plane], radius[plane] = (PLANE_HALF_SIZE, PLANE_HALF_SIZE, 0.0), np.inf
     return RigidGeoms(
         id=ids.astype(np.int32),

@@ -6,6 +6,8 @@ The stages of :meth:`ImpulseSolver.solve` follow the kernels: ``islands``, ``jac
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import warp as wp
 
@@ -56,6 +58,8 @@ class ImpulseSolver:
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
         }
+        self._memory: dict[str, np.ndarray] = {}
+        """See :meth:`_kept`."""
         self._wrench = np.zeros((2 * n, 6))
         self._body_response = np.zeros((2 * n, 6, tree_size, 6), np.float32)
         self.bodies = np.zeros(0, np.int32)
@@ -89,26 +93,39 @@ class ImpulseSolver:
         other[of_geoms] = np.where(now >= 0, now, REMOVED_GEOM)
 
     def _allocate(self) -> None:
-        """Arrays whose size depends on the rigid world or on the matrices of the blocks."""
+        """Arrays whose size depends on the rigid world or on the matrices of the blocks.
+
+        The large ones lie in memory that is kept: new pages took 4 ms when an actor joined. Every solve overwrites what
+        it reads of them.
+        """
         world, rows = self.rigid.mj_model, 3 * self.capacity
         self.rows = SharedArrays(
             structs.Rows,
-            rigid_jacobian=np.zeros((rows, world.nv)),
-            rigid_response=np.zeros((rows, world.nv)),
+            rigid_jacobian=self._kept("rigid_jacobian", (rows, world.nv)),
+            rigid_response=self._kept("rigid_response", (rows, world.nv)),
             rigid_velocity=np.zeros(world.nv),
             delassus=self._matrix,
             **self._row_arrays,
         )
         self.scratch = SharedArrays(
             structs.SolverScratch,
-            matrix=np.zeros(len(self._matrix)),
-            columns=np.zeros((rows, 1 + world.nv)),
+            matrix=self._kept("matrix", self._matrix.shape),
+            columns=self._kept("columns", (rows, 1 + world.nv)),
             rigid_system=np.zeros((world.nv, 1 + world.nv)),
-            **{name: np.zeros(rows) for name in ("impulse_first", "impulse_before", "direction")},
+            **{name: self._kept(name, (rows,)) for name in ("impulse_first", "impulse_before", "direction")},
         )
         labels = np.zeros(2 * world.ntree, np.int32)  # see EffectiveMass.island_labels
         dofs = np.zeros(world.nv, np.int32)
         self.islands = SharedArrays(structs.Islands, rigid_last_contact=labels, dof=dofs, **self._island_arrays)
+
+    def _kept(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        """An array of this shape in the memory of this name, twice as large as what was asked for when that was
+        made: pages that nothing has touched take no memory."""
+        size = math.prod(shape)
+        memory = self._memory.get(name)
+        if memory is None or len(memory) < size:
+            memory = self._memory[name] = np.zeros(2 * size)
+        return memory[:size].reshape(shape)
 
     def clear(self) -> None:
         """Forget the last solve, but for its warm start."""

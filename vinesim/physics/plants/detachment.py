@@ -8,6 +8,7 @@ on it, its bunches still hanging from it (:meth:`ArticulationSolver.cut`).
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -35,11 +36,19 @@ class Blade:
     """[7] of the mouth's middle in the link: x along the blades, y from blade to blade, z across their plane."""
     half: np.ndarray
     """[3] m, half edges of the mouth; half[1] is the reach: how far to either side wood is caught."""
+    force: float = np.inf
+    """[N] with which it closes at most."""
     closing: bool = False
+    closures: int = 0
+    """How often it has closed so far."""
+    cut: int = 0
+    """Pieces that it cut when it closed last."""
+    resistance: float = 0.0
+    """[N] Cutting force of the strongest piece that was in its mouth then, cut or not; 0 if there was none."""
 
-    def close(self) -> None:
-        """Shut, and open again: what is in the mouth at the end of the coming step is cut."""
-        self.closing = True
+    def close(self, force: float = np.inf) -> None:
+        """Shut with at most ``force`` [N], and open again: cuts what is in the mouth at the end of the coming step."""
+        self.closing, self.force = True, force
 
 
 class DetachmentMonitor:
@@ -52,8 +61,10 @@ class DetachmentMonitor:
         contact_solver: ContactSolver,
         parameters: PhysicsParameters = PhysicsParameters(),
     ) -> None:
-        """``parameters``: ``detachment_duration`` says how long a peduncle must be overloaded."""
+        """``parameters``: ``detachment_duration`` says how long a peduncle must be overloaded, ``cutting_strength``
+        what a blade has to overcome."""
         self._overload_limit = parameters.steps(parameters.detachment_duration)
+        self._cutting_strength = parameters.cutting_strength
         self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
         self.blades: list[Blade] = []
         self.hand_contacts: tuple[Contact, ...] = ()
@@ -122,13 +133,23 @@ class DetachmentMonitor:
         self.plants.forward_kinematics()
         for blade in self.blades:
             if blade.closing:
-                blade.closing = False
+                blade.closing, blade.cut, blade.resistance = False, 0, 0.0
+                blade.closures += 1
                 for body in self._bodies_in_mouth(blade).tolist():
+                    resistance = self.cutting_force(body)
+                    blade.resistance = max(blade.resistance, resistance)
+                    if resistance > blade.force:
+                        continue
+                    blade.cut += 1
                     bunch = int(self._bunch_of[body])
                     if bunch < 0:
                         self.cut(body, "blade", blade.actor)
                     elif self.plants.state.bunch_attached[bunch]:
                         self.pick(bunch, "blade", blade.actor)
+
+    def cutting_force(self, body: int) -> float:
+        """[N] that it takes to cut a piece of wood across: its cross-section at the root end times its strength."""
+        return self._cutting_strength * math.pi * float(self.plants.model.body_radius[body, 0]) ** 2
 
     def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
         """Pieces of wood [k] whose axis passes through a blade's mouth, of each branch the one next to the root."""

@@ -65,6 +65,10 @@ def kernel_parameters(
     }  # fmt: skip
 
 
+MIN_CAPACITY = 16
+"""Bodies that a list holds at least."""
+
+
 class KernelLaunches:
     """Launches of the articulation kernels on the arrays of one solver.
 
@@ -92,6 +96,7 @@ class KernelLaunches:
             self.fill(structs.SolverParameters, **(parameters | {"fast_rate": math.inf, "geometric_stiffness": 0.0}))
         )
         self.response_capacity = self.joint_capacity = 0
+        self._record_joint_wrench(MIN_CAPACITY)  # or the first bunch that is picked would wait for it
 
     # ------------------------------------------------------------------ arrays
 
@@ -224,7 +229,7 @@ class KernelLaunches:
         in the list, at most m); a view, good until the next call."""
         n, buffers = len(bodies), self.buffers
         if n > self.response_capacity or self.response_capacity == 0:
-            self._record_response(max(2 * self.response_capacity, n, 16))
+            self._record_response(max(2 * self.response_capacity, n, MIN_CAPACITY))
         self._response_bodies[:n] = buffers.slots[bodies]
         self._respond(n)
         buffers.synchronize()
@@ -265,7 +270,7 @@ class KernelLaunches:
         """Wrench [n, 6] N, N m that the joints of some bodies [n] carried in the last step."""
         n, buffers = len(bodies), self.buffers
         if n > self.joint_capacity:
-            self._record_joint_wrench(max(2 * self.joint_capacity, n, 16))
+            self._record_joint_wrench(max(2 * self.joint_capacity, n))
         self._joint_bodies[:n] = buffers.slots[bodies]
         self._sum_joint_wrenches(n)
         buffers.synchronize()

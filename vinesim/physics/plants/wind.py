@@ -1,99 +1,132 @@
-"""Wind: a mean that blows steadily and gusts that travel with it, felt by plants as drag on leaves and wood.
+"""Wind on the plants: which trees feel it in the simulation, and what is left for cameras to draw.
 
-Turbulence is *frozen* (Taylor, Proc. R. Soc. A 164, 1938): a fixed pattern carried along by the mean, so what blows
-here now blows downwind later, and trees in a row bend one after the other. The pattern is a sum of plane waves
-(Kraichnan, Phys. Fluids 13, 1970), each without divergence, their wave numbers drawn from von Karman's spectrum of
-length scale L, in which energy rises as k^4 and falls as k^-5/3. Near a canopy gusts are 0.3 to 0.6 of the mean in it
-and a few canopy heights long (Raupach, Finnigan and Brunet, Boundary-Layer Meteorol. 78, 1996).
+Gusts let nothing rest, and ten thousand awake trees fit in no step. So only trees near somebody who is there to see are
+simulated in the wind. All others sleep where they last rested; how far the wind moves them is a function of place and
+time that sensors compute for what they look at (:mod:`vinesim.physics.plants.sway`).
+
+Each tree has a phase from 0, its motion is drawn, to 1, it is simulated. It rises while the tree is awake and near: in
+its first half the air of the simulated tree grows to that of the wind, in its second half the drawn motion fades out.
+It falls otherwise, and the tree keeps the air that it felt last. So nothing that is seen jumps.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.kernels.articulation.forces import AIR_DENSITY
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.shelter import TreeDrag
 from vinesim.scene.builder import GRAVITY
+from vinesim.scene.state import State
+from vinesim.scene.values import WindState
+from vinesim.scene.wind import Wind
 
-GUST_WAVES = 48
-"""Plane waves of which gusts are made."""
+FADE_DURATION = 2.0
+"""[s] Half of a change between drawn and simulated, and the time in which wind begins and ends. TUNED: twice the
+period of a slow shoot, so that a simulated tree follows its growing load."""
+
+Observers = tuple[np.ndarray, float]
+"""Points [n, 3] m and a distance [m]: trees whose foot is so near to one of them are simulated in the wind."""
 
 
-class Wind:
-    """A field of air velocity: a pure function of place and time, the same on every client with the same arguments.
+class WindOnPlants:
+    """Sets ``plants.tree_air`` before each step, and wakes sleepers near actors that the wind moves."""
 
-    Args:
-        mean: velocity of the steady wind [3] m/s, world axes; the gusts travel with it.
-        gusts: standard deviation of each component about the mean [m/s].
-        scale: length scale of the gusts [m].
-        seed: of the pattern.
-    """
+    def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        self.plants, self.parameters = plants, parameters
+        model, first = plants.model, plants.model.tree_first
+        number = np.arange(len(model.body_mass)) - first[model.body_tree]
+        core = number < model.tree_core[model.body_tree]  # a bunch's mass has its clusters in it
+        self._foot = model.tree_pose[:, :3].astype(float)
+        self._weight = np.add.reduceat(model.body_mass * core, first) * -GRAVITY[2] if len(first) else np.zeros(0)
+        self.phase = np.zeros(len(first), np.float32)
+        """0: the motion of a tree in the wind is drawn, 1: it is simulated [tree]."""
+        self._drag: TreeDrag | None = None
+        self._wind: Wind | None = None
+        self._strength, self._time, self._round, self._steps = 0.0, 0.0, 0, 0
 
-    def __init__(self, mean: np.ndarray, *, gusts: float = 0.0, scale: float = 4.0, seed: int = 0) -> None:
-        self.mean = np.asarray(mean, float)
-        if self.mean.shape != (3,) or not np.isfinite(self.mean).all():
-            raise ValueError(f"mean wind {mean}: give three finite numbers, m/s")
-        if not 0.0 <= gusts < np.inf or not 0.0 < scale < np.inf:
-            raise ValueError(f"gusts {gusts} m/s, scale {scale} m: need gusts of 0 or more and a positive scale")
-        self.gusts, self.scale = gusts, scale
-        rng = np.random.Generator(np.random.PCG64(seed))
-        # wave numbers at equal shares of the energy; shuffled, since directions are drawn by number
-        grid = np.geomspace(1e-2, 1e2, 4000) / scale
-        energy = np.cumsum((grid * scale) ** 4 / (1.0 + (grid * scale) ** 2) ** (17.0 / 6.0) * np.gradient(grid))
-        share = (np.arange(GUST_WAVES) + 0.5) / GUST_WAVES
-        number = np.interp(rng.permutation(share), energy / energy[-1], grid)
-        along = frames.normalize(rng.normal(size=(GUST_WAVES, 3)))
-        self._wave = number[:, None] * along
-        self._phase = rng.uniform(0.0, 2.0 * np.pi, GUST_WAVES)
-        across = np.cross(along, frames.normalize(rng.normal(size=(GUST_WAVES, 3))))
-        self._sway = frames.normalize(across) * gusts * np.sqrt(6.0 / GUST_WAVES)
-        self._plants: ArticulationSolver | None = None
-        self._round = 0
+    def update(self, wind: Wind | None, time: float, observers: Observers | None = None) -> None:
+        """Before a step at a ``time`` [s] of the wind; None for calm. Without ``observers`` all trees are simulated.
 
-    def velocity_at(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Velocity of the air [..., 3] m/s at points [..., 3] m of the world at a time [s]."""
-        points = np.asarray(points, float)
-        if self.gusts == 0.0:
-            return np.broadcast_to(self.mean, points.shape)
-        return self.mean + np.cos((points - self.mean * time) @ self._wave.T + self._phase) @ self._sway
-
-    def update(
-        self,
-        plants: ArticulationSolver,
-        time: float,
-        observers: tuple[np.ndarray, float] | None = None,
-        parameters: PhysicsParameters = PhysicsParameters(),
-    ) -> None:
-        """Set ``plants.tree_air`` of awake trees for the next tick; wake sleepers that the wind would move.
-
-        Wind blows everywhere and gusts let nothing rest, but ten thousand awake trees fit in no tick. ``observers`` =
-        (points [n, 3] m, distance [m]) says who is there to see: only trees whose foot is so near to one of the points
-        feel the wind. All others keep the air they felt last, so that they come to rest in it and stay asleep.
+        A wind that is there in the first step has always blown; a later one grows, and one that ends dies away.
         """
-        if plants is not self._plants:
-            model, first = plants.model, plants.model.tree_first
-            self._plants, self._foot = plants, model.tree_pose[:, :3].astype(float)
-            self._area = np.add.reduceat(model.body_drag.astype(float), first)
-            number = np.arange(len(model.body_mass)) - first[model.body_tree]
-            core = number < model.tree_core[model.body_tree]  # a bunch's mass has its clusters in it
-            self._weight = np.add.reduceat(model.body_mass * core, first) * -GRAVITY[2]
-        awake = self._near_observers(plants.awake, observers)
-        plants.tree_air[awake] = self.velocity_at(self._foot[awake], time)
+        self._follow(wind)
+        self._time, self._steps = time, self._steps + 1
+        if self._wind is None:
+            return
+        plants = self.plants
+        driven = np.zeros(len(self.phase), bool)
+        driven[awake := self._near(plants.awake, observers)] = True
+        step = 0.5 * self.parameters.dt / FADE_DURATION
+        if self._steps == 1:
+            self.phase[driven] = 1.0
+        fading = np.flatnonzero((self.phase > 0.0) & ~driven)
+        self.phase[fading] = np.maximum(self.phase[fading] - step, 0.0)
+        before = np.minimum(2.0 * self.phase[awake], 1.0)[:, None]
+        self.phase[awake] = np.minimum(self.phase[awake] + step, 1.0)
+        after = np.minimum(2.0 * self.phase[awake], 1.0)[:, None]
+        growth = np.where(before < 1.0, (after - before) / np.maximum(1.0 - before, 1e-6), 1.0)
+        plants.tree_air[awake] += growth * (self._air(awake) - plants.tree_air[awake])
+        if wind is self._wind:
+            self._wake_stirred(observers)
+        else:
+            self._calm(~driven)
 
-        rounds = parameters.steps(parameters.wind_check_period)  # all sleepers are looked at once in so many steps
+    @property
+    def state(self) -> WindState | None:
+        """The wind as sensors need it, None in calm air."""
+        if self._wind is None:
+            return None
+        fade = np.clip(2.0 - 2.0 * self.phase, 0.0, 1.0)
+        drawn = fade * fade * (3.0 - 2.0 * fade)
+        return WindState(self._wind, self._time, self._strength, self.plants.tree_air.copy(), drawn)
+
+    def _follow(self, wind: Wind | None) -> None:
+        """Let the wind that blows end before another begins."""
+        step = self.parameters.dt / FADE_DURATION
+        if wind is self._wind:
+            self._strength = min(self._strength + step, 1.0)
+            return
+        self._strength = max(self._strength - step, 0.0)
+        if self._strength == 0.0:
+            self._wind = wind
+            self.plants.tree_air[:] = 0.0
+            if wind is not None:
+                if self._drag is None:
+                    self._drag = TreeDrag.of(self.plants.model, State.at_rest(self.plants.model).body_q)
+                self._share = self._drag.air_share(wind.mean)
+                self._strength = 1.0 if self._steps == 0 else step
+
+    def _air(self, trees: np.ndarray) -> np.ndarray:
+        """Velocity [k, 3] m/s of the wind at some trees [k]."""
+        assert self._wind is not None
+        velocity = self._wind.velocity_at(self._foot[trees], self._time)
+        return self._strength * self._share[trees, None] * velocity
+
+    def _calm(self, trees: np.ndarray) -> None:
+        """While a wind dies away: let sleepers that still feel their last air come to rest without it."""
+        felt = np.flatnonzero(trees & (self.plants.tree_air != 0.0).any(1))
+        if len(felt):
+            self.plants.wake(felt)
+            ago = self._strength + self.parameters.dt / FADE_DURATION
+            self.plants.tree_air[felt] *= self._strength / ago
+
+    def _wake_stirred(self, observers: Observers | None) -> None:
+        """All sleepers are looked at once in a period, an equal number in each step."""
+        plants, parameters = self.plants, self.parameters
+        rounds = parameters.steps(parameters.wind_check_period)
         self._round = (self._round + 1) % rounds
         some = np.arange(self._round, len(self._foot), rounds)
-        some = self._near_observers(some[~plants.state.tree_awake[some] & (self._area[some] > 0.0)], observers)
-        air, felt = self.velocity_at(self._foot[some], time), plants.tree_air[some].astype(float)
+        assert self._drag is not None
+        area = self._drag.area
+        some = self._near(some[~plants.state.tree_awake[some] & (area[some] > 0.0)], observers)
+        air, felt = self._air(some), plants.tree_air[some].astype(float)
         change = air * np.linalg.norm(air, axis=-1, keepdims=True) - felt * np.linalg.norm(felt, axis=-1, keepdims=True)
-        force = 0.5 * AIR_DENSITY * self._area[some] * np.linalg.norm(change, axis=-1)
-        stirred = force > parameters.wind_wake_load * self._weight[some]
-        plants.tree_air[some[stirred]] = air[stirred]
-        plants.wake(some[stirred])
+        force = 0.5 * AIR_DENSITY * area[some] * np.linalg.norm(change, axis=-1)
+        plants.wake(some[force > parameters.wind_wake_load * self._weight[some]])
 
-    def _near_observers(self, trees: np.ndarray, observers: tuple[np.ndarray, float] | None) -> np.ndarray:
+    def _near(self, trees: np.ndarray, observers: Observers | None) -> np.ndarray:
         """Those of some trees whose foot is near one of the points."""
         if observers is None:
             return trees

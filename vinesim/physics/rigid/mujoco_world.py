@@ -44,6 +44,8 @@ class CompiledWorld:
     names: WorldNames
     bunches: dict[int, tuple[int, FreeBunch]]
     """Free bunches that have bodies in it already, each with its slot."""
+    removed: tuple[RobotBody | HumanBody, ...] = ()
+    """Actors of the present world that it is made without."""
 
 
 def _log_mujoco_warnings() -> None:

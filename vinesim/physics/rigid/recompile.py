@@ -9,7 +9,7 @@ import numpy as np
 
 from vinesim.physics.rigid.mujoco_sleep import AWAKE_COUNTER
 
-_FREE = mujoco.mjtJoint.mjJNT_FREE
+_FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
 _INIT, _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_INIT), int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
 DOF_ARRAYS = (

@@ -12,7 +12,7 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
@@ -32,6 +32,9 @@ from vinesim.scene.values import HumanSpec, RobotSpec
 
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 _HIPS = BODY_PARTS.index("hips")
+
+MAX_RATE = 1e4
+"""[m/s, rad/s] No body moves as fast, unless the simulation has become unstable."""
 
 
 class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
@@ -75,15 +78,20 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         self._recompile()
 
     def compile_with(
-        self, *specs: RobotSpec | HumanSpec, is_remote: bool = False, replaces: bool = False
-    ) -> CompiledWorld:
-        """Compile the world with more actors and a full pool of spare bodies for free bunches, for :meth:`adopt`.
+        self, *specs: RobotSpec | HumanSpec, is_remote: bool = False, replaces: bool = False,
+        without: Collection[str] = (),
+    ) -> CompiledWorld:  # fmt: skip
+        """Compile the world with more actors, ``without`` those of some names, and with a full pool of spare bodies for
+        free bunches, for :meth:`adopt`.
 
         Any thread may call this while steps go on. Raises :class:`RobotError` if a URDF does not compile, of several
         robots without saying which. ``is_remote``: see :meth:`add_human`. ``replaces``: the robots
         are here and keep their states; only their shapes are others.
         """
         robots, humans = list(self._robots.values()), list(self._humans.values())
+        removed = tuple(actor for actor in (*robots, *humans) if actor.spec.name in without)
+        robots = [robot for robot in robots if robot not in removed]
+        humans = [human for human in humans if human not in removed]
         for spec in specs:
             if isinstance(spec, HumanSpec):
                 code = _free_code(spec.name, "human", static_world.HUMAN_CODES, humans, robots, HumanError)
@@ -96,7 +104,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
                 code = _free_code(spec.name, "robot", static_world.ROBOT_CODES, robots, humans, RobotError)
                 robots.append(RobotBody(spec, code, self.parameters))
         try:
-            return self._compile_world(tuple(robots), tuple(humans))
+            return dataclasses.replace(self._compile_world(tuple(robots), tuple(humans)), removed=removed)
         except ValueError as error:
             added = [spec for spec in specs if isinstance(spec, RobotSpec)]
             if not added:
@@ -104,18 +112,20 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             raise build_error(added[-1], error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
-        """Use a world that was compiled with more actors, with other shapes of robots, or with more room for free
-        bunches; between steps.
+        """Use a world that was compiled with more or fewer actors, with other shapes of robots, or with more room for
+        free bunches; between steps.
 
         False, and nothing is changed, if other actors joined or left meanwhile: compile it anew.
         """
-        present = (*self._robots.values(), *self._humans.values())
+        present = tuple(
+            actor for actor in (*self._robots.values(), *self._humans.values()) if actor not in compiled.removed
+        )
         planned = (*compiled.robots, *compiled.humans)
         added = [actor for actor in planned if actor not in present]
         replaced = {
             actor: self._robots[actor.spec.name]
             for actor in added
-            if isinstance(actor, RobotBody) and actor.spec.name in self._robots
+            if isinstance(actor, RobotBody) and self._robots.get(actor.spec.name) in present
         }
         kept: list[RobotBody | HumanBody] = [
             replaced[actor] if isinstance(actor, RobotBody) and actor in replaced else actor
@@ -210,7 +220,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             np.add(force, 0.0, out=d.qfrc_applied)  # turns -0 into +0: -0 would keep sleeping boxes awake
         mujoco.mj_step2(m, d)
         self._link_sensors.measure(m, d)
-        if not np.isfinite(d.qvel).all() or not np.isfinite(d.qpos).all():
+        if not (d.qvel.min() > -MAX_RATE and d.qvel.max() < MAX_RATE and np.isfinite(d.qpos).all()):
             self._stop_faulty_trees()
             force = None
         self.contact_force[:] = 0.0 if force is None else force
@@ -236,13 +246,14 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         self._link_sensors.find_indices(mj_model, self._robots)
 
     def _stop_faulty_trees(self) -> None:
-        """Stop the kinematic trees with a number that is not finite where the step began; the others go on."""
+        """Stop the kinematic trees with a number that is not finite, or a rate beyond :data:`MAX_RATE`, where the step
+        began; the others go on."""
         m, d = self.mj_model, self.mj_data
         joint_tree = m.dof_treeid[m.jnt_dofadr]
         width = np.where(m.jnt_type == mujoco.mjtJoint.mjJNT_FREE, 7, 1)
         tree = np.repeat(joint_tree, width)  # of each entry of qpos
         faulty = np.zeros(m.ntree, bool)
-        faulty[m.dof_treeid[~np.isfinite(d.qvel)]] = True
+        faulty[m.dof_treeid[~(np.abs(d.qvel) < MAX_RATE)]] = True
         faulty[tree[~np.isfinite(d.qpos)]] = True
         valid = np.where(np.isfinite(self._valid_qpos), self._valid_qpos, m.qpos0)
         d.qpos[faulty[tree]] = valid[faulty[tree]]
@@ -255,7 +266,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
                 robot.feedforward[:] = 0.0
         stopped = [m.body(m.tree_bodyadr[tree]).name for tree in np.flatnonzero(faulty)]
         self.faults += len(stopped)
-        self.last_fault = f"t = {d.time:.2f} s: {', '.join(stopped)} moved by a number that is not finite; stopped"
+        names = ", ".join(stopped)
+        self.last_fault = f"t = {d.time:.2f} s: {names} moved by a number that is not finite or too fast; stopped"
 
 
 def _free_code(

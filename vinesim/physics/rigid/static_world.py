@@ -37,11 +37,12 @@ def _codes(bits: range) -> tuple[int, ...]:
 
 
 ROBOT_CODES, HUMAN_CODES = _codes(_ROBOT_BITS), _codes(_HUMAN_BITS)
-"""Collision codes: each actor has one of its own, so that it never touches itself but all others.
+"""Collision codes: each actor has one of its own, so that it touches all others, and itself only where that is wanted.
 
-MuJoCo lets two geoms touch if ``contype`` of one and ``conaffinity`` of the other share a bit. An actor has its code as
-``contype`` and all other bits in ``conaffinity``. Codes of one kind all have six bits, so none contains another: each
-has a bit that the other has not. 31 bits thus tell 924 robots and 1716 people apart; a bit for each would do for 25.
+MuJoCo lets two geoms touch if ``contype`` of one and ``conaffinity`` of the other share a bit. An actor has its code
+as ``contype`` and all other bits in ``conaffinity``; a robot that touches itself has its code there, too. Codes of one
+kind all have six bits, so none contains another: each has a bit that the other has not. 31 bits thus tell 924 robots
+and 1716 people apart; a bit for each would do for 25.
 """
 
 

@@ -186,6 +186,11 @@ class TrajectoryController:
             self._end(Outcome.CANCELED, "it was cancelled")
             self._hold()
 
+    def release(self, text: str) -> None:
+        """End the goal, as another controller moves its joints from now on; ``text`` says which."""
+        self._end(Outcome.PREEMPTED, text)
+        self.active_goal = None
+
     def _validate(self, trajectory: Trajectory, time: float) -> np.ndarray:
         """Indices [joint] of the trajectory's joints among the controller's; :class:`TrajectoryError` if invalid."""
         name, t = self.robot.name, trajectory

@@ -11,7 +11,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.robot.description.kinematics import MovingJoints
 from vinesim.robot.description.sidecar import BaseLimits, CameraMount, Cutter, JointGroup, SensorMount
-from vinesim.scene.values import Drive, RobotSpec
+from vinesim.scene.values import ControllerSpec, Drive, RobotSpec
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +42,8 @@ class RobotDescription:
     imus: tuple[SensorMount, ...]
     wrenches: tuple[SensorMount, ...]
     cutters: tuple[Cutter, ...]
+    controllers: tuple[ControllerSpec, ...]
+    """What ROS may command, by which interface; sorted by name."""
     base_limits: BaseLimits
     mass: float
     """[kg]"""
@@ -49,6 +51,8 @@ class RobotDescription:
     """What was changed or derived at loading, one line each."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Corners [face, 3, 3] m of meshes that came over the network, by the file name that ``urdf`` gives them."""
+    is_remote: bool = False
+    """Whether its text came over the network: another client simulates the robot."""
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -96,5 +100,5 @@ class RobotDescription:
         pose = frames.pose([0.0, 0.0, 0.0]) if pose is None else np.asarray(pose, float)
         return RobotSpec(
             name, index, self.urdf, self.base, pose, self.drives, self.home.copy(), self.base_limits.effort,
-            self.meshes,
+            self.meshes, self.is_remote,
         )  # fmt: skip

@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
+from vinesim.robot.description.controllers import command_interfaces, make_controllers
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
 from vinesim.robot.description.errors import DescriptionError, description_error
@@ -37,7 +38,13 @@ from vinesim.robot.description.repairs import (
 from vinesim.robot.description.sidecar import Sidecar, check_sidecar, read_sidecar
 from vinesim.robot.description.urdf_checks import check_joints, check_masses, check_tree
 from vinesim.robot.description.urdf_model import Joint, Robot, parse_robot
-from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES, check_numbers, fix_wheels, read_xml
+from vinesim.robot.description.urdf_reader import (
+    MOVABLE_JOINT_TYPES,
+    check_numbers,
+    fix_wheels,
+    merge_disabled_collisions,
+    read_xml,
+)
 from vinesim.scene import data_files
 
 log = logging.getLogger(__name__)
@@ -78,6 +85,9 @@ def load_description(
     cameras = sidecar.cameras if sidecar.cameras is not None else guess_cameras(root, notes)
     lidars = sidecar.lidars if sidecar.lidars is not None else guess_lidars(root, notes)
     sidecar = msgspec.structs.replace(sidecar, cameras=cameras, lidars=lidars)
+    srdf = file.parent / sidecar.srdf if sidecar.srdf else file.with_suffix(".srdf")
+    if not is_remote and (sidecar.srdf or srdf.is_file()):
+        merge_disabled_collisions(root, srdf, notes)
     try:
         parsed = parse_robot(root)
     except ValueError as error:
@@ -90,7 +100,7 @@ def load_description(
     add_missing_masses(root, parsed, base, order, assumed)
     urdf = etree.tostring(root, encoding="unicode")
     description = _assemble(parse_robot(root), base, order, file, urdf, sidecar, notes, assumed)
-    description = dataclasses.replace(description, meshes=meshes)
+    description = dataclasses.replace(description, meshes=meshes, is_remote=is_remote)
     for note in notes:
         log.info("%s: %s", file.name, note)
     if assumed:
@@ -146,6 +156,7 @@ def _assemble(
         imus=sidecar.imus,
         wrenches=sidecar.wrenches,
         cutters=sidecar.cutters,
+        controllers=make_controllers(sidecar, names, command_interfaces(urdf), file.with_suffix(".toml")),
         base_limits=msgspec.structs.replace(sidecar.base, linear=0.0, angular=0.0, effort=BOLTED_EFFORT)
         if base == MOUNT
         else sidecar.base,

@@ -1,4 +1,4 @@
-"""The TOML file beside a URDF: base limits, joint groups with gains, sensors, cutters.
+"""The TOML file beside a URDF: base limits, joint groups with gains, sensors, cutters, controllers.
 
 The attributes are the keys of the file, except ``armature``, ``series_stiffness`` and ``series_damping`` of a group,
 which the file calls ``rotor``, ``elastic`` and ``elastic_damping``.
@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from vinesim.robot.description.errors import description_error
+from vinesim.scene.values import ControllerKind
 
 
 class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -95,6 +96,18 @@ class Cutter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Half edges of the space [m]; the second is how far to either side wood is caught."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Its centre in ``frame`` [m]."""
+    force: float | None = None
+    """Largest force with which it cuts [N]; without it, it cuts whatever is in its mouth."""
+
+
+class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A controller, as ROS sees it; see :class:`vinesim.scene.values.ControllerKind`."""
+
+    kind: ControllerKind
+    joints: tuple[str, ...] = ()
+    """Those of ``group`` unless given."""
+    group: str = ""
+    """A joint group; a gripper or cutter needs one."""
 
 
 class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -107,6 +120,11 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
     cutters: tuple[Cutter, ...] = ()
+    controllers: dict[str, Controller] | None = None
+    """By name; None: those that :mod:`vinesim.robot.description.controllers` derives from the groups."""
+    srdf: str = ""
+    """SRDF file whose pairs of ``disable_collisions`` never touch, by its path from the TOML file; unless given, the
+    file of the URDF's name that ends with ``.srdf``, if there is one."""
 
 
 def read_sidecar(file: pathlib.Path) -> Sidecar:
@@ -207,6 +225,8 @@ def _check_cutters(sidecar: Sidecar, links: Container[str], file: pathlib.Path) 
             raise description_error(
                 file, f"the cutter of {cutter.group!r} sits in {cutter.frame!r}", "name a link of the URDF"
             )
+        if cutter.force is not None and not cutter.force > 0.0:
+            raise description_error(file, f"the cutter of {cutter.group!r} has {cutter.force} N", "give more than 0")
         if min(cutter.half) <= 0.0:
             raise description_error(
                 file, f"the cutter of {cutter.group!r} has a mouth of {cutter.half}", "give half edges above 0"

@@ -48,6 +48,22 @@ def read_xml(file: pathlib.Path) -> etree._Element:
     return root
 
 
+def merge_disabled_collisions(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:
+    """Copy the ``disable_collisions`` of an SRDF ``file`` between links of the URDF into its text; adds to ``notes``.
+
+    So they reach whatever reads that text. Raises :class:`DescriptionError` if the file is missing or no SRDF.
+    """
+    if not file.is_file():
+        raise description_error(file, "this SRDF is missing", "mend its path in the robot's TOML file")
+    pairs = read_xml(file).findall("disable_collisions")
+    links = {link.get("name") for link in root.iterfind("link")}
+    known = [pair for pair in pairs if links.issuperset((pair.get("link1"), pair.get("link2")))]
+    for pair in known:
+        etree.SubElement(root, "disable_collisions", link1=pair.get("link1"), link2=pair.get("link2"))
+    unknown = f", {len(pairs) - len(known)} more name links that it lacks" if len(known) < len(pairs) else ""
+    notes.append(f"{len(known)} pairs of links never touch by {file.name}{unknown}")
+
+
 def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
     """Raise :class:`DescriptionError` unless all numbers are complete and bounded, and all sizes above 0."""
     for element in root.iter(*{tag for tag, _ in NUMBER_COUNTS}):

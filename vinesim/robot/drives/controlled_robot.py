@@ -161,13 +161,23 @@ class Robot(RobotInstance):
         travel, offset = self.description.finger_travel(fingers)
         return travel * float(self.rigid.joint_measurements(self.name)[0][fingers].mean()) + offset
 
-    def command_cutter(self, group: str) -> None:
-        """Close the cutter of a gripper and open it again: what is between its blades in the next step is cut."""
+    def command_cutter(self, group: str, force: float | None = None) -> None:
+        """Close the cutter of a gripper and open it again: what is between its blades in the next step is cut.
+
+        ``force`` [N]: with at most so much, the cutter's own limit unless given; what resists more stays.
+        """
+        if force is not None and not force > 0.0:
+            raise CommandError(f"{self.name}: cutting force {force}; give more than 0, or none for all there is")
+        limits = [cutter.force for cutter in self.description.cutters if cutter.group == group]
+        for blade, limit in zip(self.cutter_blades(group), limits, strict=True):
+            blade.close(min(np.inf if limit is None else limit, np.inf if force is None else force))
+
+    def cutter_blades(self, group: str) -> tuple[Blade, ...]:
+        """The cutters of a gripper, which tell what they cut; :class:`CommandError` if it has none."""
         if group not in self._cutters:
             known = ", ".join(sorted(self._cutters)) or "none"
             raise CommandError(f"{self.name} has no cutter at {group!r}; cutters fitted: {known}")
-        for blade in self._cutters[group]:
-            blade.close()
+        return tuple(self._cutters[group])
 
     def command_base(self, linear: float, angular: float, time: float) -> None:
         """Drive with ``linear`` [m/s] ahead and ``angular`` [rad/s] to the left; lapses after the timeout."""

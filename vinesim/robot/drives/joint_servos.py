@@ -30,6 +30,11 @@ MIN_DIVISOR = 1e-9
 """Stiffness, inertia and velocity [SI units] are taken to be at least this where they divide."""
 
 
+def series_stiffness(drives: Sequence[Drive]) -> np.ndarray:
+    """[joint] Stiffnesses of the series elastic elements of some drives [N m/rad or N/m]."""
+    return np.array([drive.series_stiffness or drive.stiffness or drive.effort / RIGID_DEFLECTION for drive in drives])
+
+
 class JointServos:
     """The servos of one robot's driven joints; all arrays are [joint], in the order of ``drives``."""
 
@@ -43,9 +48,7 @@ class JointServos:
         """[joint] largest velocities [rad/s or m/s]"""
         self.max_effort = np.array([drive.effort for drive in drives], float)
         """[joint] largest efforts [N m or N]"""
-        self.series_stiffness = np.array(
-            [drive.series_stiffness or drive.stiffness or drive.effort / RIGID_DEFLECTION for drive in drives]
-        )
+        self.series_stiffness = series_stiffness(drives)
         """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
         self._series_damping = np.array(
             [drive.series_damping if drive.series_stiffness else drive.damping for drive in drives]

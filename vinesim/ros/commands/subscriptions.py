@@ -11,34 +11,36 @@ from typing import Any
 
 import rclpy.node
 from geometry_msgs.msg import TwistStamped
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 
-from vinesim.ros.commands.types import Command, JointTrajectory
-from vinesim.ros.messages import convert
+from vinesim.ros.commands import convert
+from vinesim.ros.commands.types import (
+    BaseVelocity,
+    Command,
+    ElasticCommand,
+    ForwardCommand,
+    ImpedanceCommand,
+)
 from vinesim.ros.topic import RELIABLE
+from vinesim.scene.values import ControllerKind, ControllerSpec
 
 log = logging.getLogger(__name__)
 
-MAX_QUEUED = 64
+MAX_QUEUED = 256
 """Largest number of queued commands; a client that takes them after every step never loses the oldest."""
+FORWARD_KINDS = (ControllerKind.FORWARD_POSITION, ControllerKind.FORWARD_VELOCITY, ControllerKind.FORWARD_EFFORT)
 
 
-class CommandSubscriptions:
-    """The queue of commands: a set-point replaces an older one of its kind, trajectories are all kept."""
+class CommandQueue:
+    """Commands on their way to the client: a set-point replaces an older one of its kind, goals are all kept."""
 
-    def __init__(self, node: rclpy.node.Node, trajectory_controllers: Sequence[str]) -> None:
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._queue: deque[Command] = deque(maxlen=MAX_QUEUED)
         self.rejected = 0
-        """Messages that contradicted themselves."""
-        self._subscribe(node, TwistStamped, "mobile_base_controller/cmd_vel", convert.base_velocity)
-        forward = "forward_position_controller"
-        take = partial(convert.joint_positions, controller=forward)
-        self._subscribe(node, Float64MultiArray, f"{forward}/commands", take)
-        for name in trajectory_controllers:
-            take = partial(convert.joint_trajectory, controller=name)
-            self._subscribe(node, JointTrajectoryMessage, f"{name}/joint_trajectory", take)
+        """Messages and goals that contradicted themselves."""
 
     def drain(self) -> list[Command]:
         """Take all commands that arrived since the last call, in order of arrival."""
@@ -47,18 +49,65 @@ class CommandSubscriptions:
             self._queue.clear()
         return commands
 
-    def _subscribe(self, node: rclpy.node.Node, message: type, topic: str, take: Callable[[Any], Command]) -> None:
-        node.create_subscription(message, topic, partial(self._receive, take), RELIABLE)
+    def put(self, command: Command) -> None:
+        """Add a command."""
+        key = _setpoint_key(command)
+        with self._lock:
+            if key is not None:
+                for older in [c for c in self._queue if _setpoint_key(c) == key]:
+                    self._queue.remove(older)
+            self._queue.append(command)
+
+    def refuse(self, error: convert.CommandError) -> None:
+        """Count a command that contradicts itself."""
+        self.rejected += 1
+        log.warning("refused a command: %s", error)
+
+
+def _setpoint_key(command: Command) -> tuple[str, ...] | None:
+    """What a command sets, if a newer one makes it void; None for trajectories and goals."""
+    match command:
+        case BaseVelocity():
+            return ("base",)
+        case ForwardCommand():
+            return (command.controller,)
+        case ImpedanceCommand():
+            return (command.controller, command.what)
+        case ElasticCommand():
+            return (command.controller, command.joint)
+    return None
+
+
+class CommandSubscriptions:
+    """The command topics of a base and of these ``controllers``."""
+
+    def __init__(self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue) -> None:
+        self._node, self._queue = node, queue
+        self._subscribe(TwistStamped, "mobile_base_controller/cmd_vel", convert.base_velocity)
+        for spec in controllers:
+            self._subscribe_controller(spec.name, spec.kind, spec.joints)
+
+    def _subscribe_controller(self, name: str, kind: ControllerKind, joints: tuple[str, ...]) -> None:
+        if kind is ControllerKind.JOINT_TRAJECTORY:
+            take = partial(convert.joint_trajectory, controller=name, known=joints)
+            self._subscribe(JointTrajectoryMessage, f"{name}/joint_trajectory", take)
+        elif kind in FORWARD_KINDS:
+            take = partial(convert.forward_command, controller=name, joints=joints)
+            self._subscribe(Float64MultiArray, f"{name}/commands", take)
+        elif kind is ControllerKind.IMPEDANCE:
+            for what in ("stiffness", "damping", "equilibrium"):
+                take = partial(convert.impedance_command, controller=name, joints=joints, what=what)
+                self._subscribe(Float64MultiArray, f"{name}/{what}", take)
+        elif kind is ControllerKind.SERIES_ELASTIC:
+            for joint in joints:
+                take = partial(convert.elastic_command, controller=name, joint=joint)
+                self._subscribe(JointState, f"{name}/{joint}/command", take)
+
+    def _subscribe(self, message: type, topic: str, take: Callable[[Any], Command]) -> None:
+        self._node.create_subscription(message, topic, partial(self._receive, take), RELIABLE)
 
     def _receive(self, take: Callable[[Any], Command], message: Any) -> None:
         try:
-            command = take(message)
+            self._queue.put(take(message))
         except convert.CommandError as error:
-            self.rejected += 1
-            log.warning("refused a command: %s", error)
-            return
-        with self._lock:
-            if not isinstance(command, JointTrajectory):
-                for older in [c for c in self._queue if type(c) is type(command)]:
-                    self._queue.remove(older)
-            self._queue.append(command)
+            self._queue.refuse(error)

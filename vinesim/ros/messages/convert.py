@@ -1,4 +1,4 @@
-"""Conversion of values to ROS messages and back: pure functions.
+"""Conversion of values to ROS messages: pure functions.
 
 Arrays go into a message through ``array.array``, which rosidl takes as it is (0.03 ms for a 0.9 MB picture; a list of
 numbers takes a thousand times as long). Stamps are the simulation time of the sample (REP-117/118 for what has no
@@ -11,22 +11,22 @@ import array
 import functools
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import TwistStamped, WrenchStamped
+from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo as CameraInfoMessage
 from sensor_msgs.msg import CompressedImage, Image, JointState, PointCloud2, PointField
-from std_msgs.msg import Float64MultiArray, Header, String
-from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
+from sensor_msgs.msg import Imu as ImuMessage
+from std_msgs.msg import Header, String
+from trajectory_msgs.msg import JointTrajectoryPoint
 
 from vinesim import frames
-from vinesim.ros.commands.types import BaseVelocity, JointPositions, JointTrajectory
 from vinesim.ros.messages.transforms import split_time
 from vinesim.scene.camera_geometry import (
     DISTORTION,
@@ -37,7 +37,17 @@ from vinesim.scene.camera_geometry import (
     write_points,
 )
 from vinesim.scene.ids import LABEL_STRIDE, Organ
-from vinesim.scene.values import CameraFrame, CameraInfo, ComponentStatus, Contact, JointSample, LidarScan, RobotSample
+from vinesim.scene.values import (
+    CameraFrame,
+    CameraInfo,
+    ComponentStatus,
+    ElasticSample,
+    Imu,
+    JointSample,
+    LidarScan,
+    RobotSample,
+    Wrench,
+)
 
 """One point of a depth camera's cloud; rgb is 0x00RRGGBB, which PointCloud2 carries as a float32 (PCL's way)."""
 
@@ -61,11 +71,13 @@ DUAL_LIDAR_POINT = np.dtype(
 )
 """The same of a lidar that reports two returns of a shot; return_type: 1 the strongest, 2 the other."""
 
-_FIELD_TYPES = {"f4": PointField.FLOAT32, "u1": PointField.UINT8, "u2": PointField.UINT16, "u4": PointField.FLOAT32}
-
-
-class CommandError(ValueError):
-    """A command message contradicts itself; the text says how."""
+_FIELD_TYPES = {
+    "f4": PointField.FLOAT32,
+    "i4": PointField.INT32,
+    "u1": PointField.UINT8,
+    "u2": PointField.UINT16,
+    "u4": PointField.FLOAT32,
+}
 
 
 def stamp(time: float) -> Time:
@@ -112,15 +124,62 @@ def odometry(sample: RobotSample, base: str) -> Odometry:
     return message
 
 
-def wrench(contact: Contact, time: float, frame: str, frame_q: np.ndarray) -> WrenchStamped:
-    """One contact as the wrench that it exerts on the robot: axes and moment origin of ``frame``, at ``frame_q``."""
-    frame_q = np.asarray(frame_q, float)
-    into_frame = frames.conjugate(frame_q[3:])
-    force = frames.rotate(into_frame, np.asarray(contact.force, float))
-    arm = frames.rotate(into_frame, np.asarray(contact.position, float) - frame_q[:3])
-    message = WrenchStamped(header=header(time, frame))
-    _set_vector(message.wrench.force, force)
-    _set_vector(message.wrench.torque, np.cross(arm, force))
+def wrench(sample: Wrench) -> WrenchStamped:
+    """What a force-torque sensor reads, in its frame."""
+    message = WrenchStamped(header=header(sample.time, sample.frame))
+    _set_vector(message.wrench.force, sample.force)
+    _set_vector(message.wrench.torque, sample.torque)
+    return message
+
+
+def imu(sample: Imu) -> ImuMessage:
+    """What an inertial measurement unit reads; exact, so all covariances are 0."""
+    message = ImuMessage(header=header(sample.time, sample.frame))
+    _set_quaternion(message.orientation, sample.orientation)
+    _set_vector(message.angular_velocity, sample.angular_velocity)
+    _set_vector(message.linear_acceleration, sample.linear_acceleration)
+    return message
+
+
+def elastic_state(sample: ElasticSample, joint: int) -> JointState:
+    """One series elastic element: position of the motor, and the torque that its spring carries."""
+    return JointState(
+        header=header(sample.time, ""), name=[sample.names[joint]], position=[float(sample.motor[joint])],
+        effort=[float(sample.torque[joint])],
+    )  # fmt: skip
+
+
+def reference_points(sample: RobotSample, joints: np.ndarray) -> dict[str, JointTrajectoryPoint]:
+    """Desired and actual state of ``joints`` [k], and the difference, as control_msgs have them."""
+    assert sample.reference is not None
+    wanted = np.stack([sample.reference.position[joints], sample.reference.velocity[joints]])
+    found = np.stack([sample.joints.position[joints], sample.joints.velocity[joints]])
+    states = {"desired": wanted, "actual": found, "error": wanted - found}
+    return {
+        name: JointTrajectoryPoint(positions=position.tolist(), velocities=velocity.tolist())
+        for name, (position, velocity) in states.items()
+    }
+
+
+CONTACT_POINT = np.dtype(
+    [
+        ("x", "f4"), ("y", "f4"), ("z", "f4"), ("force_x", "f4"), ("force_y", "f4"), ("force_z", "f4"),
+        ("body", "i4"), ("bunch", "i4"), ("link", "i4"),
+    ]
+)  # fmt: skip
+"""A contact as a point of a cloud: where, the force on the robot [N], the plant's body, its bunch or -1, and the
+robot's link by its number in the URDF or -1."""
+
+
+def contact_cloud(sample: RobotSample, links: Mapping[str, int], bunch_of_body: np.ndarray, frame: str) -> PointCloud2:
+    """All contacts of one step, in the world's ``frame``; ``links``: numbers by name, ``bunch_of_body`` [body]."""
+    message, points = _cloud(sample.joints.time, frame, CONTACT_POINT, 1, len(sample.contacts))
+    for row, contact in zip(points[0], sample.contacts, strict=True):
+        row["x"], row["y"], row["z"] = contact.position
+        row["force_x"], row["force_y"], row["force_z"] = contact.force
+        row["body"], row["link"] = contact.body, links.get(contact.link.removeprefix(f"{sample.actor}/"), -1)
+        row["bunch"] = bunch_of_body[contact.body] if 0 <= contact.body < len(bunch_of_body) else -1
+    message.is_dense = True
     return message
 
 
@@ -212,44 +271,6 @@ def diagnostics(time: float, prefix: str, components: Iterable[ComponentStatus])
             DiagnosticStatus(name=f"{prefix}: {one.name}", level=_LEVELS[one.level], message=one.message, values=values)
         )
     return DiagnosticArray(header=header(time, ""), status=statuses)
-
-
-def base_velocity(message: TwistStamped) -> BaseVelocity:
-    """A commanded velocity of the base; :class:`CommandError` if it is not finite."""
-    linear, angular = message.twist.linear, message.twist.angular
-    velocity = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
-    if not np.isfinite(velocity).all():
-        raise CommandError(f"cmd_vel is not finite: {velocity.tolist()}")
-    return BaseVelocity(seconds(message.header.stamp), velocity[:3], velocity[3:])
-
-
-def joint_positions(message: Float64MultiArray, controller: str) -> JointPositions:
-    """Commanded positions of a forward controller; :class:`CommandError` if they are not finite."""
-    positions = np.array(message.data, float)
-    if not np.isfinite(positions).all():
-        raise CommandError(f"{controller}: commanded positions are not finite: {positions.tolist()}")
-    return JointPositions(controller, positions)
-
-
-def joint_trajectory(message: JointTrajectoryMessage, controller: str) -> JointTrajectory:
-    """A trajectory; :class:`CommandError` if its points do not fit its joints or its times do not rise."""
-    joints = tuple(message.joint_names)
-    for i, point in enumerate(message.points):
-        if len(point.positions) != len(joints) or len(point.velocities) not in (0, len(joints)):
-            raise CommandError(
-                f"{controller}: point {i} has {len(point.positions)} positions and {len(point.velocities)} velocities "
-                f"for {len(joints)} joints; give one of each per joint, or no velocities"
-            )
-    start = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points]
-    times = np.array(start, float)
-    if (np.diff(times) <= 0.0).any():
-        raise CommandError(f"{controller}: time_from_start does not rise: {start}")
-    positions = np.array([p.positions for p in message.points], float).reshape(len(times), len(joints))
-    with_velocity = len(times) > 0 and all(len(p.velocities) for p in message.points) and len(joints) > 0
-    velocities = np.array([p.velocities for p in message.points], float) if with_velocity else None
-    if not np.isfinite(positions).all() or (velocities is not None and not np.isfinite(velocities).all()):
-        raise CommandError(f"{controller}: the trajectory is not finite")
-    return JointTrajectory(controller, seconds(message.header.stamp), joints, times, positions, velocities)
 
 
 def _image(frame: CameraFrame, pixels: np.ndarray, encoding: str, dtype: type) -> Image:

@@ -1,22 +1,66 @@
-"""/clock: simulation time for nodes that run with use_sim_time."""
+"""/clock: time of the world for nodes that run with use_sim_time. Of all nodes of a ROS domain one publishes it.
+
+A node that has seen no other publisher of /clock for a second becomes one; of two that did so at once the one with the
+greater identifier of its publisher gives way. When the publisher goes, another node follows within a few seconds.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time as wall
+from collections.abc import Callable, Iterator
 from functools import partial
 
+import rclpy.node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from vinesim.ros.messages import convert
-from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
+from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage, Topic
+
+CLOCK = "/clock"
+FREE_TIME = 1.0
+"""[s] Without a publisher of /clock before a node becomes it: discovery of a node on the same machine takes 0.3 s."""
+LOOK_PERIOD = 0.25
+"""Wall time between two looks at the publishers [s]."""
 
 
 class ClockPublisher:
-    """/clock: one for each ROS domain, so its name is absolute under every namespace."""
+    """This node's part in /clock; its name is absolute under every namespace."""
 
-    def __init__(self, advertise: Advertise) -> None:
-        self._topic = advertise(ClockMessage, "/clock", RELIABLE)
+    def __init__(self, node: rclpy.node.Node, advertise: Advertise, withdraw: Callable[[Topic], None]) -> None:
+        self._node, self._advertise, self._withdraw = node, advertise, withdraw
+        self._topic: Topic | None = None
+        self._free_since = wall.monotonic()
+        self._next_look = 0.0
+
+    @property
+    def has_subscribers(self) -> bool:
+        """Whether this node publishes /clock, and has subscribers."""
+        topic = self._topic
+        return topic is not None and topic.subscription_count > 0
+
+    def update(self) -> None:
+        """Look who publishes /clock, and begin or stop; called by the receiving thread of the node."""
+        now = wall.monotonic()
+        if now < self._next_look:
+            return
+        self._next_look = now + LOOK_PERIOD
+        own, others = [], []
+        for publisher in self._node.get_publishers_info_by_topic(CLOCK):
+            is_own = (publisher.node_name, publisher.node_namespace) == (
+                self._node.get_name(), self._node.get_namespace()
+            )  # fmt: skip
+            (own if is_own else others).append(tuple(publisher.endpoint_gid))
+        if self._topic is None:
+            if others:
+                self._free_since = now
+            elif now - self._free_since >= FREE_TIME:
+                self._topic = self._advertise(ClockMessage, CLOCK, RELIABLE)
+        elif own and any(other < own[0] for other in others):
+            topic, self._topic, self._free_since = self._topic, None, now
+            self._withdraw(topic)
 
     def pending(self, time: float) -> Iterator[PendingMessage]:
-        """The message of a simulation time [s]."""
-        yield self._topic, partial(convert.clock, time)
+        """The message of a time [s], if this node publishes it."""
+        topic = self._topic
+        if topic is not None:
+            yield topic, partial(convert.clock, time)

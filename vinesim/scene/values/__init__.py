@@ -8,10 +8,21 @@ from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPos
 from vinesim.scene.values.measurement import Measurement
 from vinesim.scene.values.network import Coupling, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 from vinesim.scene.values.rigid import Mesh, RigidVisual, Shape
-from vinesim.scene.values.robot import Drive, ElasticSample, Imu, JointSample, RobotSample, RobotSpec, Wrench
+from vinesim.scene.values.robot import (
+    ControllerKind,
+    ControllerSpec,
+    Drive,
+    ElasticSample,
+    Imu,
+    JointReference,
+    JointSample,
+    RobotSample,
+    RobotSpec,
+    Wrench,
+)
 from vinesim.scene.values.sensors import CameraFrame, CameraInfo, CameraOutput, LidarScan
 from vinesim.scene.values.status import ComponentStatus
-from vinesim.scene.values.world import Contact, Detachment, Snapshot
+from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
 __all__ = [
     "POINT_NAMES",
@@ -20,6 +31,8 @@ __all__ = [
     "CameraOutput",
     "ComponentStatus",
     "Contact",
+    "ControllerKind",
+    "ControllerSpec",
     "Coupling",
     "Detachment",
     "Drive",
@@ -30,6 +43,7 @@ __all__ = [
     "HumanSpec",
     "HumanUpdate",
     "Imu",
+    "JointReference",
     "JointSample",
     "LidarScan",
     "Measurement",
@@ -42,5 +56,6 @@ __all__ = [
     "Shape",
     "Snapshot",
     "TreeUpdate",
+    "WindState",
     "Wrench",
 ]

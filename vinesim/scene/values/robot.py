@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 from collections.abc import Mapping
 
 import numpy as np
@@ -59,6 +60,34 @@ class RobotSpec:
     """Largest force [N] and moment [N m] with which the tracks hold or drive the base."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Corners [face, 3, 3] m of meshes that are in no file, by the file name that the URDF gives them."""
+    is_copy: bool = False
+    """Whether another client simulates the robot. A copy follows received states, in which contacts of its links with
+    each other and the ground are counted already; boxes that stand for its meshes would touch where those do not."""
+
+
+class ControllerKind(enum.StrEnum):
+    """What a controller of a robot does with its joints, in the words of ros2_controllers where they have one."""
+
+    JOINT_TRAJECTORY = "joint_trajectory"
+    GRIPPER = "gripper"
+    CUTTER = "cutter"
+    FORWARD_POSITION = "forward_position"
+    FORWARD_VELOCITY = "forward_velocity"
+    FORWARD_EFFORT = "forward_effort"
+    IMPEDANCE = "impedance"
+    SERIES_ELASTIC = "series_elastic"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ControllerSpec:
+    """One controller of a robot: prefix of its topics and actions, and the joints that it moves."""
+
+    name: str
+    kind: ControllerKind
+    joints: tuple[str, ...]
+    """In the order of its commands; none for a cutter."""
+    group: str = ""
+    """The joint group of a gripper or cutter."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -75,6 +104,16 @@ class JointSample:
     """[joint] N m or N: what the drive transmits; at rest gravity load minus J^T f of the contacts."""
     contact: np.ndarray
     """[joint] N m or N: J^T f of the contacts alone."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class JointReference:
+    """What the controllers of a robot ask of its joints in one step, in the order of joint arrays."""
+
+    position: np.ndarray
+    """[joint] rad or m"""
+    velocity: np.ndarray
+    """[joint] rad/s or m/s"""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -141,3 +180,4 @@ class RobotSample:
     elements: ElasticSample | None = None
     wrenches: tuple[Wrench, ...] = ()
     imus: tuple[Imu, ...] = ()
+    reference: JointReference | None = None

@@ -7,6 +7,22 @@ import dataclasses
 import numpy as np
 
 from vinesim.scene.values.rigid import RigidVisual
+from vinesim.scene.wind import Wind
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class WindState:
+    """The wind at one instant, and how much of what it does to each tree is drawn because it is not simulated."""
+
+    wind: Wind
+    time: float
+    """[s] Of the wind: that of the world."""
+    strength: float
+    """[1] From 0 when a wind begins to 1, and back to 0 when it ends."""
+    tree_air: np.ndarray
+    """[tree, 3] m/s Air in which the simulated pose of each tree is."""
+    tree_drawn: np.ndarray
+    """[tree] 1: the tree is drawn where the wind would hold it, 0: where it is simulated."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -26,6 +42,9 @@ class Snapshot:
     """Their poses [link, 7] m, 1."""
     moved_trees: np.ndarray
     """Indices of the trees that are awake [k]: only these have moved since they fell asleep."""
+    wind: WindState | None = None
+    """None: the air is calm. Else ``body_q`` lacks the sway of trees on which wind is not simulated; see
+    :mod:`vinesim.physics.plants.sway`."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -1,0 +1,55 @@
+"""World time: stamps of clients that started at different moments compare, never run back, and are smooth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.client.world_time import MAX_LAG, WorldTime
+
+DT = 0.01
+
+
+def stamps(clock: np.ndarray) -> np.ndarray:
+    """What a client stamps its steps with that begin at these times of the server's clock [step] s."""
+    world, found = WorldTime(DT), []
+    for step, now in enumerate(clock):
+        world.follow(step * DT, now)
+        found.append(step * DT + world.offset)
+    return np.array(found)
+
+
+def test_clients_agree_and_jitter_is_smoothed() -> None:
+    """Two that started 7 s apart, with steps late by up to 8 ms: 2 ms apart, and steps of 10 ms within 0.2 ms."""
+    random = np.random.default_rng(3)
+    begin = 1.7e9
+    one = begin + np.arange(3000) * DT + random.exponential(2e-3, 3000).clip(0.0, 8e-3)
+    other = begin + 7.0 + np.arange(2300) * DT + random.exponential(2e-3, 2300).clip(0.0, 8e-3)
+    first, second = stamps(one), stamps(other)
+    apart = first[1200:] - second[500:2300]
+    assert np.abs(apart).max() < 2e-3
+    assert np.abs(np.diff(first[300:]) - DT).max() < 2e-4
+
+
+def test_a_slow_client_keeps_up_and_no_time_runs_back() -> None:
+    """At 70 % of real time, and after it stood for 3 s, stamps are at most 50 ms behind and always rise."""
+    clock = 100.0 + np.cumsum(np.full(2000, DT / 0.7))
+    clock[1000:] += 3.0
+    found = stamps(clock)
+    assert (np.diff(found) > 0.0).all()
+    assert (clock - found).max() <= MAX_LAG + 1e-9
+    assert (found - clock).max() < 1e-3
+
+
+def test_a_clock_that_is_set_back_a_little_is_waited_for() -> None:
+    """Two seconds back (another server): time goes on at nine tenths of its rate until it is met, and never back."""
+    clock = 100.0 + np.arange(4000) * DT
+    clock[500:] -= 2.0
+    found = stamps(clock)
+    rise = np.diff(found)
+    assert rise.min() > 0.89 * DT
+    assert abs(found[-1] - clock[-1]) < 0.05
+
+
+def test_without_a_server_it_is_simulated_time() -> None:
+    assert WorldTime(DT).offset == 0.0
+    assert not WorldTime(DT).is_shared

@@ -1,0 +1,46 @@
+"""Broken messages and well-formed lies against a client with physics and the server's store: no law is broken.
+
+Few here; ``vinesim bench fuzz --messages N --lies N`` sends as many as are wanted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinesim.bench.message_fuzz import attack
+from vinesim.bench.support.fuzz_world import ATTACKER, FuzzWorld, LawBroken
+from vinesim.bench.support.lies import tell_lies
+
+
+@pytest.mark.parametrize(("kind", "is_stranger"), [("human", False), ("robot", False), ("human", True)])
+def test_broken_messages_break_no_law(kind, is_stranger):
+    done = attack(3_000, seed=5, kind=kind, is_stranger=is_stranger)
+    assert done.sent == 3_000
+    assert done.arrived > 1_500
+    assert done.records > 200
+    assert (done.malformed > 500) != is_stranger, "a stranger's messages are dropped before they are decoded"
+
+
+@pytest.mark.parametrize("kind", ["human", "robot"])
+def test_well_formed_lies_break_no_law(kind):
+    assert tell_lies(20, seed=2, kind=kind) > 40
+
+
+def test_the_laws_notice_what_they_forbid():
+    with FuzzWorld() as world:
+        world.check()
+        assert ATTACKER in world.client.remote_actors
+        state = world.client.physics.state
+        state.joint_qd[3, 1] = np.nan
+        with pytest.raises(LawBroken, match="not finite"):
+            world.check()
+        state.joint_qd[3, 1] = 0.0
+        cluster = int(world.model.tree_first[1] + world.model.tree_core[1])
+        state.body_cut[cluster] = True
+        with pytest.raises(LawBroken, match="berry cluster"):
+            world.check()
+        state.body_cut[cluster] = False
+        world.store.counters.errors = 1
+        with pytest.raises(LawBroken, match="store"):
+            world.check()

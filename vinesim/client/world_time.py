@@ -1,0 +1,46 @@
+"""Time of the world: the server's clock as one client sees it at its steps, for the stamps of all that leaves a client.
+
+Simulated time counts a client's own steps from 0. Clients start at different moments, and one that is slow or stood
+still falls behind, so stamps are simulated time plus an offset that follows the server's clock. Without a server the
+offset is 0.
+"""
+
+from __future__ import annotations
+
+import logging
+
+log = logging.getLogger(__name__)
+
+GAIN = 0.01
+"""Share of its error by which the offset follows in one step: jitter of single steps is smoothed over a second."""
+MAX_RATE = 0.1
+"""[s/s] Largest rate at which the offset follows: a step of 10 ms is stamped as 9 to 11 ms."""
+MAX_LAG = 0.05
+"""[s] Stamps are never further behind the server's clock: a client that is slow skips ahead."""
+MAX_LEAD = 5.0
+"""[s] A server's clock that is further behind belongs to another run of the world, and is taken at once."""
+
+
+class WorldTime:
+    """Offset of the world's time against the simulated time of one client."""
+
+    def __init__(self, dt: float) -> None:
+        """``dt``: duration of a step [s]."""
+        self.offset = 0.0
+        """World's time minus simulated time [s]."""
+        self.is_shared = False
+        """Whether a server's clock is followed."""
+        self._max_change = MAX_RATE * dt
+
+    def follow(self, simulated: float, clock: float) -> None:
+        """Follow the server's ``clock`` [s] at the step that starts at ``simulated`` time [s]; call it every step."""
+        away = clock - simulated - self.offset
+        if not self.is_shared:
+            self.is_shared = True
+            self.offset += away
+        elif away < -MAX_LEAD:
+            log.warning("the server's clock is %.1f s behind what it was: time goes back", -away)
+            self.offset += away
+        else:
+            self.offset += min(max(GAIN * away, -self._max_change), self._max_change)
+            self.offset = max(self.offset, clock - simulated - MAX_LAG)

@@ -1,0 +1,99 @@
+"""Sway of trees in the wind: where a tree that is not simulated is drawn, from the pose in which it rests.
+
+Each joint turns by what the steady wind turns it, and by a linear answer to what the gusts add to the pressure of the
+air. Gusts reach the tree through the transfer function of an oscillator, as a sum over the plane waves of the wind.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+JOINT_GAP = wp.constant(0.005)
+"""[m] A body that is further than this from its joint was cut off, and lies where it lies."""
+
+
+@wp.func
+def steady_share(pressure: wp.vec3, mean: wp.vec3):
+    """How much of the deflection in the mean wind belongs to a pressure v |v| [m^2/s^2]: its part along the mean's."""
+    square = wp.dot(mean, mean)
+    share = float(0.0)
+    if square > 0.0:
+        share = wp.clamp(wp.dot(pressure, mean) / square, 0.0, 1.0)
+    return share
+
+
+@wp.func
+def small_turn(turn: wp.vec3):
+    """Rotation by a vector [rad]; a half angle h has the sine h and is then made exact to third order."""
+    square = wp.dot(turn, turn)
+    half = 0.5 - square / 48.0 + square * square / 3840.0
+    w = 1.0 - square / 8.0 + square * square / 384.0
+    return wp.normalize(wp.quat(turn[0] * half, turn[1] * half, turn[2] * half, w))
+
+
+@wp.kernel
+def sway_trees(
+    # model
+    tree_first: wp.array(dtype=wp.int32),
+    tree_size: wp.array(dtype=wp.int32),
+    body_parent: wp.array(dtype=wp.int32),
+    body_offset: wp.array(dtype=wp.vec3),
+    body_steady: wp.array(dtype=wp.vec3),
+    body_gain: wp.array(dtype=wp.mat33),
+    tree_steady: wp.array(dtype=wp.vec3),
+    tree_gust: wp.array(dtype=wp.vec3, ndim=2),
+    # in
+    trees: wp.array(dtype=wp.int32),
+    waves: wp.array(dtype=float),
+    strength: float,
+    tree_air: wp.array(dtype=wp.vec3),
+    tree_drawn: wp.array(dtype=float),
+    body_q: wp.array(dtype=wp.transform),
+    # out
+    turned_out: wp.array(dtype=wp.quat),
+    body_q_out: wp.array(dtype=wp.transform),
+):
+    """One thread draws one tree.
+
+    body_steady: [body] rad, world axes, turn of its joint in the mean wind. body_gain: [body] rad per m^2/s^2, how it
+    turns when the pressure v |v| changes. tree_steady: [tree] m/s, the mean wind at the tree; tree_gust: [tree, term]
+    m/s, filtered gusts as factors of ``waves`` [term], the cosines, then the sines of the waves at this instant. trees:
+    [thread] which tree. strength: of the wind. tree_air: [tree] m/s, air in which ``body_q`` rests; tree_drawn: [tree]
+    share that is drawn. turned_out: [body] how far each body is turned, scratch. body_q_out: [body] poses as drawn.
+    """
+    tree = trees[wp.tid()]
+    first = tree_first[tree]
+    drawn = tree_drawn[tree]
+    air = tree_steady[tree]
+    mean = wp.length(air) * air
+    if drawn > 0.0:
+        for i in range(waves.shape[0]):
+            air += waves[i] * tree_gust[tree, i]
+    air = strength * air
+    felt = tree_air[tree]
+    pressure = wp.length(air) * air
+    rest = wp.length(felt) * felt
+    steady = steady_share(pressure, mean)
+    steady_at_rest = steady_share(rest, mean)
+    change = drawn * (pressure - rest - (steady - steady_at_rest) * mean)
+    share = drawn * (steady - steady_at_rest)
+    for k in range(first, first + tree_size[tree]):
+        pose = body_q[k]
+        place = wp.transform_get_translation(pose)
+        turned = wp.quat_identity(dtype=float)
+        if drawn > 0.0:
+            parent = body_parent[k]
+            joined = bool(True)
+            moved = place
+            if parent >= 0:
+                lever = place - wp.transform_get_translation(body_q[parent])
+                joined = wp.abs(wp.length(lever) - wp.length(body_offset[k])) < JOINT_GAP
+                turned = turned_out[parent]
+                moved = wp.transform_get_translation(body_q_out[parent]) + wp.quat_rotate(turned, lever)
+            if joined:
+                turned = turned * small_turn(share * body_steady[k] + body_gain[k] * change)
+                place = moved
+            else:
+                turned = wp.quat_identity(dtype=float)
+        turned_out[k] = turned
+        body_q_out[k] = wp.transform(place, turned * wp.transform_get_rotation(pose))

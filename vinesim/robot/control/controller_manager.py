@@ -1,0 +1,241 @@
+"""Runs the controllers of one robot: each joint obeys the controller that was commanded last, and no other.
+
+A command to one controller ends the goals of all others that move any of its joints. Goals have ids, given by whoever
+sends them; how they ended is told by :meth:`ControllerManager.take_results`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim.robot.control.gripper_controller import CutterController, GripperController, GripperState
+from vinesim.robot.control.trajectory_controller import (
+    GoalHandle,
+    Outcome,
+    Trajectory,
+    TrajectoryController,
+    TrajectoryError,
+)
+from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.scene.values import ControllerKind, ControllerSpec
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class GoalResult:
+    """How a goal ended."""
+
+    goal: bytes
+    outcome: Outcome
+    text: str = ""
+    """Why it failed; empty if it did not."""
+    gripper: GripperState | None = None
+    """Of a gripper or cutter."""
+
+
+@dataclasses.dataclass(slots=True)
+class _ActiveGoal:
+    """A goal that is executed."""
+
+    id: bytes
+    trajectory: GoalHandle | None
+    """None for grippers and cutters."""
+
+
+class ControllerManager:
+    """The controllers of a local robot; all its methods belong to the thread of the physics."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.specs = {spec.name: spec for spec in robot.description.controllers}
+        joints = robot.description.joints
+        self.desired = robot.setpoint.copy()
+        self.desired_velocity = np.zeros(len(joints))
+        """[joint] what the controllers ask for in this step [rad or m, rad/s or m/s]."""
+        self._indices = {spec.name: robot.joint_indices(spec.joints) for spec in self.specs.values()}
+        self._owner: list[str | None] = [None] * len(joints)
+        """[joint] the controller that moves it."""
+        self._trajectories: dict[str, TrajectoryController] = {}
+        self._grippers: dict[str, GripperController] = {}
+        self._cutters: dict[str, CutterController] = {}
+        self._goals: dict[str, _ActiveGoal] = {}
+        """By controller."""
+        self._results: list[GoalResult] = []
+        self._gains: dict[str, dict[str, np.ndarray]] = {}
+
+    # ------------------------------------------------------------------ goals
+
+    def start_trajectory(self, name: str, trajectory: Trajectory, time: float, goal: bytes | None = None) -> None:
+        """Follow a trajectory from ``time`` [s]; :class:`CommandError` if there is no such controller.
+
+        A goal that cannot be followed ends at once; without one :class:`TrajectoryError` is raised.
+        """
+        spec = self._spec(name, ControllerKind.JOINT_TRAJECTORY)
+        if name not in self._trajectories:
+            self._trajectories[name] = TrajectoryController(self.robot, spec.joints)
+        controller = self._trajectories[name]
+        before = self._goals.get(name)
+        try:
+            handle = controller.start(trajectory, time)
+        except TrajectoryError as error:
+            if goal is None:
+                raise
+            self._results.append(GoalResult(goal, error.code, str(error)))
+            return
+        if before is not None:
+            self._end(name, Outcome.PREEMPTED, "a newer trajectory took over")
+        self._claim(name)
+        if goal is not None:
+            self._goals[name] = _ActiveGoal(goal, handle)
+
+    def stop_trajectory(self, name: str) -> None:
+        """End what a trajectory controller does and hold its joints."""
+        self._spec(name, ControllerKind.JOINT_TRAJECTORY)
+        if name in self._trajectories:
+            self._trajectories[name].cancel()
+            self._end(name, Outcome.CANCELED, "an empty trajectory stopped it")
+
+    def start_gripper(self, name: str, opening: float, effort: float | None, time: float, goal: bytes) -> None:
+        """Move a gripper, or close a cutter if that is what the controller has (whatever the ``opening``)."""
+        spec = self.specs.get(name)
+        kind = ControllerKind.CUTTER if spec and spec.kind is ControllerKind.CUTTER else ControllerKind.GRIPPER
+        spec = self._spec(name, kind)
+        try:
+            if kind is ControllerKind.CUTTER:
+                cutter = self._cutters.setdefault(name, CutterController(self.robot, spec.group))
+                cutter.start(effort)
+            else:
+                if name not in self._grippers:
+                    self._grippers[name] = GripperController(self.robot, spec.group)
+                self._grippers[name].start(opening, effort, time)
+        except CommandError as error:
+            self._results.append(GoalResult(goal, Outcome.INVALID_GOAL, str(error), self._gripper_state(name, time)))
+            return
+        self._end(name, Outcome.PREEMPTED, "a newer goal took over", time)
+        self._claim(name)
+        self._goals[name] = _ActiveGoal(goal, None)
+
+    def cancel(self, goal: bytes, time: float) -> None:
+        """Cancel a goal and hold its joints; nothing happens if it has ended."""
+        for name, active in list(self._goals.items()):
+            if active.id == goal:
+                if name in self._trajectories:
+                    self._trajectories[name].cancel()
+                elif name in self._grippers:
+                    here = self.robot.gripper_opening(self.specs[name].group)
+                    self._grippers[name].start(here, None, time)
+                self._end(name, Outcome.CANCELED, "it was cancelled", time)
+
+    def cancel_all(self, time: float) -> None:
+        """Cancel all goals."""
+        for active in list(self._goals.values()):
+            self.cancel(active.id, time)
+
+    def take_results(self) -> list[GoalResult]:
+        """The goals that have ended since the last call."""
+        results, self._results = self._results, []
+        return results
+
+    # ------------------------------------------------------------------ commands without a goal
+
+    def forward(self, name: str, values: np.ndarray) -> None:
+        """Pass positions, velocities or efforts on to the joints of a forward controller; NaN leaves a joint alone."""
+        spec = self.specs.get(name)
+        commands = {
+            ControllerKind.FORWARD_POSITION: self.robot.command_position,
+            ControllerKind.FORWARD_VELOCITY: self.robot.command_velocity,
+            ControllerKind.FORWARD_EFFORT: self.robot.command_effort,
+        }
+        if spec is None or spec.kind not in commands:
+            raise CommandError(f"{self.robot.name} has no forward controller {name!r}")
+        self._pass_on(spec, values, commands[spec.kind])
+
+    def command_impedance(self, name: str, what: str, values: np.ndarray) -> None:
+        """Set ``what``, "stiffness" or "damping" [joint] of an impedance controller, or move its "equilibrium"."""
+        spec = self._spec(name, ControllerKind.IMPEDANCE)
+        if what == "equilibrium":
+            self._pass_on(spec, values, self.robot.command_position)
+            return
+        joints = self._indices[name]
+        if name not in self._gains:
+            drives = [self.robot.description.drives[i] for i in joints]
+            self._gains[name] = {
+                "stiffness": np.array([drive.stiffness for drive in drives]),
+                "damping": np.array([drive.damping for drive in drives]),
+            }
+        gains = self._gains[name] | {what: np.asarray(values, float)}
+        self.robot.command_impedance(gains["stiffness"], gains["damping"], joints)
+        self._gains[name] = gains
+
+    def command_motor(self, name: str, joint: str, position: float) -> None:
+        """Hold the motor of a series elastic joint at ``position`` [rad or m]."""
+        spec = self._spec(name, ControllerKind.SERIES_ELASTIC)
+        if joint not in spec.joints:
+            raise CommandError(
+                f"{name} of {self.robot.name} does not move {joint!r}; it moves {', '.join(spec.joints)}"
+            )
+        self.robot.command_motor_position([position], [joint])
+        self._claim(name, self.robot.joint_indices([joint]))
+
+    # ------------------------------------------------------------------ each step
+
+    def __call__(self, time: float) -> None:
+        """Command the set-points of the step that starts at ``time`` [s]; call it before :meth:`Robot.control`."""
+        for name, controller in self._trajectories.items():
+            active = self._goals.get(name)
+            if controller.active_goal is not None:
+                controller(time)
+                state = controller.state(time)
+                joints = self._indices[name]
+                self.desired[joints], self.desired_velocity[joints] = state.desired, state.desired_velocity
+            if active is not None and active.trajectory is not None and active.trajectory.outcome is not None:
+                self._end(name, active.trajectory.outcome, active.trajectory.text)
+        for name in list(self._goals):
+            state = self._gripper_state(name, time)
+            if state is not None and state.is_done:
+                self._results.append(GoalResult(self._goals.pop(name).id, Outcome.SUCCESSFUL, "", state))
+        others = np.array([owner not in self._trajectories for owner in self._owner])
+        self.desired[others], self.desired_velocity[others] = self.robot.setpoint[others], 0.0
+
+    def _gripper_state(self, name: str, time: float) -> GripperState | None:
+        if name in self._grippers:
+            return self._grippers[name].state(time)
+        return self._cutters[name].state() if name in self._cutters else None
+
+    # ------------------------------------------------------------------ claims
+
+    def _pass_on(self, spec: ControllerSpec, values: np.ndarray, command: Callable[..., None]) -> None:
+        if len(values) != len(spec.joints):
+            raise CommandError(
+                f"{self.robot.name}: {len(values)} values for {spec.name}; give one each for {', '.join(spec.joints)}"
+            )
+        given = ~np.isnan(values)
+        joints = self._indices[spec.name][given]
+        command(values[given], joints)
+        self._claim(spec.name, joints)
+
+    def _claim(self, name: str, joints: np.ndarray | None = None) -> None:
+        """Give joints (all of the controller unless given) to a controller; goals of others on any of them end."""
+        joints = self._indices[name] if joints is None else joints
+        others = {self._owner[j] for j in joints} - {None, name}
+        for other in sorted(o for o in others if o is not None):
+            if other in self._trajectories:
+                self._trajectories[other].release(f"{name} took over")
+            self._end(other, Outcome.PREEMPTED, f"{name} took over joints of {other}")
+        for j in joints:
+            self._owner[j] = name
+
+    def _end(self, name: str, outcome: Outcome, text: str, time: float = 0.0) -> None:
+        active = self._goals.pop(name, None)
+        if active is not None:
+            self._results.append(GoalResult(active.id, outcome, text, self._gripper_state(name, time)))
+
+    def _spec(self, name: str, kind: ControllerKind) -> ControllerSpec:
+        spec = self.specs.get(name)
+        if spec is None or spec.kind is not kind:
+            known = ", ".join(one.name for one in self.specs.values() if one.kind is kind) or "none"
+            raise CommandError(f"{self.robot.name} has no {kind} controller {name!r}; there are: {known}")
+        return spec

@@ -1,0 +1,107 @@
+"""Controllers of a robot: those of its TOML file, or derived from its joint groups as ros2_control robots name them.
+
+Where the URDF has ``ros2_control`` tags, a controller commands a joint only by an interface that the tags offer.
+"""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Container, Mapping, Sequence
+
+from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
+
+from vinesim.robot.description.errors import description_error
+from vinesim.robot.description.sidecar import Controller, Sidecar
+from vinesim.scene.values import ControllerKind, ControllerSpec
+
+INTERFACE_OF_KIND = {
+    ControllerKind.JOINT_TRAJECTORY: "position",
+    ControllerKind.GRIPPER: "position",
+    ControllerKind.FORWARD_POSITION: "position",
+    ControllerKind.FORWARD_VELOCITY: "velocity",
+    ControllerKind.FORWARD_EFFORT: "effort",
+    ControllerKind.IMPEDANCE: "effort",
+}
+"""The command interface of ros2_control that each kind of controller needs of its joints."""
+FORWARD_KINDS = (ControllerKind.FORWARD_POSITION, ControllerKind.FORWARD_VELOCITY, ControllerKind.FORWARD_EFFORT)
+MIN_ARM_JOINTS = 4
+"""A group with a tool, or with so many joints, is an arm: it gets an impedance controller."""
+
+
+def command_interfaces(urdf: str) -> dict[str, set[str]]:
+    """Command interfaces of each joint in the ``ros2_control`` tags of a URDF; empty if it has none."""
+    found: dict[str, set[str]] = {}
+    for joint in etree.fromstring(urdf.encode()).iterfind("ros2_control/joint"):
+        names = {interface.get("name", "") for interface in joint.iterfind("command_interface")}
+        found.setdefault(joint.get("name", ""), set()).update(names)
+    return found
+
+
+def make_controllers(
+    sidecar: Sidecar, driven: Sequence[str], interfaces: Mapping[str, set[str]], file: pathlib.Path
+) -> tuple[ControllerSpec, ...]:
+    """The controllers of a robot with these ``driven`` joints, sorted by name; ``interfaces``: by joint, empty: all.
+
+    :class:`DescriptionError` if one of the ``sidecar`` names a joint, group or cutter that is not there.
+    """
+    if sidecar.controllers is not None:
+        specs = [_checked(name, one, sidecar, driven, file) for name, one in sidecar.controllers.items()]
+    else:
+        specs = _derived(sidecar, driven)
+    limited = [_limited(spec, interfaces) for spec in specs]
+    return tuple(sorted((one for one in limited if one is not None), key=lambda spec: spec.name))
+
+
+def is_gripper(name: str, sidecar: Sidecar) -> bool:
+    """Whether a group is a gripper: it is called one or a hand, or has a cutter."""
+    return "gripper" in name or "hand" in name or any(cutter.group == name for cutter in sidecar.cutters)
+
+
+def _derived(sidecar: Sidecar, driven: Sequence[str]) -> list[ControllerSpec]:
+    specs, arms = [], []
+    for name, group in sidecar.groups.items():
+        if is_gripper(name, sidecar):
+            specs.append(ControllerSpec(f"{name}_controller", ControllerKind.GRIPPER, group.joints, name))
+            continue
+        specs.append(ControllerSpec(f"{name}_controller", ControllerKind.JOINT_TRAJECTORY, group.joints, name))
+        if group.tool or len(group.joints) >= MIN_ARM_JOINTS:
+            arms += group.joints
+            specs.append(ControllerSpec(f"{name}_impedance_controller", ControllerKind.IMPEDANCE, group.joints, name))
+    for group in dict.fromkeys(cutter.group for cutter in sidecar.cutters):
+        stem = group.replace("gripper", "cutter") if "gripper" in group else f"{group}_cutter"
+        specs.append(ControllerSpec(f"{stem}_controller", ControllerKind.CUTTER, (), group))
+    specs += [ControllerSpec(f"{kind}_controller", kind, tuple(driven)) for kind in FORWARD_KINDS]
+    if arms:
+        specs.append(ControllerSpec("see", ControllerKind.SERIES_ELASTIC, tuple(arms)))
+    return specs
+
+
+def _checked(
+    name: str, given: Controller, sidecar: Sidecar, driven: Container[str], file: pathlib.Path
+) -> ControllerSpec:
+    if given.group and given.group not in sidecar.groups:
+        raise description_error(file, f"controller {name!r} belongs to {given.group!r}", "name a group")
+    if given.kind is ControllerKind.CUTTER:
+        if all(cutter.group != given.group for cutter in sidecar.cutters):
+            raise description_error(file, f"controller {name!r}: no cutter at {given.group!r}", "name its group")
+        return ControllerSpec(name, given.kind, (), given.group)
+    if given.kind is ControllerKind.GRIPPER and not given.group:
+        raise description_error(file, f"controller {name!r} of a gripper has no group", "name one")
+    joints = given.joints or (sidecar.groups[given.group].joints if given.group else ())
+    for joint in joints:
+        if joint not in driven:
+            raise description_error(file, f"controller {name!r} moves {joint!r}", "name driven joints only")
+    if not joints or len(set(joints)) < len(joints):
+        raise description_error(file, f"controller {name!r} moves {list(joints)}", "name joints, each once")
+    return ControllerSpec(name, given.kind, joints, given.group)
+
+
+def _limited(spec: ControllerSpec, interfaces: Mapping[str, set[str]]) -> ControllerSpec | None:
+    """The controller with the joints that offer its interface; None if there are none."""
+    needed = INTERFACE_OF_KIND.get(spec.kind)
+    if not interfaces or needed is None:
+        return spec
+    joints = tuple(joint for joint in spec.joints if needed in interfaces.get(joint, ()))
+    if spec.kind is ControllerKind.GRIPPER and joints != spec.joints:
+        return None
+    return ControllerSpec(spec.name, spec.kind, joints, spec.group) if joints else None

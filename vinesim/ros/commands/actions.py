@@ -1,0 +1,143 @@
+"""Action servers of trajectory controllers, grippers and cutters: control_msgs, as ros2_controllers serve them.
+
+A goal is checked here and executed by the client; its handle waits without a thread or task of its own until the
+client tells how it ended. A newer goal of a controller ends the one before it, which is aborted.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import rclpy.node
+from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
+
+from vinesim.ros.commands import convert
+from vinesim.ros.commands.subscriptions import CommandQueue
+from vinesim.ros.commands.types import CancelGoal, GoalResult, GoalStatus, GripperGoal, JointTrajectory
+from vinesim.ros.messages.convert import reference_points, stamp
+from vinesim.scene.values import ControllerKind, ControllerSpec, RobotSample
+
+log = logging.getLogger(__name__)
+
+RESULT_TIMEOUT = 10
+"""[s] A result waits so long for whoever asks for it; the default of rcl since Iron."""
+MAX_GOALS = 32
+"""Goals of one robot that are executed at once; further ones are rejected."""
+
+
+class _DeferredActionServer(ActionServer):
+    """An action server whose accepted goals are executing, but have no task until there is a result."""
+
+    def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Callable[..., Any] | None) -> None:
+        if execute_callback is not None:
+            super().notify_execute(goal_handle, execute_callback)
+
+
+class ActiveGoal:
+    """A goal between its acceptance and its result."""
+
+    def __init__(self, server: ActionServer, handle: ServerGoalHandle, command: JointTrajectory | GripperGoal) -> None:
+        self.server, self.handle, self.command = server, handle, command
+
+
+class ControllerActions:
+    """The action servers of these ``controllers``."""
+
+    def __init__(self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue) -> None:
+        from control_msgs.action import FollowJointTrajectory, GripperCommand
+
+        self._queue, self._lock = queue, threading.Lock()
+        self._goals: dict[bytes, ActiveGoal] = {}
+        self._trajectory_type, self._gripper_type = FollowJointTrajectory, GripperCommand
+        for spec in controllers:
+            if spec.kind is ControllerKind.JOINT_TRAJECTORY:
+                take = partial(convert.trajectory_goal, controller=spec.name, known=spec.joints)
+                self._serve(node, FollowJointTrajectory, f"{spec.name}/follow_joint_trajectory", take)
+            elif spec.kind in (ControllerKind.GRIPPER, ControllerKind.CUTTER):
+                take = partial(convert.gripper_goal, controller=spec.name)
+                self._serve(node, GripperCommand, f"{spec.name}/gripper_cmd", take)
+
+    def _serve(
+        self, node: rclpy.node.Node, action: Any, name: str, take: Callable[..., JointTrajectory | GripperGoal]
+    ) -> None:
+        server = _DeferredActionServer(
+            node, action, name, lambda _: action.Result(), goal_callback=partial(self._judge, take),
+            cancel_callback=self._cancel, result_timeout=RESULT_TIMEOUT,
+        )  # fmt: skip
+        server.register_handle_accepted_callback(partial(self._begin, server, take))
+
+    # ------------------------------------------------------------------ in the receiving thread
+
+    def _judge(self, take: Callable[..., object], request: Any) -> GoalResponse:
+        try:
+            take(request, goal=b"")
+            if len(self._goals) >= MAX_GOALS:
+                raise convert.CommandError(f"{MAX_GOALS} goals are executed already; wait for one to end")
+        except convert.CommandError as error:
+            self._queue.refuse(error)
+            return GoalResponse.REJECT
+        return GoalResponse.ACCEPT
+
+    def _begin(
+        self, server: ActionServer, take: Callable[..., JointTrajectory | GripperGoal], handle: ServerGoalHandle
+    ) -> None:
+        goal = bytes(handle.goal_id.uuid)
+        command = take(handle.request, goal=goal)
+        handle.execute()
+        with self._lock:
+            self._goals[goal] = ActiveGoal(server, handle, command)
+        self._queue.put(command)
+
+    def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        self._queue.put(CancelGoal(bytes(handle.goal_id.uuid)))
+        return CancelResponse.ACCEPT
+
+    # ------------------------------------------------------------------ in the publishing thread
+
+    @property
+    def goals(self) -> list[ActiveGoal]:
+        """The goals that are being executed."""
+        with self._lock:
+            return list(self._goals.values())
+
+    def publish_feedback(self, sample: RobotSample) -> None:
+        """Publish to the clients of trajectory goals how far these are."""
+        places = {name: i for i, name in enumerate(sample.joints.names)}
+        for goal in self.goals:
+            if isinstance(goal.command, JointTrajectory):
+                joints = goal.command.joints
+                points = reference_points(sample, np.array([places[joint] for joint in joints]))
+                message = self._trajectory_type.Feedback(joint_names=list(joints), **points)
+                message.header.stamp = stamp(sample.joints.time)
+                goal.handle.publish_feedback(message)
+
+    def finish(self, result: GoalResult) -> None:
+        """Tell a goal's client how it ended; nothing happens if the goal is not known."""
+        with self._lock:
+            goal = self._goals.pop(result.goal, None)
+        if goal is None:
+            return
+        if isinstance(goal.command, JointTrajectory):
+            message = self._trajectory_type.Result(error_code=result.code, error_string=result.text)
+        else:
+            message = self._gripper_type.Result()
+            if (gripper := result.gripper) is not None:
+                message.position, message.effort = gripper.position, gripper.effort
+                message.stalled, message.reached_goal = gripper.stalled, gripper.reached_goal
+        goal.server.notify_execute(goal.handle, partial(_end, result.status, message))
+
+
+def _end(status: GoalStatus, result: Any, handle: ServerGoalHandle) -> Any:
+    """Bring a goal into its last state; a cancel request that came too late leaves it succeeded or aborted."""
+    if handle.is_cancel_requested and status is not GoalStatus.SUCCEEDED:
+        handle.canceled()
+    elif status is GoalStatus.SUCCEEDED:
+        handle.succeed()
+    else:
+        handle.abort()
+    return result

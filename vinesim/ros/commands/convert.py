@@ -1,0 +1,135 @@
+"""Conversion of command messages to plain values: pure functions that raise :class:`CommandError` for unfit ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TwistStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
+
+from vinesim.ros.commands.types import (
+    BaseVelocity,
+    ElasticCommand,
+    ForwardCommand,
+    GripperGoal,
+    ImpedanceCommand,
+    JointTolerances,
+    JointTrajectory,
+)
+from vinesim.ros.messages.convert import seconds
+
+
+class CommandError(ValueError):
+    """A command message contradicts itself; the text says how."""
+
+
+def base_velocity(message: TwistStamped) -> BaseVelocity:
+    """A commanded velocity of the base; it must be finite."""
+    linear, angular = message.twist.linear, message.twist.angular
+    velocity = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
+    if not np.isfinite(velocity).all():
+        raise CommandError(f"cmd_vel is not finite: {velocity.tolist()}")
+    return BaseVelocity(seconds(message.header.stamp), velocity[:3], velocity[3:])
+
+
+def _joint_values(message: Float64MultiArray, controller: str, joints: Sequence[str], *, nan: bool) -> np.ndarray:
+    values = np.array(message.data, float)
+    if len(values) != len(joints):
+        raise CommandError(f"{controller}: {len(values)} values; give one for each of {', '.join(joints)}")
+    if np.isinf(values).any() or (np.isnan(values).any() and not nan):
+        raise CommandError(f"{controller}: values are not finite: {values.tolist()}")
+    return values
+
+
+def forward_command(message: Float64MultiArray, controller: str, joints: Sequence[str]) -> ForwardCommand:
+    """Values of a forward controller of these ``joints``: finite, or NaN."""
+    return ForwardCommand(controller, _joint_values(message, controller, joints, nan=True))
+
+
+def impedance_command(
+    message: Float64MultiArray, controller: str, joints: Sequence[str], what: str
+) -> ImpedanceCommand:
+    """Gains or equilibrium of an impedance controller of these ``joints``: finite, gains not below zero."""
+    values = _joint_values(message, controller, joints, nan=False)
+    if what != "equilibrium" and (values < 0.0).any():
+        raise CommandError(f"{controller}: {what} below zero: {values.tolist()}; give 0 or more")
+    return ImpedanceCommand(controller, what, values)
+
+
+def elastic_command(message: JointState, controller: str, joint: str) -> ElasticCommand:
+    """Position of one motor: the message's only one, or that of its ``joint``."""
+    names, positions = list(message.name), list(message.position)
+    place = names.index(joint) if joint in names else 0
+    if place >= len(positions) or (names and joint not in names) or not np.isfinite(positions[place]):
+        raise CommandError(f"{controller}/{joint}: positions {positions} of {names}; give a finite one of {joint}")
+    return ElasticCommand(controller, joint, positions[place])
+
+
+def joint_trajectory(
+    message: JointTrajectoryMessage, controller: str, known: Sequence[str], goal: bytes | None = None
+) -> JointTrajectory:
+    """A trajectory of some of the ``known`` joints: its points fit its joints, and its times rise from 0 on."""
+    joints = tuple(message.joint_names)
+    unknown = [joint for joint in joints if joint not in known]
+    if unknown or len(set(joints)) < len(joints) or (message.points and not joints):
+        raise CommandError(
+            f"{controller}: a trajectory for {', '.join(joints) or 'nothing'}; it moves each of {', '.join(known)} once"
+        )
+    for i, point in enumerate(message.points):
+        if len(point.positions) != len(joints) or len(point.velocities) not in (0, len(joints)):
+            raise CommandError(
+                f"{controller}: point {i} has {len(point.positions)} positions and {len(point.velocities)} velocities "
+                f"for {len(joints)} joints; give one of each per joint, or no velocities"
+            )
+    start = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points]
+    times = np.array(start, float)
+    if (np.diff(times) <= 0.0).any() or (len(times) and times[0] < 0.0):
+        raise CommandError(f"{controller}: time_from_start does not rise from 0 on: {start}")
+    positions = np.array([p.positions for p in message.points], float).reshape(len(times), len(joints))
+    with_velocity = len(times) > 0 and all(len(p.velocities) for p in message.points) and len(joints) > 0
+    velocities = np.array([p.velocities for p in message.points], float) if with_velocity else None
+    if not np.isfinite(positions).all() or (velocities is not None and not np.isfinite(velocities).all()):
+        raise CommandError(f"{controller}: the trajectory is not finite")
+    return JointTrajectory(controller, seconds(message.header.stamp), joints, times, positions, velocities, goal=goal)
+
+
+def trajectory_goal(request: Any, controller: str, known: Sequence[str], goal: bytes) -> JointTrajectory:
+    """A goal of control_msgs/action/FollowJointTrajectory with its tolerances; it needs at least one point."""
+    plain = joint_trajectory(request.trajectory, controller, known, goal)
+    if len(plain.times) == 0:
+        raise CommandError(f"{controller}: a goal without points; give at least one, or cancel the goal before it")
+    late = request.goal_time_tolerance.sec + 1e-9 * request.goal_time_tolerance.nanosec
+    return JointTrajectory(
+        controller, plain.time, plain.joints, plain.times, plain.positions, plain.velocities,
+        path_tolerance=_tolerances(request.path_tolerance, plain.joints, controller),
+        goal_tolerance=_tolerances(request.goal_tolerance, plain.joints, controller),
+        goal_time_tolerance=late if late > 0.0 else None, goal=goal,
+    )  # fmt: skip
+
+
+def _tolerances(given: Iterable[Any], joints: tuple[str, ...], controller: str) -> JointTolerances | None:
+    """Tolerances in the order of ``joints``, None if none is given. 0 means none was given, below 0 no limit."""
+    position, velocity = np.full(len(joints), np.inf), np.full(len(joints), np.inf)
+    said = False
+    for one in given:
+        if one.name not in joints:
+            raise CommandError(f"{controller}: a tolerance for {one.name!r}, which the trajectory does not move")
+        place = joints.index(one.name)
+        for values, limit in ((position, one.position), (velocity, one.velocity)):
+            if np.isnan(limit):
+                raise CommandError(f"{controller}: the tolerance for {one.name!r} is not a number")
+            if limit > 0.0:
+                values[place], said = limit, True
+    return JointTolerances(position, velocity) if said else None
+
+
+def gripper_goal(request: Any, controller: str, goal: bytes) -> GripperGoal:
+    """A goal of control_msgs/action/GripperCommand; an effort of 0 or below means all there is."""
+    command = request.command
+    if not np.isfinite([command.position, command.max_effort]).all():
+        raise CommandError(f"{controller}: position {command.position}, max_effort {command.max_effort}: not finite")
+    return GripperGoal(controller, goal, command.position, command.max_effort if command.max_effort > 0.0 else None)

@@ -1,0 +1,57 @@
+"""Topics of contacts between a robot and plants: as a cloud for programs, as arrows for RViz."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+
+import numpy as np
+from geometry_msgs.msg import Point, Vector3
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from vinesim.ros.messages import convert
+from vinesim.ros.publishers.robot import MAP_FRAME
+from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
+from vinesim.scene.values import Contact, RobotSample
+
+MARKER_PERIOD = 10
+"""Steps between two arrays of markers: 10 Hz."""
+ARROW_SCALE = 0.01
+"""[m/N] Length of an arrow for its force."""
+
+
+class ContactPublisher:
+    """``vine/contacts`` after every step, with or without contacts; ``vine/markers`` at 10 Hz."""
+
+    def __init__(self, advertise: Advertise, bunch_of_body: np.ndarray, links: dict[str, int] | None = None) -> None:
+        """``bunch_of_body`` [body]: -1 for wood. ``links``: numbers of the robot's links by name."""
+        self._contacts = advertise(PointCloud2, "vine/contacts", RELIABLE)
+        self._markers = advertise(MarkerArray, "vine/markers", RELIABLE)
+        self._bunch_of_body, self._links = bunch_of_body, links or {}
+        self._steps = 0
+
+    def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
+        """All messages of one step."""
+        yield self._contacts, partial(convert.contact_cloud, sample, self._links, self._bunch_of_body, MAP_FRAME)
+        self._steps += 1
+        if self._steps % MARKER_PERIOD == 0:
+            yield self._markers, partial(_arrows, sample)
+
+
+def _arrows(sample: RobotSample) -> MarkerArray:
+    """One arrow a contact, along the force on the robot; those of the message before go."""
+    markers = [Marker(header=convert.header(sample.joints.time, MAP_FRAME), ns="contacts", action=Marker.DELETEALL)]
+    markers += [_arrow(i, contact, sample.joints.time) for i, contact in enumerate(sample.contacts)]
+    return MarkerArray(markers=markers)
+
+
+def _arrow(number: int, contact: Contact, time: float) -> Marker:
+    start = np.asarray(contact.position, float)
+    end = start + ARROW_SCALE * np.asarray(contact.force, float)
+    points = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in (start, end)]
+    return Marker(
+        header=convert.header(time, MAP_FRAME), ns="contacts", id=number, type=Marker.ARROW, action=Marker.ADD,
+        points=points, scale=Vector3(x=0.01, y=0.02, z=0.0), color=ColorRGBA(r=1.0, g=0.3, b=0.0, a=1.0),
+    )  # fmt: skip
