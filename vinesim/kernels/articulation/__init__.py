@@ -48,6 +48,6 @@ One after the other (pitch 1) suits a CPU; a GPU reads neighbouring trees at onc
 over children are read and stored, not added in place: that would be an atomic operation, in a GPU's far cache.
 
 Files: ``structs`` (arguments), ``spatial`` (rotations, inertias), ``forces`` (springs, ties, drag), ``kinematics``,
-``prediction`` (the three passes), ``first_mode`` (substeps), ``impulse_response``, ``integration``, ``floating_components`` (what has been cut
+``prediction`` (the three passes), ``first_mode`` (substeps), ``energy_budget``, ``impulse_response``, ``integration``, ``floating_components`` (what has been cut
 off), ``joint_wrench``, ``gather_scatter`` (rows between host and device).
 """

@@ -179,17 +179,17 @@ class KernelLaunches:
             )
             for trees, options in (("stepping", partitioned), ("subset", {"index_list": "trees"}))
         )  # fmt: skip
+        apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
         begin = record(
-            begin_budget, parameters, self._model, "stepping", self._forces, joints, self._bodies, self.budget,
-            **partitioned,
-        )
+            begin_budget, parameters, self._model, "stepping", self._forces, joints, self.budget, apart, **partitioned,
+        )  # fmt: skip
         move = record(
             integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
             "tree_rate", "tree_euler_steps", joints, **partitioned,
         )  # fmt: skip
         keep = record(
             keep_budget, parameters, self._model, "stepping", "tree_steps", "tree_rate", self._forces, self.budget,
-            "tree_euler_steps", joints, fill(s.BodyState, body_q="after_q", body_qd="after_qd"), self._factors, scratch,
+            "tree_euler_steps", joints, apart, self._factors, scratch,
             fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"), **partitioned,
         )  # fmt: skip
         self.integrate = _in_turn(begin, move, keep)
