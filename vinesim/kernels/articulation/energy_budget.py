@@ -11,7 +11,8 @@ which takes 0.9 % of the rate of a mode with w dt = 0.3, half with w dt = 3, and
 can only fall. What is still too much is taken from all rates alike, and the next step is taken with phi = 1.
 
 The budget begins anew with whatever does work from outside: contacts, loads, moving air, ties that are moved, and
-changes of state or model between steps. Trees with a floating root have no budget.
+changes of state or model between steps. Trees with a floating root have no budget, nor has a solver without geometric
+stiffness, which is there to be compared with others.
 """
 
 import warp as wp
@@ -208,7 +209,7 @@ def begin_budget(
     state = contiguous_joints(joints)
     loads = contiguous_forces(forces)
     mark, pushed = mark_and_push(dense, loads, state, tree)
-    if pushed:
+    if pushed or p.geometric_stiffness == 0.0:
         budget_out.limit[tree] = NO_LIMIT
         return
     known = budget_out.mark[tree]
