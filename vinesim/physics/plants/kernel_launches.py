@@ -11,6 +11,7 @@ import warp as wp
 
 from vinesim.kernels.articulation import first_mode, structs
 from vinesim.kernels.articulation.eight_trees import predict_groups
+from vinesim.kernels.articulation.energy_budget import NO_LIMIT, begin_budget, keep_budget
 from vinesim.kernels.articulation.floating_components import correct_floating_momentum
 from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.articulation.integration import integrate
@@ -25,6 +26,17 @@ if TYPE_CHECKING:
     from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
 Launch = Callable[..., None]
+
+
+def _in_turn(*launches: Launch) -> Launch:
+    """One launch of several kernels, one after the other."""
+
+    def launch(*which: int) -> None:
+        for one in launches:
+            one(*which)
+
+    return launch
+
 
 STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
 """Rows that are carried to the device before every prediction."""
@@ -105,12 +117,17 @@ class KernelLaunches:
             for name in names:
                 buffers.add_scratch(name, dtype)
         trees = len(model.tree_first)
+        self.budget = structs.EnergyBudget()
+        for name, field in structs.fields(structs.EnergyBudget).items():
+            setattr(self.budget, name, wp.zeros(trees, dtype=field.type.dtype, device=buffers.device))
+        self.budget.limit.fill_(NO_LIMIT)
         buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
 
     def upload_changed(self) -> None:
         """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
         if self.changed:
             self.buffers.upload(self._seldom)
+            self.budget.limit.fill_(NO_LIMIT)
             self.changed, self.substeps_due = False, True
 
     def fill(self, struct: Any, **values: Any) -> Any:
@@ -168,10 +185,20 @@ class KernelLaunches:
             None if self.buffers.has_copies else self._record_groups(parameters, joints, scratch, prediction)
         )
         """Predicts groups of trees, on a CPU."""
-        self.integrate = record(
+        apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
+        begin = record(
+            begin_budget, parameters, self._model, "stepping", self._forces, joints, self.budget, apart, **partitioned,
+        )  # fmt: skip
+        move = record(
             integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
             "tree_rate", "tree_euler_steps", joints, **partitioned,
         )  # fmt: skip
+        keep = record(
+            keep_budget, parameters, self._model, "stepping", "tree_steps", "tree_rate", self._forces, self.budget,
+            "tree_euler_steps", joints, apart, self._factors, scratch,
+            fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"), **partitioned,
+        )  # fmt: skip
+        self.integrate = _in_turn(begin, move, keep)
         self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
         self.apply_wrenches = record(
             apply_wrenches, parameters.dt, self._model, "subset", "body_wrench", self._factors, fill(s.WrenchScratch),
