@@ -17,18 +17,18 @@ G = 9.81
 def add_rod(
     tree: TreeBuilder, length: float, radii: tuple[float, float], wood: RodMaterial, pieces: int, tip: float
 ) -> None:
-    """An undamped rod on a tree, with a sphere of ``tip`` kg at its end."""
+    """A rod on a tree, with a sphere of ``tip`` kg at its end."""
     last = tree.add_rod(-1, length, radii, wood, pieces)[-1]
     if tip > 0.0:
         far, radius = np.asarray(tree.bodies[last]["far"]), (tip / 4190.0) ** (1.0 / 3.0)
         tree.add_body(
             last, offset=(length / pieces, 0, 0), mass=tip, inertia=[0.4 * tip * radius**2] * 3, length=2.0 * radius,
-            com=(radius, 0, 0), stiffness=far, damping=0.0 * far,
+            com=(radius, 0, 0), stiffness=far, damping=wood.damping * far,
         )  # fmt: skip
 
 
-def random_rods(count: int, seed: int) -> tuple[Model, np.ndarray]:
-    """Undamped rods of 0.3 to 1.5 m, 4 to 10 mm thick, 0.3 to 8 GPa, clamped in any direction, six in ten with a mass on
+def random_rods(count: int, seed: int, damping: float = 0.0) -> tuple[Model, np.ndarray]:
+    """Rods of so much damping [s], of 0.3 to 1.5 m, 4 to 10 mm thick, 0.3 to 8 GPa, clamped in any direction, six in ten with a mass on
     the tip, half of them drawn in equilibrium; and how each joint [body, 3] is to be bent and twisted before release."""
     rng = np.random.default_rng(seed)
     trees, bends = [], []
@@ -36,7 +36,7 @@ def random_rods(count: int, seed: int) -> tuple[Model, np.ndarray]:
         clamp = rng.normal(size=4)
         tree = TreeBuilder(np.array([3.0 * i, 0.0, 2.0, *(clamp / np.linalg.norm(clamp))]))
         length, radius, modulus = rng.uniform(0.3, 1.5), rng.uniform(0.002, 0.005), 10.0 ** rng.uniform(8.5, 9.9)
-        wood = RodMaterial(modulus, 950.0, 0.0, shear_modulus=rng.uniform(0.15, 0.75) * modulus)
+        wood = RodMaterial(modulus, 950.0, damping, shear_modulus=rng.uniform(0.15, 0.75) * modulus)
         tip = rng.uniform(0.1, 3.0) * 950.0 * np.pi * radius**2 * length if rng.random() < 0.6 else 0.0
         add_rod(tree, length, (radius, radius * rng.uniform(0.5, 1.0)), wood, int(rng.integers(4, 17)), tip)
         if rng.random() < 0.5:
@@ -95,20 +95,20 @@ def releasable(model: Model, bends: np.ndarray, steps: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("phi", "seconds"),
-    [(0.5, 5), (0.55, 5), pytest.param(0.5, 20, marks=pytest.mark.slow), pytest.param(0.55, 20, marks=pytest.mark.slow)],
+    ("phi", "damping", "seconds"),
+    [
+        (0.5, 0.0, 5),
+        (0.55, 0.0, 5),
+        (0.55, 0.006, 5),
+        pytest.param(0.5, 0.0, 20, marks=pytest.mark.slow),
+        pytest.param(0.55, 0.0, 20, marks=pytest.mark.slow),
+    ],
 )
-def test_no_random_rod_gains_energy(phi: float, seconds: int) -> None:
-    """100 random rods released from 0.02 to 0.6 rad: after no step more than 2 % of what they can give off is added.
-
-    One rod is excepted, whose first step adds 23 % at phi 0.55: the budget takes kinetic energy, and this is elastic.
-    Without a budget two thirds of such rods gain more than 2 % at phi 1/2, and one in eight at 0.55, up to a thousandfold.
-    """
-    model, bends = random_rods(100, 1)
+def test_no_random_rod_gains_energy(phi: float, damping: float, seconds: int) -> None:
+    """100 random rods released from 0.02 to 0.6 rad: after no step more than 2 % of what they can give off is added."""
+    model, bends = random_rods(100, 1, damping)
     gain = largest_gain(released(model, bends, phi), 100 * seconds, every=seconds // 5) / releasable(model, bends, 500)
-    worst = np.sort(gain)[::-1]
-    assert worst[1] < 0.02, f"rods {np.argsort(-gain)[:5]}: {worst[:5]}"
-    assert worst[0] < 0.3
+    assert gain.max() < 0.02, f"rods {np.argsort(-gain)[:5]}: {np.sort(gain)[:-6:-1]}"
 
 
 def loaded_cane(phi: float, bend: float) -> ArticulationSolver:

@@ -8,11 +8,14 @@ filtered at fixed pose,
     (M + c K) v' = M v,    c = 0.1 dt^2,
 
 which takes 0.9 % of the rate of a mode with w dt = 0.3, half with w dt = 3, and all of those far beyond. Kinetic energy
-can only fall. What is still too much is taken from all rates alike, and the next step is taken with phi = 1.
+can only fall. What is still too much is taken from all rates alike, and the next step is taken with phi = 1. A pose that
+alone has too much is one that the step went too far to: the tree is led back towards where the step began.
 
 The budget begins anew with whatever does work from outside: contacts, loads, moving air, ties that are moved, and
-changes of state or model between steps. Trees with a floating root have no budget, nor has a solver without geometric
-stiffness, which is there to be compared with others.
+changes of state or model between steps. Trees with a floating root or on wires have none, nor has a solver without
+geometric stiffness, which is there to be compared with others.
+
+Trees that can gain much within one step are watched closely, others seldom: :func:`choose_budget`.
 """
 
 import warp as wp
@@ -27,6 +30,7 @@ from vinesim.kernels.articulation.contiguous import (
     contiguous_prediction,
     contiguous_scratch,
 )
+from vinesim.kernels.articulation.first_mode import place_relaxed
 from vinesim.kernels.articulation.kinematics import body_kinematics, parent_kinematics
 from vinesim.kernels.articulation.prediction import accelerate_bodies, add_terms
 from vinesim.kernels.articulation.spatial import (
@@ -48,8 +52,12 @@ from vinesim.kernels.articulation.structs import (
     Scratch,
     SolverParameters,
 )
+from vinesim.kernels.articulation.tree_energy import is_pushed, state_mark, tree_energy
 
-wp.set_module_options({"enable_backward": False})
+INLINE_ALL = (wp.config.cpu_compiler_flags or "").replace("-inline-threshold=9000", "-inline-threshold=100000")
+"""Warp's flags for its CPU compiler, but functions of any size are inlined: with a call, all structs are copied first."""
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
 BAND = wp.constant(0.01)
 """Share of the kinetic energy, the largest of the last seconds, by which energy may exceed its budget. Of motion that the
@@ -65,133 +73,107 @@ FILTER = wp.constant(0.1)
 """c / dt^2. TUNED: 0.03 to 1 serve as well"""
 
 CLOSE_STEPS = wp.constant(32)
-"""Steps that are all checked after the budget began and after the energy was found to rise; else every
-:data:`CHECK_PERIOD`-th is. TUNED"""
+"""Steps that are all checked after the energy was found to rise, and in a tree that is watched closely after its budget
+began; else every so-manieth. TUNED"""
+
+NO_BUDGET = 0
+CLOSELY = 1
+NOW_AND_THEN = 2
+"""How the energy of a tree is watched. Closely: the budget is kept in every step. Now and then: energy is looked at; when it
+has risen, the tree is watched closely until :data:`CLOSE_STEPS` steps have gone by without a rise."""
 
 CHECK_PERIOD = wp.constant(8)
-"""[step] TUNED: a check costs a sixth of a step"""
+"""[launch] Period of checks of a quiet tree. On a CPU there is one launch in eight steps while no tree is watched closely.
+TUNED: a check costs as much as a third of a step"""
 
 CHECK_RATE = wp.constant(2.0)
-"""[rad/s] Every step of a tree with a faster joint is checked. TUNED"""
+"""[rad/s] Every step of a tree with a faster joint is checked, if it is watched closely. TUNED"""
+
+MIN_DAMPING = wp.constant(0.5)
+"""Least damping of a joint over its stiffness, in steps, in trees that are checked seldom. MEASURED, as is
+:data:`MAX_SAG`: docs/decisions/integrator.md"""
+
+MAX_SAG = wp.constant(4.0)
+"""[rad] Largest angle, along a path from root to tip, by which the weight of such a tree would bend its springs if they
+were linear and the tree kept the shape of its relaxed springs, level."""
+
+MIN_PHI = wp.constant(0.549)
+"""A tree of which less is asked is watched closely: phi does not damp what the step does not resolve."""
+
+BACKTRACKS = wp.constant(8)
+"""Times that the turn of a step may be halved. DERIVED: then 0.4 % of it is left."""
 
 NO_LIMIT = wp.constant(1.0e30)
 """[J] Limit of a tree whose budget has not begun."""
 
 
-@wp.func
-def spring_energy(stiffness: wp.vec3, q: wp.quat):
-    """theta^T K theta / 2 [J], with theta the rotation vector of q."""
-    v = wp.vec3(q[0], q[1], q[2])
-    square = wp.dot(v, v)
-    s = 1.0 + square * (1.0 / 6.0 + square * (3.0 / 40.0 + square * (5.0 / 112.0)))  # asin(|v|) / |v|
-    if square > 0.02:
-        sine = wp.sqrt(square)
-        s = wp.atan2(sine, wp.abs(q[3])) / sine
-    return 2.0 * s * s * wp.dot(stiffness, wp.cw_mul(v, v))
-
-
-@wp.func
-def body_energy(
-    k: int,
+@wp.kernel
+def choose_budget(
+    # model
     p: SolverParameters,
     model: ArticulationModel,
-    forces: AppliedForces,
-    joint_q: wp.quat,
-    origin: wp.vec3,
-    pose: wp.transform,
-    motion: wp.spatial_vector,
+    # in
+    trees: wp.array(dtype=wp.int32),
+    # out
+    scratch_out: Scratch,
+    tree_budget_out: wp.array(dtype=wp.int32),
 ):
-    """Kinetic and potential energy of one body, the size of the terms that these are sums of [J], and a checksum of
-    where its ties are held.
+    """One thread chooses how the energy of one tree is watched: closely if it is limp or hardly damped.
 
-    Potential is its weight's, its joint's spring and its ties. pose: [m] against ``origin`` [m], world axes.
+    trees: [thread] which tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or :data:`NO_BUDGET` with
+    a floating root. scratch_out holds nothing that is needed later.
     """
-    turn = wp.transform_get_rotation(pose)
-    arm = wp.quat_rotate(turn, model.body_com[k])
-    omega = wp.spatial_bottom(motion)
-    velocity = wp.spatial_top(motion) + wp.cross(omega, arm)
-    spin = wp.quat_rotate_inv(turn, omega)
-    crossed = wp.vec3(spin[1] * spin[2], spin[2] * spin[0], spin[0] * spin[1])
-    mass = model.body_mass[k]
-    kinetic = 0.5 * (
-        mass * wp.dot(velocity, velocity) + wp.dot(model.body_inertia[k], wp.cw_mul(spin, spin))
-    ) + wp.dot(model.body_product[k], crossed)
-    place = wp.transform_get_translation(pose)
-    weight = mass * wp.dot(p.gravity, place + arm)
-    elastic = spring_energy(model.joint_stiffness[k], joint_q)
-    held = float(0.0)
-    ties = model.tie_span[k]
-    for t in range(ties[0], ties[1]):
-        anchor = forces.tie_anchor[t]
-        held += anchor[0] + 2.0 * anchor[1] + 4.0 * anchor[2]
-        stretch = place + wp.quat_rotate(turn, model.tie_point[t]) - (anchor - origin)
-        elastic += 0.5 * model.tie_stiffness[t] * wp.dot(stretch, stretch)
-    return wp.vec4(kinetic, elastic - weight, kinetic + elastic + wp.abs(weight), held)
-
-
-@wp.func
-def tree_energy(
-    p: SolverParameters,
-    model: ArticulationModel,
-    forces: AppliedForces,
-    joints: JointState,
-    tree: int,
-    bodies_out: BodyState,
-):
-    """:func:`body_energy` of a whole tree, its bodies put where the joints say: against the tree's origin, so that far
-    from the world's no digits are lost."""
-    energy = wp.vec4()
+    tree = trees[wp.tid()]
     first = model.tree_first[tree]
-    origin = wp.transform_get_translation(model.tree_pose[tree])
-    standing = wp.transform(wp.vec3(), wp.transform_get_rotation(model.tree_pose[tree]))
-    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
-        parent = model.body_parent[k]
-        above = standing
-        above_motion = wp.spatial_vector()
-        if parent >= 0:
-            above = bodies_out.body_q[parent]
-            above_motion = bodies_out.body_qd[parent]
-        _axes, _lever, pose, motion = body_kinematics(
-            above, above_motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
+    size = model.tree_moving[tree]
+    budget = wp.int32(NOW_AND_THEN)
+    floats = bool(False)
+    for k in range(first, first + size * model.pitch, model.pitch):
+        place_relaxed(model, k, scratch_out)
+        mass = model.body_mass[k]
+        scratch_out.bias[k] = wp.spatial_vector(
+            mass * (scratch_out.J[k] * model.body_com[k]), wp.vec3(mass, 0.0, 0.0)
         )
-        bodies_out.body_q[k] = pose
-        bodies_out.body_qd[k] = motion
-        energy += body_energy(k, p, model, forces, joints.joint_q[k], origin, pose, motion)
-    return energy
+        floats = floats or model.body_root[k] >= 0
+    for i in range(size):
+        k = first + (size - 1 - i) * model.pitch
+        subtree = scratch_out.bias[k]
+        moment = wp.spatial_top(subtree)
+        mass = subtree[3]
+        stiffness = model.joint_stiffness[k]
+        damping = model.joint_damping[k]
+        softest = float(NO_LIMIT)
+        for axis in range(3):
+            if stiffness[axis] > 0.0:
+                softest = wp.min(softest, stiffness[axis])
+                if damping[axis] < MIN_DAMPING * p.dt * stiffness[axis]:
+                    budget = CLOSELY
+        scratch_out.Du[k] = wp.vec3(wp.length(p.gravity) * wp.length(moment) / softest, 0.0, 0.0)
+        parent = model.body_parent[k]
+        if parent >= 0:
+            moment = moment + mass * scratch_out.tension[k]
+            scratch_out.bias[parent] = scratch_out.bias[parent] + wp.spatial_vector(moment, wp.vec3(mass, 0.0, 0.0))
+    for k in range(first, first + size * model.pitch, model.pitch):
+        parent = model.body_parent[k]
+        if parent >= 0:
+            scratch_out.Du[k] = scratch_out.Du[k] + scratch_out.Du[parent]
+        if scratch_out.Du[k][0] > MAX_SAG:
+            budget = CLOSELY
+    if floats:
+        budget = NO_BUDGET
+    tree_budget_out[tree] = budget
 
 
 @wp.func
-def joint_mark(q: wp.quat, qd: wp.vec3):
-    """Part of one joint in :func:`state_mark`; its weights are powers of two, so that contraction changes no bit."""
-    return (q[0] + 2.0 * q[1] + 4.0 * q[2]) + (0.5 * qd[0] + qd[1] + 2.0 * qd[2])
+def is_close(budget: int, phi: float):
+    """Whether a tree of which this phi is asked is always watched closely."""
+    return budget == CLOSELY or phi < MIN_PHI
 
 
 @wp.func
-def state_mark(model: ArticulationModel, joints: JointState, tree: int):
-    """Fletcher's checksum of a tree's joints."""
-    mark = float(0.0)
-    weighted = float(0.0)
-    first = model.tree_first[tree]
-    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
-        mark = mark + joint_mark(joints.joint_q[k], joints.joint_qd[k])
-        weighted = weighted + mark
-    return wp.vec2(mark, weighted)
-
-
-@wp.func
-def mark_and_push(model: ArticulationModel, forces: AppliedForces, joints: JointState, tree: int):
-    """:func:`state_mark`, and whether contacts, loads or air do work on a tree in this step or a part of it floats."""
-    push = wp.length_sq(forces.tree_air[tree])
-    floating = int(0)
-    mark = float(0.0)
-    weighted = float(0.0)
-    first = model.tree_first[tree]
-    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
-        mark = mark + joint_mark(joints.joint_q[k], joints.joint_qd[k])
-        weighted = weighted + mark
-        push = push + (wp.length_sq(forces.body_load[k]) + wp.length_sq(forces.body_wrench[k]))
-        floating = wp.max(floating, model.body_root[k] + 1)
-    return wp.vec2(mark, weighted), not push == 0.0 or floating > 0
+def is_watched(budget: int, phi: float, tree: int, budgets: EnergyBudget):
+    """Whether a tree's budget is kept in this step."""
+    return is_close(budget, phi) or budgets.limit[tree] >= NO_LIMIT or budgets.watch[tree] > 0
 
 
 @wp.kernel
@@ -201,6 +183,8 @@ def begin_budget(
     model: ArticulationModel,
     # in
     trees: wp.array(dtype=wp.int32),
+    tree_budget: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
     forces: AppliedForces,
     joints: JointState,
     # out
@@ -209,21 +193,30 @@ def begin_budget(
 ):
     """Before an integration: one thread begins the budget of one tree, if work was done on it since the last step.
 
-    trees: [thread] which tree. forces: of this step. joints: at its start. budget_out: the limit is :data:`NO_LIMIT`
-    while outer forces act. bodies_out: scratch.
+    trees: [thread] which tree; nothing happens with a tree_budget [tree] of :data:`NO_BUDGET`. tree_phi: [tree] phi asked for. forces:
+    of this step. joints: at its start. budget_out: the limit is :data:`NO_LIMIT` while outer forces act. bodies_out:
+    scratch.
     """
     tree = trees[wp.tid()]
-    dense = contiguous_model(model)
-    state = contiguous_joints(joints)
-    loads = contiguous_forces(forces)
-    mark, pushed = mark_and_push(dense, loads, state, tree)
-    if pushed or p.geometric_stiffness == 0.0:
+    kind = tree_budget[tree]
+    if kind == NO_BUDGET or not is_watched(kind, tree_phi[tree], tree, budget_out):
+        return
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    if wp.length_sq(forces.tree_air[tree]) != 0.0 or is_pushed(
+        forces.body_load, forces.body_wrench, first, size, model.pitch
+    ):
         budget_out.limit[tree] = NO_LIMIT
         return
-    known = budget_out.mark[tree]
-    if budget_out.limit[tree] < NO_LIMIT and mark[0] == known[0] and mark[1] == known[1]:
+    for k in range(first, first + size * model.pitch, model.pitch):
+        budget_out.start_q[k] = joints.joint_q[k]
+    mark = state_mark(joints.joint_q, joints.joint_qd, first, size, model.pitch)
+    if budget_out.limit[tree] < NO_LIMIT and mark == budget_out.mark[tree]:
         return
-    energy = tree_energy(p, dense, loads, state, tree, contiguous_bodies(bodies_out))
+    energy = tree_energy(
+        p, contiguous_model(model), contiguous_forces(forces), contiguous_joints(joints), tree,
+        contiguous_bodies(bodies_out),
+    )  # fmt: skip
     budget_out.limit[tree] = energy[0] + energy[1] + ROUNDING * energy[2]
     budget_out.last[tree] = energy[0] + energy[1]
     budget_out.scale[tree] = energy[0]
@@ -295,15 +288,81 @@ def filter_rates(
 
 
 @wp.func
-def is_due(rate: float, tree: int, budget_out: EnergyBudget):
+def is_due(rate: float, close: bool, tree: int, budget_out: EnergyBudget):
     """Whether this step of a tree is to be checked; counts it."""
     watch = budget_out.watch[tree] - 1
-    due = watch >= 0 or rate > CHECK_RATE
+    due = watch >= 0 or (close and rate > CHECK_RATE)
     if watch <= -CHECK_PERIOD:
         watch = 0
         due = True
     budget_out.watch[tree] = watch
     return due
+
+
+@wp.func
+def lead_back(
+    p: SolverParameters,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    start_q: wp.array(dtype=wp.quat),
+    goal: float,
+    tree: int,
+    joints_out: JointState,
+    bodies_out: BodyState,
+):
+    """Stop a tree and halve the way that its joints went in the step until its energy, returned, is at most ``goal``."""
+    first = model.tree_first[tree]
+    energy = wp.vec4(0.0, wp.float32(NO_LIMIT), 0.0, 0.0)
+    halved = int(0)
+    while energy[1] > goal and halved < BACKTRACKS:
+        for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
+            joints_out.joint_q[k] = wp.normalize(start_q[k] + joints_out.joint_q[k])
+            joints_out.joint_qd[k] = wp.vec3()
+        energy = tree_energy(p, model, forces, joints_out, tree, bodies_out)
+        halved += 1
+    return energy
+
+
+@wp.func
+def take_energy(
+    p: SolverParameters,
+    dt: float,
+    goal: float,
+    pose_goal: float,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    tree: int,
+    budget_out: EnergyBudget,
+    tree_euler_steps_out: wp.array(dtype=wp.int32),
+    joints_out: JointState,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """Take from a tree what energy it has above ``goal`` [J], or above ``pose_goal`` if its pose alone has so much.
+
+    Returns its kinetic and potential energy.
+    """
+    filter_rates(
+        p, FILTER * dt * dt, model, joints_out, tree, bodies_out, factors_out, scratch_out, prediction_out
+    )
+    first = model.tree_first[tree]
+    end = first + model.tree_moving[tree] * model.pitch
+    for k in range(first, end, model.pitch):
+        joints_out.joint_qd[k] = prediction_out.joint_qd_free[k]
+    energy = tree_energy(p, model, forces, joints_out, tree, bodies_out)
+    if energy[0] + energy[1] > goal:
+        share = wp.sqrt(wp.clamp((goal - energy[1]) / energy[0], 0.0, 1.0))
+        for k in range(first, end, model.pitch):
+            joints_out.joint_qd[k] = share * joints_out.joint_qd[k]
+        tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], 1)
+        energy[0] = share * share * energy[0]
+        if energy[1] > pose_goal:
+            energy = lead_back(p, model, forces, budget_out.start_q, pose_goal, tree, joints_out, bodies_out)
+    budget_out.filtered[tree] = budget_out.filtered[tree] + 1
+    budget_out.watch[tree] = CLOSE_STEPS
+    return energy[0] + energy[1]
 
 
 @wp.kernel
@@ -313,6 +372,8 @@ def keep_budget(
     model: ArticulationModel,
     # in
     trees: wp.array(dtype=wp.int32),
+    tree_budget: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
     tree_steps: wp.array(dtype=wp.int32),
     tree_rate: wp.array(dtype=float),
     forces: AppliedForces,
@@ -328,18 +389,24 @@ def keep_budget(
     """After an integration: one thread takes from one tree the energy that is beyond its budget.
 
     trees: [thread] which tree; nothing happens without a limit or with tree_rate [tree] above ``p.fault_rate``.
-    tree_steps: [tree] substeps that the step is divided into; this is one of them. joints_out: rates at its end, less
-    where energy was taken; tree_euler_steps_out: [tree] then at least 1. All that follows is scratch.
+    tree_budget: [tree] how its energy is watched. tree_phi: [tree] phi asked for. tree_steps: [tree] substeps that the step
+    is divided into; this is one of them. joints_out: at its end, slower where energy was taken; tree_euler_steps_out:
+    [tree] then at least 1. All that follows is scratch.
     """
     tree = trees[wp.tid()]
+    kind = tree_budget[tree]
+    if kind == NO_BUDGET:
+        return
     limit = budget_out.limit[tree]
     rate = tree_rate[tree]
     if limit >= NO_LIMIT or not rate <= p.fault_rate:
         return
-    dense = contiguous_model(model)
-    state = contiguous_joints(joints_out)
-    loads = contiguous_forces(forces)
-    if is_due(rate, tree, budget_out):
+    close = is_close(kind, tree_phi[tree])
+    watched = is_watched(kind, tree_phi[tree], tree, budget_out)
+    if is_due(rate, close, tree, budget_out):
+        dense = contiguous_model(model)
+        state = contiguous_joints(joints_out)
+        loads = contiguous_forces(forces)
         bodies = contiguous_bodies(bodies_out)
         energy = tree_energy(p, dense, loads, state, tree, bodies)
         if energy[3] != budget_out.held[tree]:
@@ -349,31 +416,24 @@ def keep_budget(
         rounding = ROUNDING * energy[2]
         band = BAND * wp.max(budget_out.scale[tree], energy[0]) + rounding
         gain = total - budget_out.last[tree]
+        if total > limit + band and not watched:
+            budget_out.watch[tree] = CLOSE_STEPS
+            budget_out.limit[tree] = NO_LIMIT  # it may have been pushed since
+            return
         if total > limit + band and gain > rounding:
             goal = limit + 0.5 * band - gain  # less by what the next step may gain again
-            dt = p.dt / float(tree_steps[tree])
-            prediction = contiguous_prediction(prediction_out)
-            filter_rates(
-                p, FILTER * dt * dt, dense, state, tree, bodies, contiguous_factors(factors_out),
-                contiguous_scratch(scratch_out), prediction,
+            total = take_energy(
+                p, p.dt / float(tree_steps[tree]), goal, limit + band, dense, loads, tree, budget_out,
+                tree_euler_steps_out, state, bodies, contiguous_factors(factors_out), contiguous_scratch(scratch_out),
+                contiguous_prediction(prediction_out),
             )  # fmt: skip
-            first = dense.tree_first[tree]
-            end = first + dense.tree_moving[tree] * dense.pitch
-            for k in range(first, end, dense.pitch):
-                state.joint_qd[k] = prediction.joint_qd_free[k]
-            energy = tree_energy(p, dense, loads, state, tree, bodies)
-            if energy[0] + energy[1] > goal:
-                share = wp.sqrt(wp.clamp((goal - energy[1]) / energy[0], 0.0, 1.0))
-                for k in range(first, end, dense.pitch):
-                    state.joint_qd[k] = share * state.joint_qd[k]
-                tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], 1)
-                energy[0] = share * share * energy[0]
-            budget_out.filtered[tree] = budget_out.filtered[tree] + 1
-            budget_out.watch[tree] = CLOSE_STEPS
         else:
             budget_out.scale[tree] = wp.max(FADE * budget_out.scale[tree], energy[0])
             budget_out.limit[tree] = wp.min(limit, total + rounding)
             if total > limit + rounding and gain > rounding:
                 budget_out.watch[tree] = CLOSE_STEPS
-        budget_out.last[tree] = energy[0] + energy[1]
-    budget_out.mark[tree] = state_mark(dense, state, tree)
+        budget_out.last[tree] = total
+    if close or budget_out.watch[tree] > 0:
+        budget_out.mark[tree] = state_mark(
+            joints_out.joint_q, joints_out.joint_qd, model.tree_first[tree], model.tree_moving[tree], model.pitch
+        )

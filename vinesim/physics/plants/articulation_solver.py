@@ -111,6 +111,7 @@ class ArticulationSolver:
         """Kernels on these arrays."""
         self._runner = StepRunner(
             buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
+            tree_budget=self.tree_budget if geometric_stiffness else None,
             tree_rate=self.tree_rate, stepping=self._stepping, groups=self._groups, floating=self._floating,
             topologies=Topologies(model, state.body_cut, self.tree_moving), thread_pool=self.thread_pool,
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]]),
@@ -137,6 +138,8 @@ class ArticulationSolver:
         """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
         self.tree_substeps = np.ones(trees, np.int32)
         """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
+        self.tree_budget = np.zeros(trees, np.int32)
+        """How the energy of each awake tree is watched [tree]: :mod:`vinesim.kernels.articulation.energy_budget`."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -184,7 +187,8 @@ class ArticulationSolver:
             wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
                        "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
                        "tree_euler_steps": self._euler_steps, "tree_steps": self._steps,
-                       "tree_substeps": self.tree_substeps, "floating": self._floating},
+                       "tree_substeps": self.tree_substeps, "tree_budget": self.tree_budget,
+                       "floating": self._floating},
             float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
                     "tie_damping": ties.damping, "tie_softening": ties.softening, "tree_phi": self.phi,
                     "phi_used": self.phi_used, "tree_rate": self.tree_rate},
