@@ -423,7 +423,7 @@ def keep_budget(
         if total > limit + band and gain > rounding:
             goal = limit + 0.5 * band - gain  # less by what the next step may gain again
             total = take_energy(
-                p, p.dt / float(tree_steps[tree]), goal, limit + band, dense, loads, tree, budget_out,
+                p, p.dt / float(tree_steps[tree]), goal, limit + BAND * budget_out.scale[tree] + rounding, dense, loads, tree, budget_out,
                 tree_euler_steps_out, state, bodies, contiguous_factors(factors_out), contiguous_scratch(scratch_out),
                 contiguous_prediction(prediction_out),
             )  # fmt: skip
