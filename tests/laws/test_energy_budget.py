@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
+from vinesim.kernels.articulation.energy_budget import CLOSELY, NO_BUDGET, NOW_AND_THEN
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
@@ -109,6 +110,22 @@ def test_no_random_rod_gains_energy(phi: float, damping: float, seconds: int) ->
     model, bends = random_rods(100, 1, damping)
     gain = largest_gain(released(model, bends, phi), 100 * seconds, every=seconds // 5) / releasable(model, bends, 500)
     assert gain.max() < 0.02, f"rods {np.argsort(-gain)[:5]}: {np.sort(gain)[:-6:-1]}"
+
+
+def test_trees_are_watched_as_closely_as_they_need() -> None:
+    """A cane with a bunch now and then, one without damping or one that is limp closely, one that is cut never."""
+    wood, soft, dry = (RodMaterial(modulus, 900.0, beta) for modulus, beta in ((5e9, 0.006), (5e7, 0.006), (5e9, 0.0)))
+    trees = [TreeBuilder(frames.pose(np.array([0.0, i, 2.0]))) for i in range(4)]
+    for tree, material in zip(trees, (wood, soft, dry, wood), strict=True):
+        tree.add_rod(-1, 1.0, (0.004, 0.004), material, 8)
+    model = assemble(trees)
+    plants = ArticulationSolver(model, State.at_rest(model))
+    plants.wake(np.arange(4))
+    plants.predict()
+    assert plants.tree_budget.tolist() == [NOW_AND_THEN, CLOSELY, CLOSELY, NOW_AND_THEN]
+    plants.cut(int(model.tree_first[3]) + 4)
+    plants.predict()
+    assert plants.tree_budget.tolist() == [NOW_AND_THEN, CLOSELY, CLOSELY, NO_BUDGET]
 
 
 def loaded_cane(phi: float, bend: float) -> ArticulationSolver:
