@@ -269,7 +269,7 @@ def test_secured_from_certificate_to_client(tmp_path):
         (["record", "run.mcap", "--only", "cats"], ["cats", "poses", "trees"]),
         (["record", "run.mcap", "--area", "0", "0", "-1", "1"], ["area 0 0 -1 1", "X0 < X1"]),
         (["replay", "nowhere.mcap", "--out", "pictures"], ["nowhere.mcap", "No such file"]),
-        (["replay", "run.mcap"], ["--connect", "--listen", "--out"]),
+        (["replay", "run.mcap"], ["--connect", "--listen", "--out", "--ros"]),
         (["demo", "--scene", "nowhere"], ["nowhere"]),
         (["demo", "--robot", "unknown"], ["unknown"]),
         (["demo", "--job", "dance"], ["dance", "push", "pick", "exchange"]),
@@ -323,6 +323,9 @@ def test_three_roles_join_one_server_each_in_its_own_process():
         assert sorted(server.figures()["actors"]) == ["vineyard/eva", "vineyard/guest", "vineyard/picker"]
         for client in clients.values():
             client.send_signal(signal.SIGINT)
-        for client in clients.values():
+        for name, client in clients.items():
             _, errors = client.communicate(timeout=TIMEOUT)
             assert client.returncode == 0, errors
+            assert ("in a browser: http://127.0.0.1:" in errors) == (name != "picker"), (
+                "people and spectators have a page"
+            )

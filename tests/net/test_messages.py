@@ -419,6 +419,8 @@ def test_records_are_decoded_as_encoded():
         ({"pose": (np.nan, 0, 0, 0, 0, 0, 1.0)}, "not finite"),
         ({"pose": (0, 0, 2e5, 0, 0, 0, 1.0)}, "too far away"),
         ({"pose": (0, 0, 0, 0, 0, 0, 0.5)}, "no unit quaternion"),
+        ({"place": (0, np.inf, 0, 0, 0, 0, 1.0)}, "not finite"),
+        ({"place": (0, 0, 0, 0, 0, 0, 0.0)}, "no unit quaternion"),
         ({"cut": (-1,)}, "impossible"),
         ({"parent": "x" * 201}, "impossible"),
     ],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -94,7 +96,8 @@ def test_controller_reports_desired_and_actual_state() -> None:
     state = arm.controller.state(arm.time)
     assert state.joints == ARM
     np.testing.assert_allclose(state.position, arm.at())
-    assert np.abs(state.error).max() < 0.01
+    assert np.abs(state.error).max() < 2e-3  # both at the same time: 0.4 rad/s times a step were 4e-3 more
+    np.testing.assert_allclose(state.desired[[0, 3]], arm.robot.setpoint[arm.robot.joint_indices(TWO)])
     assert np.abs(state.desired_velocity[[0, 3]]).min() > 0.05
     assert (state.desired_velocity[[1, 2, 4, 5, 6]] == 0.0).all()
 
@@ -183,8 +186,15 @@ def test_a_trajectory_may_start_later_but_not_be_over() -> None:
     run = arm.controller.start(later, 0.0)
     arm.run(0.5)
     np.testing.assert_allclose(arm.at(), arm.home, atol=1e-4)
+    arm.run(1.4)
+    run = arm.controller.start(dataclasses.replace(later, start_time=arm.time + 0.5), arm.time)
+    assert not arm.controller.state(arm.time).desired_velocity.any()  # it waits, and its start is no jump in speed
+    np.testing.assert_allclose(arm.controller.state(arm.time).desired, arm.robot.setpoint[arm.controller.indices])
+    arm.run(0.45)
+    arm.rows.clear()
     arm.run(4.0, until=run)
-    assert arm.time == pytest.approx(3.5, abs=0.03)
+    assert np.abs(np.diff(np.array(arm.rows)[:20, 1], axis=0)).max() < 0.04
+    assert arm.time == pytest.approx(1.9 + 3.5, abs=0.03)
     with pytest.raises(TrajectoryError, match=r"ended at 3\.50 s, now is 9\.00 s") as error:
         arm.controller.start(later, 9.0)
     assert error.value.code is Outcome.OLD_HEADER_TIMESTAMP

@@ -126,6 +126,50 @@ def test_a_robot_without_truth_and_bad_values():
             assert reason, (name, value)
             assert "\n" not in reason
         assert node.environment_rate == 20.0
+        kept = node.set_parameters
+    assert kept == {"publish_map_to_odom": False, "publish_truth": True, "environment_rate": 20.0}
+    kept |= {"publish_truth": False}
+    for one in heard.values():
+        one.clear()
+    with RobotNode("r", "<robot name='r'/>", namespace="space", parameters=kept) as node, StockNode() as peer:
+        node.publish_environment_static(("pole_0",), REST[None])
+        peer.node.create_subscription(TFMessage, "space/tf", heard["tf"].append, 10)
+        peer.node.create_subscription(TFMessage, "space/tf_environment_static", heard["poles"].append, latched)
+        wait_until(lambda: heard["tf"] and heard["poles"], tick, "topics of a node that was started again")
+        assert (parents(), len(heard["poles"][-1].transforms), node.environment_rate) == (["odom"], 0, 20.0)
+
+
+def test_a_parameter_file_counts_from_the_start(tmp_path):
+    message_packages.ensure_importable(["tf2_msgs"])
+    from tf2_msgs.msg import TFMessage
+
+    file = tmp_path / "parameters.yaml"
+    values = "{publish_map_to_odom: false, publish_truth: false, environment_rate: 2.0, cam.jpeg_quality: 50}"
+    file.write_text(f"/**: {{ros__parameters: {values}}}\n")
+    joints = JointSample(1.0, (), NONE, NONE, NONE, NONE)
+    sample = RobotSample("r", joints, REST, np.zeros(6), REST, np.zeros(6), np.zeros((2, 3, 3)), (), np.zeros((0, 7)))
+    heard, poles = [], []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    with (
+        RobotNode("r", "<robot name='r'/>", params_file=file) as node,
+        SensorNode("s", cameras=["cam"], params_file=file) as sensors,
+        StockNode() as peer,
+    ):
+        node.publish_environment_static(("pole_0",), REST[None])
+        peer.node.create_subscription(TFMessage, "tf", heard.append, 10)
+        peer.node.create_subscription(TFMessage, "tf_environment_static", poles.append, latched)
+        wait_until(lambda: heard and poles, lambda: (node.publish_robot_state(sample), peer.spin(0.01)), "tf")
+        assert [t.header.frame_id for t in heard[-1].transforms] == ["odom"]
+        assert not poles[-1].transforms
+        assert node.environment_rate == 2.0
+        assert sensors._parameters["cam.jpeg_quality"] == 50
+    file.write_text("/**: {ros__parameters: {publish_truth: 3}}\n")
+    with pytest.raises(ValueError, match=r"publish_truth.*expecting type"):
+        RobotNode("r", "<robot name='r'/>", params_file=file)
+    file.write_text("here: there: nowhere\n")
+    with pytest.raises(ValueError, match=r"parameters\.yaml is no ROS 2 parameter file") as refused:
+        RobotNode("r", "<robot name='r'/>", params_file=file)
+    assert "\n" not in str(refused.value)
 
 
 def test_depth_labels_and_rates_of_sensors():

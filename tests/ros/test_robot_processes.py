@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState, PointCloud2
 
@@ -81,6 +84,25 @@ def robot(monkeypatch, tmp_path) -> Iterator[Robot]:
             yield one
 
 
+def call(robot: Robot, kind: type, service: str, **fields: Any) -> Any:
+    """The response of a service."""
+    client = robot.peer.node.create_client(kind, service)
+    robot.run_until(client.service_is_ready)
+    answer = client.call_async(kind.Request(**fields))
+    robot.run_until(answer.done)
+    robot.peer.node.destroy_client(client)
+    return answer.result()
+
+
+def set_parameter(robot: Robot, node: str, name: str, value: float) -> None:
+    message = Parameter(name, value=value).to_parameter_msg()
+    assert call(robot, SetParameters, f"{node}/set_parameters", parameters=[message]).results[0].successful
+
+
+def get_parameter(robot: Robot, node: str, name: str) -> Any:
+    return parameter_value_to_python(call(robot, GetParameters, f"{node}/get_parameters", names=[name]).values[0])
+
+
 def nanoseconds(message: Clock) -> int:
     return message.clock.sec * 10**9 + message.clock.nanosec
 
@@ -127,6 +149,11 @@ def test_killed_processes_come_back_and_diagnostics_say_so(robot):
         return found[-1] if found else None
 
     robot.run_until(lambda: pictures and joints and level_of_sensors() == DiagnosticStatus.OK)
+    values = {"/robot": ("environment_rate", 4.0), "/robot_sensors": (f"{CAMERA}.jpeg_quality", 40)}
+    for node, (name, value) in values.items():
+        set_parameter(robot, node, name, value)
+    workers = robot.processes.ros, robot.processes.sensors
+    robot.run_until(lambda: all(one._parameters for one in workers))
     os.kill(robot.processes.sensors.worker.current().process.pid, signal.SIGKILL)
     robot.run_until(lambda: level_of_sensors() == DiagnosticStatus.ERROR)
     assert not robot.status.current()["sensors_ready"]
@@ -139,6 +166,8 @@ def test_killed_processes_come_back_and_diagnostics_say_so(robot):
     robot.run_until(lambda: robot.status.current()["ros_restarts"] == 1)
     seen = len(joints), len(diagnostics)
     robot.run_until(lambda: len(joints) > seen[0] + 20 and len(diagnostics) > seen[1])
+    for node, (name, value) in values.items():
+        assert get_parameter(robot, node, name) == value, "parameters that were set hold for the new process"
 
 
 def test_of_a_process_that_stops_for_a_while_every_step_is_sent_or_counted_as_lost(robot):

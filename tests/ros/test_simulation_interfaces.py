@@ -120,11 +120,57 @@ def test_entities_and_their_states(world: SimulationInRos) -> None:
 def test_what_is_not_supported_says_so(world: SimulationInRos) -> None:
     from simulation_interfaces.msg import Result
 
-    for service in ("SpawnEntity", "DeleteEntity", "ResetSimulation"):
+    for service in ("SpawnEntities", "LoadWorld", "SetEntityInfo"):
         result = world.call(service).result
         assert result.result == Result.RESULT_FEATURE_UNSUPPORTED
         assert "not supported by vinesim" in result.error_message
     assert 26 in world.call("GetSimulatorFeatures").features.features  # pause
+
+
+def test_entities_are_spawned_moved_deleted_and_the_scene_set_back(world: SimulationInRos) -> None:
+    """As a test program does it; time goes on over a reset, and what is refused has the code of its service."""
+    import simulation_interfaces.srv as services
+    from geometry_msgs.msg import Point, Pose, PoseStamped
+    from simulation_interfaces.msg import EntityState, Result
+    from std_msgs.msg import Header
+
+    def at(x: float, y: float, frame: str = "map") -> dict[str, Any]:
+        return {"header": Header(frame_id=frame), "pose": Pose(position=Point(x=x, y=y))}
+
+    listed = world.call("GetSpawnables").spawnables
+    assert [one.uri for one in listed] == ["vinesim:box", "vinesim:person", "vinesim:bunch"]
+    assert listed[0].spawn_bounds.points[0].z == pytest.approx(0.24)  # upper corner first
+    crate = {"name": "crate", "uri": "vinesim:box"}
+    spawned = world.call("SpawnEntity", **crate, initial_pose=PoseStamped(**at(9.0, -3.0)))
+    assert (spawned.result.result, spawned.entity_name) == (Result.RESULT_OK, "crate")
+    again = world.call("SpawnEntity", **crate, initial_pose=PoseStamped(**at(9.0, -3.0)))
+    assert again.result.result == services.SpawnEntity.Response.NAME_NOT_UNIQUE
+    other = world.call("SpawnEntity", uri="vinesim:box", name="b", initial_pose=PoseStamped(**at(9.0, -3.0, "odom")))
+    assert other.result.result == services.SpawnEntity.Response.INVALID_POSE
+    inline = world.call("SpawnEntity", name="b", resource_string="<robot/>")
+    assert inline.result.result == services.SpawnEntity.Response.UNSUPPORTED_FORMAT
+
+    assert world.call("SetEntityState", entity="crate", state=EntityState(**at(7.0, 2.0))).result.result == 1
+    pose = world.call("GetEntityState", entity="crate").state.pose.position
+    assert (pose.x, pose.y) == pytest.approx((7.0, 2.0), abs=0.02)
+    elsewhere = world.call("SetEntityState", entity="crate", state=EntityState(**at(7.0, 2.0, "odom")))
+    assert elsewhere.result.result == services.SetEntityState.Response.INVALID_POSE
+    assert world.call("DeleteEntity", entity="missing").result.result == Result.RESULT_NOT_FOUND
+    assert world.call("DeleteEntity", entity="robot").result.result == Result.RESULT_FEATURE_UNSUPPORTED
+    assert world.call("SetEntityState", entity="robot", state=EntityState(**at(-5.0, 1.0))).result.result == 1
+
+    before = world.call("GetEntityState", entity="robot").state.header.stamp
+    for scope in (1, 3, 8):
+        assert world.call("ResetSimulation", scope=scope).result.result == Result.RESULT_FEATURE_UNSUPPORTED
+    assert world.call("ResetSimulation").result.result == Result.RESULT_OK
+    assert "crate" not in world.call("GetEntities").entities
+    state = world.call("GetEntityState", entity="robot").state
+    start = spawn_pose(world.client.scene, 0)
+    assert (state.pose.position.x, state.pose.position.y) == pytest.approx(tuple(start[:2]), abs=0.01)
+    assert (state.header.stamp.sec, state.header.stamp.nanosec) > (before.sec, before.nanosec)
+    features = set(world.call("GetSimulatorFeatures").features.features)
+    assert {0, 1, 11, 14, 20, 22, 23} <= features
+    assert not {9, 13, 21, 40, 50} & features
 
 
 def test_a_client_of_a_shared_world_does_not_pause(world: SimulationInRos) -> None:

@@ -1,13 +1,86 @@
-"""Finger poses of a hand: how far thumb, index, middle, ring and little finger are bent, 0 straight to 1 all the
-way."""
+"""Gestures: named finger poses of a hand, those that the buttons of a controller make, and a person's own.
+
+A button that is touched bends the thumb, the trigger the index finger, the grip the other three (D6.4, section 3.4):
+six of their eight combinations are gestures. A person's own poses stand in a TOML file, and on the buttons a and b:
+
+    [poses]
+    victory = [1.0, 0.0, 0.0, 1.0, 1.0]   # thumb, index, middle, ring, little finger
+
+    [buttons]
+    a = "victory"
+"""
 
 from __future__ import annotations
+
+import dataclasses
+import pathlib
+from collections.abc import Mapping
+from typing import Annotated
+
+import msgspec
+
+from vinesim.scene.toml_loader import DataError, load_toml
 
 FingerBend = tuple[float, float, float, float, float]
 """[1] One number for each finger, from the thumb on; see :class:`vinesim.scene.values.HumanPose`."""
 
 OPEN_HAND: FingerBend = (0.0, 0.0, 0.0, 0.0, 0.0)
 FIST: FingerBend = (1.0, 1.0, 1.0, 1.0, 1.0)
+GESTURES: dict[str, FingerBend] = {
+    "open_hand": OPEN_HAND,
+    "fist": FIST,
+    "point": (1.0, 0.0, 1.0, 1.0, 1.0),
+    "thumb_up": (0.0, 1.0, 1.0, 1.0, 1.0),
+    "thumb_and_index": (0.0, 0.0, 1.0, 1.0, 1.0),
+    "pinch": (1.0, 1.0, 0.0, 0.0, 0.0),
+}
+"""The six gestures. Of the two other combinations a bent thumb alone is near the open hand, a bent index finger alone
+near the pinch."""
+MAX_DIFFERENCE = 0.4
+"""A finger that is bent by more than this otherwise makes another gesture [1]. GUESSED."""
+
+_Bend = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+
+class GestureError(DataError):
+    """A file of gestures that cannot be used."""
+
+
+class _Buttons(msgspec.Struct, forbid_unknown_fields=True):
+    a: str = ""
+    b: str = ""
+
+
+class _GestureFile(msgspec.Struct, forbid_unknown_fields=True):
+    poses: dict[str, tuple[_Bend, _Bend, _Bend, _Bend, _Bend]] = {}
+    buttons: _Buttons = msgspec.field(default_factory=_Buttons)
+
+
+@dataclasses.dataclass(frozen=True)
+class Gestures:
+    """The finger poses that one person can make."""
+
+    poses: Mapping[str, FingerBend] = dataclasses.field(default_factory=lambda: dict(GESTURES))
+    """By name: the six, and the person's own."""
+    buttons: Mapping[str, FingerBend] = dataclasses.field(default_factory=dict)
+    """Poses on the buttons ``a`` and ``b`` of either controller (x and y of a left one)."""
+
+    @classmethod
+    def load(cls, path: pathlib.Path) -> Gestures:
+        """The six and those of a file; :class:`GestureError` in one line if it cannot be used."""
+        given = load_toml(path, _GestureFile, GestureError)
+        poses = GESTURES | given.poses
+        buttons = {button: name for button, name in msgspec.structs.asdict(given.buttons).items() if name}
+        for button, name in buttons.items():
+            if name not in poses:
+                raise GestureError(f"{path}: buttons.{button}: no pose {name!r}; give one of {', '.join(poses)}")
+        return cls(poses, {button: poses[name] for button, name in buttons.items()})
+
+    def name_of(self, fingers: FingerBend) -> str:
+        """Name of the pose that ``fingers`` make, empty if none is near."""
+        away = {name: max(abs(a - b) for a, b in zip(fingers, pose, strict=True)) for name, pose in self.poses.items()}
+        nearest = min(away, key=lambda name: away[name])
+        return nearest if away[nearest] <= MAX_DIFFERENCE else ""
 
 
 def finger_bend(*, closed: bool) -> FingerBend:

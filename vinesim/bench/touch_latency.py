@@ -18,6 +18,7 @@ import numpy as np
 from vinesim.bench.poor_link import poor_link
 from vinesim.bench.support.fake_client import FakeClientProcess
 from vinesim.bench.support.network_emulator import Link, LinkProfile, NetworkEmulator
+from vinesim.bench.two_pullers import two_pullers
 from vinesim.client.recording.bunch_trace import Rows, remote_error
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose
 from vinesim.scene.generation.vineyard import generate
@@ -144,6 +145,7 @@ def link() -> Iterator[Measurement]:
         for share in (50, 95):
             yield Measurement("link", f"{case}: touch to received, p{share}", float(np.percentile(took, share)), "ms")
     yield from poor_link()
+    yield from two_pullers()
     for case in LINES:
         yield from line_measurements(case)
 

@@ -121,6 +121,18 @@ def _live(rows: Sequence[str] = ()) -> Iterator[Measurement]:
     return live(rows, _announce)
 
 
+def _page() -> Iterator[Measurement]:
+    from vinesim.bench.page_latency import page
+
+    return page()
+
+
+def _ros() -> Iterator[Measurement]:
+    from vinesim.bench.ros_topics import ros
+
+    return ros(_announce)
+
+
 def _kill(times: int = 50, seed: int = 1) -> Iterator[Measurement]:
     from vinesim.bench.kill import kill
 
@@ -158,6 +170,8 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "lidar": _lidar,
     "sensors": _sensors,
     "live": _live,
+    "ros": _ros,
+    "page": _page,
     "sync": _sync,
     "link": _link,
     "traffic": _traffic,

@@ -11,8 +11,8 @@ from vinesim.errors import UsageError
 ROLES = ("robot", "human", "spectator")
 
 ROLES_OF_OPTION = {
-    **dict.fromkeys(("robot", "approach", "namespace", "ros", "push", "job", "watch"), ("robot",)),
-    **dict.fromkeys(("walk", "reach", "height"), ("human",)),
+    **dict.fromkeys(("robot", "approach", "namespace", "params_file", "ros", "push", "job", "watch"), ("robot",)),
+    **dict.fromkeys(("walk", "reach", "height", "gestures"), ("human",)),
     "jitter_buffer": ("robot", "human"),
     "sensor_hz": ("robot", "spectator"),
     "renderer": ("robot", "spectator"),
@@ -42,6 +42,8 @@ class ClientOptions:
     approach: float
     """How far behind its start pose a robot begins [m]."""
     namespace: str
+    params_file: pathlib.Path | None
+    """ROS parameters of the nodes of robots."""
     ros: bool
     push: int | None
     """Bunch."""
@@ -67,6 +69,18 @@ class ClientOptions:
     sensor_hz: float | None
     renderer: str
     tick_log: pathlib.Path | None
+    page: int | None = None
+    """Port of the page; 0: any that is free; None: a free one if this client exists for its page, else no page."""
+    page_lan: bool = False
+    """Whether other machines of the network may open the page."""
+    gestures: pathlib.Path | None = None
+    """File of a person's own finger poses."""
+
+    @property
+    def is_for_page(self) -> bool:
+        """Whether it is a person without a script, or a spectator that writes no pictures: of use by its page only."""
+        is_person = self.role == "human" and self.walk is None and self.reach is None
+        return is_person or (self.role == "spectator" and self.out is None)
 
 
 def check_role(role: str, given: Collection[str]) -> None:
@@ -89,8 +103,12 @@ def check_status(status: str) -> None:
 def check_options(options: ClientOptions) -> None:
     """Refuse what can be refused before anything is built: :class:`UsageError`, or DeviceError for a missing device."""
     check_status(options.status)
+    if options.page_lan and options.page is None and not options.is_for_page:
+        raise UsageError("--page-lan without a page: give --page PORT, too")
     if options.tls is not None and options.connect is None:
         raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7447")
+    if options.params_file is not None and not options.params_file.is_file():
+        raise UsageError(f"--params-file {options.params_file}: there is no such file; give a ROS 2 parameter file")
     from vinesim.physics.plants.device_buffers import find_device
     from vinesim.sensors.raster import renderer_selection
 

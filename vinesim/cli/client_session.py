@@ -14,6 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
 
 from vinesim import allocator
+from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.cli.signals import stop_at_signals
 from vinesim.client.client import Client
@@ -30,6 +31,7 @@ from vinesim.robot.tasks.task import Task
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene, with_seed
+from vinesim.web import page_files
 
 SWITCH_INTERVAL = 2e-4
 """How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
@@ -104,6 +106,35 @@ class ClientSession:
         """Record force on and displacement of a bunch from now on."""
         client.trace = start_trace(client, self.model, bunch)
         return client.trace
+
+    def show_page(self, client: Client, person: TrackedHuman | None = None) -> None:
+        """Show the vineyard in browsers until the session ends, if ``--page`` is given or the client exists for its
+        page. The first page moves a spectator's eyes, or the ``person``."""
+        port = self.options.page
+        if port is None:
+            if not self.options.is_for_page:
+                return
+            if (missing := page_files.missing()) is not None:
+                print(f"no page: {missing}", file=sys.stderr, flush=True)
+                return
+            port = 0
+        page_files.check()
+        from vinesim.client.page_world import PageWorld
+        from vinesim.web.page_server import PageServer
+
+        world = PageWorld(client, person)
+        if self.options.page_lan:
+            from vinesim.client.page_access import network_access, print_code
+
+            access = network_access()
+            server = self.enter(
+                PageServer(world, port, access.host, tls=access.tls, token=access.token)
+            )  # fmt: skip
+            print_code(server.address)
+        else:
+            server = self.enter(PageServer(world, port))
+        print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
+        client.post_step.append(lambda _: world.collect(server))
 
     def run(
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,

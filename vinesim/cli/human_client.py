@@ -1,4 +1,4 @@
-"""``vinesim client --role human``: join a vineyard as a human who is moved by a script."""
+"""``vinesim client --role human``: join a vineyard as a human who is moved by a page in a browser, or by a script."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from vinesim.avatar.gestures import Gestures
 from vinesim.avatar.scripted_human import ScriptedHuman
+from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
@@ -18,7 +20,9 @@ REACH = 0.55
 
 
 def run(options: ClientOptions) -> int:
-    """Walk, reach for a bunch, hold it, pull at it, let go, until a signal; then write report.json; the exit code."""
+    """Be the person in front of the page, or by a script walk, reach for a bunch, hold it, pull at it, let go; until a
+    signal; then write report.json; the exit code."""
+    gestures = None if options.gestures is None else Gestures.load(options.gestures)
     with ClientSession(options) as session:
         validate_bunch(session.model, options.reach)
         if options.out is not None:
@@ -26,18 +30,21 @@ def run(options: ClientOptions) -> int:
                 options.out.mkdir(parents=True, exist_ok=True)
         start = start_pose(session.scene, session.spawn)
         human = ScriptedHuman(start, options.height)
+        if options.is_for_page:
+            human = TrackedHuman(start, options.height, gestures=gestures)
         client = Client(
             session.scene, session.model, None, session.bus(session.name), pose=start, source=human,
             height=options.height, **session.client_options(),
         )  # fmt: skip
         session.leave_at_end(client)
-        if options.walk is not None:
+        if options.walk is not None and isinstance(human, ScriptedHuman):
             human.do(human.walk(options.walk))
-        if options.reach is not None:
+        if options.reach is not None and isinstance(human, ScriptedHuman):
             trace = session.trace(client, options.reach)
             if options.walk is None:
                 human.do(human.walk(standing_place(bunch_centres(session.model)[options.reach], start)))
             human.do(pull_repeatedly(human, trace.centre))
+        session.show_page(client, human if isinstance(human, TrackedHuman) else None)
         status = session.run(client)
         if options.out is not None:
             save_report(options.out, status.report())

@@ -8,6 +8,7 @@ import pathlib
 import sys
 import threading
 import time
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,18 +20,24 @@ from vinesim.net.keys import sender_of
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
 from vinesim.net.transport.endpoints import check_exposure
 
+if TYPE_CHECKING:
+    from vinesim.client.recording.replay import ReplayBus
+    from vinesim.client.spectator import Spectator
+
 POLL = 0.004
 """Between two looks at what is due [s]."""
 
 
 def run(
     *, file: pathlib.Path, connect: str | None, listen: str | None, insecure: bool, world: str, speed: float,
-    start: float, end: float | None, out: pathlib.Path | None, pose: tuple[float, float, float] | None,
+    start: float, end: float | None, out: pathlib.Path | None, ros: bool, pose: tuple[float, float, float] | None,
     scene: str | None, seed: int | None,
 ) -> int:  # fmt: skip
     """Play a file; 0 when its end is reached, or on Ctrl-C."""
-    if sum(way is not None for way in (connect, listen, out)) != 1:
-        raise UsageError("give one of --connect (play to a server), --listen (be one) and --out (look at it)")
+    if sum(way is not None for way in (connect, listen, out)) + ros != 1:
+        raise UsageError(
+            "give one of --connect (play to a server), --listen (be one), --out (look at it) and --ros (publish topics)"
+        )
     if listen is not None:
         check_exposure([listen], insecure=insecure)
     tape = read_recording(file)
@@ -45,6 +52,8 @@ def run(
     print(f"{file}: {len(tape.messages)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
     if out is not None:
         return _look(tape, stop, out, pose, scene, seed, speed, start, end)
+    if ros:
+        return _publish(tape, stop, scene, seed, speed, start, end)
     return _tell(tape, stop, connect, listen, world, speed, start, end)
 
 
@@ -84,8 +93,54 @@ def _look(
     scene: str | None, seed: int | None, speed: float, start: float, end: float | None,
 ) -> int:  # fmt: skip
     """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
+    from vinesim.client.spectator import PictureWriter
+
+    spectator, bus = _spectator(tape, pose, scene, seed, start, end)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+    pictures = PictureWriter(spectator, out, 1.0)
+    while not (bus.ended or stop.is_set()):
+        _step(spectator, bus, speed, follow=pose is None)
+    pictures.save(spectator)
+    print(f"{pictures.count} pictures are in {out}/", file=sys.stderr)
+    return 0
+
+
+def _publish(
+    tape: Recording, stop: threading.Event, scene: str | None, seed: int | None, speed: float, start: float,
+    end: float | None,
+) -> int:  # fmt: skip
+    """Play to a spectator in this process in real time, and publish what it has as ROS topics."""
+    from vinesim.ros import middleware
+
+    if (reason := middleware.unavailable_reason()) is not None:
+        print(f"ROS 2 is not usable here: {reason}")
+        return 3
+    from vinesim.client.rate_loop import RateLoop
+    from vinesim.client.recording.ros_replay import RosReplay
+    from vinesim.ros.world_node import WorldNode
+
+    middleware.configure(large_messages=False)
+    spectator, bus = _spectator(tape, None, scene, seed, start, end)
+    loop = RateLoop(spectator.physics.dt)
+    with WorldNode("vinesim_replay") as node:
+        RosReplay(spectator, node, lambda: bus.time)
+        while not (bus.ended or stop.is_set()):
+            loop.begin()
+            _step(spectator, bus, speed, follow=True)
+            loop.end()
+        sent = sum(node.sent.values())
+    print(f"{sent} messages were published", file=sys.stderr)
+    return 0
+
+
+def _spectator(
+    tape: Recording, pose: tuple[float, float, float] | None, scene: str | None, seed: int | None, start: float,
+    end: float | None,
+) -> tuple[Spectator, ReplayBus]:  # fmt: skip
+    """A spectator of a recording that stands at a ``pose``, unless given behind the first robot; and its bus."""
     from vinesim.client.recording.replay import ReplayBus
-    from vinesim.client.spectator import PictureWriter, Spectator, follow_view, standing_view
+    from vinesim.client.spectator import Spectator, follow_view, standing_view
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import SceneError, load_scene, with_seed
 
@@ -105,19 +160,19 @@ def _look(
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
     eyes = standing_view(*pose) if pose is not None else follow_view(_first_pose(tape))
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
     bus = ReplayBus(tape, "spectator", start=start, end=end)
-    spectator = Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time)
-    pictures = PictureWriter(spectator, out, 1.0)
-    while not (bus.ended or stop.is_set()):
-        bus.play(spectator.physics.dt * speed)
-        if pose is None and spectator.physics.rigid.robots:
-            spectator.pose = follow_view(spectator.physics.rigid.base_state(min(spectator.physics.rigid.robots))[0])
-        spectator.tick()
-    pictures.save(spectator)
-    print(f"{pictures.count} pictures are in {out}/", file=sys.stderr)
-    return 0
+    return Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time), bus
+
+
+def _step(spectator: Spectator, bus: ReplayBus, speed: float, *, follow: bool) -> None:
+    """One tick of a spectator; ``follow``: its eyes stay behind the first robot."""
+    from vinesim.client.spectator import follow_view
+
+    bus.play(spectator.physics.dt * speed)
+    rigid = spectator.physics.rigid
+    if follow and rigid.robots:
+        spectator.pose = follow_view(rigid.base_state(min(rigid.robots))[0])
+    spectator.tick()
 
 
 def _first_pose(tape: Recording) -> np.ndarray:

@@ -45,11 +45,13 @@ def run(options: ClientOptions) -> int:
             process.attach(client, client.robots[name])
         task = None if begin is None else begin(client.physics, client.robot)
         _add_behaviour(session, client, task, approach)
+        session.show_page(client)
         status = session.run(
             client, task=task, sent=sensors[0].sent_messages, sensors=lambda: _sensor_status(sensors),
             publish=lambda values: [one.publish_diagnostics(values) for one in sensors],
         )  # fmt: skip
         if options.out is not None:
+            sensors[0].close_ros()
             report = status.report() | sensors[0].report()
             if task is not None:
                 report["job"] = task.report()
@@ -71,7 +73,7 @@ def _start_sensors(
         process = RobotProcesses(
             name, session.scene, session.model, description, namespace="/".join(filter(None, parts)), ros=options.ros,
             keep_pictures=options.out is not None and i == 0, sensor_hz=options.sensor_hz,
-            clock=i == 0, renderer=options.renderer, device=options.device,
+            params_file=options.params_file, clock=i == 0, renderer=options.renderer, device=options.device,
         )  # fmt: skip
         processes.append(session.enter(process))
     return processes
@@ -110,6 +112,8 @@ def _build_client(
 def _add_behaviour(session: ClientSession, client: Client, task: Task | None, approach: float) -> None:
     """Let the robots drive to their start poses, push the bunch of ``--push``, do the ``task``, and look at it."""
     options = session.options
+    given = {"--job": options.job, "--push": options.push, "--watch": options.watch, "--approach": approach or None}
+    client.script = next((name for name, value in given.items() if value is not None), "")
     watched = options.watch if options.watch is not None else options.push
     if watched is not None:
         session.trace(client, watched)

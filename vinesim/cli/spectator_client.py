@@ -34,6 +34,7 @@ def run(options: ClientOptions) -> int:
                 options.renderer,
                 options.device,
             )
+        session.show_page(spectator)
         session.run(spectator)
         if pictures is not None:
             pictures.save(spectator)

@@ -12,6 +12,7 @@ network.
 
 from __future__ import annotations
 
+import collections
 import functools
 import logging
 import time
@@ -22,6 +23,7 @@ from concurrent.futures import Executor
 import numpy as np
 
 from vinesim import frames
+from vinesim.allocator import release_free_memory
 from vinesim.avatar.local_human import LocalHuman
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.remote.mesh_exchange import MeshExchange
@@ -94,7 +96,10 @@ class Client:
         actors that join; without one that is done in the loop.
         """
         self.name, self.model, self.scene = name, model, scene
-        self.physics = Physics(model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking)
+        self._new_physics = functools.partial(
+            Physics, model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking
+        )
+        self.physics = self._new_physics()
         self.physics.wind = wind_of(scene)
         self.robots: dict[str, Robot] = {}
         """Robots that this client simulates, by name; the first is :attr:`robot`."""
@@ -104,8 +109,9 @@ class Client:
         """Meshes of local robots for other clients, and of remote ones for this client."""
         self.replicators: dict[str, Replicator] = {}
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
-        self.objects = ObjectSync(self.physics, self.replicators)
+        self.objects = ObjectSync(self.physics, self.replicators, self._is_present)
         self.couplings = PlantCouplings(self.physics)
+        self._description, self._executor = description, executor
         self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
         self._add_own_actor(description, pose, source, height, bus)
         self.replicator = self.replicators[name]
@@ -121,6 +127,12 @@ class Client:
         """Called after every step: sensors, ROS, recorders."""
         self.wake_readers: list[Callable[[], None]] = []
         """Called last in a tick: they wake the processes that take its results, which may get this core at once."""
+        self.script = ""
+        """Options by which its robots act by themselves; such a client is not reset by services."""
+        self.after_reset: list[Callable[[], None]] = []
+        """Called after :meth:`reset`: parts that keep the physics or a robot take the new ones."""
+        self.earlier_faults: collections.Counter[str] = collections.Counter()
+        """Faults of the physics and of couplings before the last reset."""
         self.frame_score: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
         """How much there is to see now; the picture with the highest score is kept."""
         self.trace: Trace | None = None
@@ -131,6 +143,40 @@ class Client:
         self._clock = clock
         self._remote_trees: dict[int, TreeUpdate] = {}
         self.spawner = RemoteSpawner(self.physics.rigid, description, executor, self.meshes)
+
+    @property
+    def is_alone(self) -> bool:
+        """Whether this world is this client's alone: it follows no server, and no other client is in it."""
+        return not (self.world_time.is_shared or self.remote_actors)
+
+    def reset(self) -> None:
+        """Begin the scene anew as it was generated, between steps: plants, boxes, robots where they started, at rest.
+
+        People who are here stay. Simulated time goes on, and so do all counts of the network. Takes as long as a start
+        of the physics. :class:`ValueError` unless the client :attr:`is_alone`.
+        """
+        if not self.is_alone:
+            raise ValueError("a world that other clients share cannot be reset by one of them")
+        before = self.physics
+        starts = {name: before.rigid.robot(name).spec.pose for name in self.robots}
+        people = {name: (before.rigid.human(name).spec, human.source) for name, human in self.humans.items()}
+        self.physics = self._new_physics()
+        self.physics.wind, self.physics.tick = wind_of(self.scene), before.tick
+        self.physics.rigid.mj_data.time = before.time
+        self.earlier_faults.update(before.faults | {"couplings_refused": self.couplings.refused})
+        self.objects, self.couplings = ObjectSync(self.physics, self.replicators), PlantCouplings(self.physics)
+        self._remote_trees.clear()
+        self.spawner = RemoteSpawner(self.physics.rigid, self._description, self._executor, self.meshes)
+        for name, pose in starts.items():
+            self._add_robot_body(self.robots[name].description, name, pose)
+        for name, (spec, source) in people.items():
+            self.humans[name] = LocalHuman(self.physics, spec, source)
+        if self.name in self.robots:
+            self.robot = self.robots[self.name]
+        for callback in self.after_reset:
+            callback()
+        del before
+        release_free_memory()
 
     def _add_own_actor(
         self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
@@ -159,10 +205,14 @@ class Client:
             jitter_buffer=self._jitter_buffer,
             hand_force=self.physics.parameters.hand_force,
         )
-        self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
-        robot.fit_cutters(self.physics)
+        robot = self._add_robot_body(description, name, pose)
         self.meshes.offer(bus, description.urdf)
         self._add_replicator(name, replicator)
+        return robot
+
+    def _add_robot_body(self, description: RobotDescription, name: str, pose: np.ndarray) -> Robot:
+        self.robots[name] = robot = Robot(self.physics.rigid, description, name, label_index(name), pose)
+        robot.fit_cutters(self.physics)
         return robot
 
     def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> LocalHuman:
@@ -183,10 +233,19 @@ class Client:
         self._add_replicator(spec.name, replicator)
         return human
 
+    def remove_human(self, name: str) -> None:
+        """Remove a local human who is not this client's own actor, between steps; the bus is the caller's to close."""
+        self.physics.remove_human(name)
+        del self.humans[name], self.replicators[name]
+        self._share_client()
+
     def _add_replicator(self, name: str, replicator: Replicator) -> None:
         self.replicators[name] = replicator
-        for own, share in self.replicators.items():
-            share.local_actors = self.replicators.keys() - {own}
+        self._share_client()
+
+    def _share_client(self) -> None:
+        for own in self.replicators.values():
+            own.share_client(other for other in self.replicators.values() if other is not own)
 
     def tick(self) -> None:
         """Simulate one step of ``physics.dt``; none while :attr:`steps_before_pause` is 0."""
@@ -225,6 +284,7 @@ class Client:
             if hello.kind in ("robot", "human"):
                 self.spawner.enqueue(hello)
         for name in inbox.left:
+            self.objects.carrier_left(name)
             self.spawner.cancel(name)
             self.meshes.forget(name)
             if (other := self.remote_actors.pop(name, None)) is not None:
@@ -279,6 +339,7 @@ class Client:
             detached = objects.detached_by(name, all_others=name == self.name)
             touched = objects.touched_by(name, mine)
             touching |= bool(touched)
+            carried_on = objects.carried_on(name)
             settled = replicator.send(
                 now, pose, touched=touched, moving=moving, read=objects.read_state,
                 grabbed=objects.with_trees(detached), detached=detached, detached_roots=objects.cut_roots,
@@ -287,11 +348,12 @@ class Client:
                 has_body=self.physics.support_tracker.__contains__,
                 couplings=self.couplings.of_actor(name, self._remote_trees.keys() | self.couplings.trees),
                 wrenches=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
+                carried_on=carried_on,
             )  # fmt: skip
             for update in settled:
                 # the last message is what all copies hold: hold the same, quantised state
                 objects.blend_tree(update, 1.0)
-            for number in mine - replicator.owned:
+            for number in mine.union(carried_on) - replicator.owned:
                 objects.mark_resting(replicator.record(number))
         self.interest_audit.update(self, touching)
 
@@ -351,6 +413,10 @@ class Client:
         inbox.trees = [trees[tree] for tree in sorted(trees)]
         inbox.objects = [moved[number] for number in sorted(moved) if self._is_owned_remotely(number)]
         return inbox
+
+    def _is_present(self, name: str) -> bool:
+        """Whether an actor of another client is in the world now."""
+        return any(replicator.is_present(name) for replicator in self.replicators.values())
 
     def _is_owned_remotely(self, number: int) -> bool:
         """Whether an actor of another client owns an object or tree."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import logging
 from collections.abc import Mapping
 
@@ -29,8 +30,8 @@ DESCRIPTIONS = {
 def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
     """How often each fault of :data:`DESCRIPTIONS` occurred; faults that did not are left out."""
     counters = [replicator.counters for replicator in client.replicators.values()]
-    counts = client.physics.faults | {
-        "couplings_refused": client.couplings.refused,
+    physics = client.physics.faults | {"couplings_refused": client.couplings.refused}
+    counts = dict(client.earlier_faults + collections.Counter(physics)) | {
         "messages_refused": sum(one.malformed for one in counters),
         "wrenches_refused": sum(one.wrenches_refused for one in counters),
         "meshes_refused": client.meshes.refused_count,

@@ -7,12 +7,14 @@ them as well.
 from __future__ import annotations
 
 import logging
+import pathlib
 import threading
 import time as wall
-from collections.abc import Iterable
-from typing import Self
+from collections.abc import Iterable, Mapping
+from typing import Any, Self
 
 import rclpy
+import rclpy.node
 from rclpy.context import Context
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import SingleThreadedExecutor
@@ -39,8 +41,12 @@ class Node:
     for a name that ROS does not allow; each with one line of text. A context: :meth:`close` at its end.
     """
 
-    def __init__(self, name: str, namespace: str, topics: Iterable[str]) -> None:
-        """``topics``: names given by the user, checked before anything starts. :meth:`_start` starts the thread."""
+    def __init__(
+        self, name: str, namespace: str, topics: Iterable[str], params_file: pathlib.Path | None = None,
+        parameters: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        """``topics``: names given by the user, checked before anything starts. ``params_file``: values of parameters
+        (YAML, as ``--params-file`` of ROS 2 takes it); ``parameters``: those that were set in an earlier run."""
         try:
             validate_node_name(name)
             validate_namespace(f"/{namespace}" if namespace else "/")
@@ -56,9 +62,10 @@ class Node:
         # No signal handlers: the client handles SIGINT. No arguments: sys.argv is vinesim's own.
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         try:
-            self._node = rclpy.create_node(name, context=self._context, namespace=namespace or None)
-            self._parameters = Parameters(self._node)
+            self._node = self._create(name, namespace, params_file)
+            self._parameters = Parameters(self._node, parameters)
             self._open()
+            self._parameters.apply()
         except BaseException:
             self._context.shutdown()
             raise
@@ -68,6 +75,15 @@ class Node:
         self._threads += self._own_threads(name)
         for thread in self._threads:
             thread.start()
+
+    def _create(self, name: str, namespace: str, params_file: pathlib.Path | None) -> rclpy.node.Node:
+        given = [] if params_file is None else ["--ros-args", "--params-file", str(params_file)]
+        try:
+            return rclpy.create_node(name, context=self._context, namespace=namespace or None, cli_args=given)
+        except RuntimeError as error:
+            if params_file is None:
+                raise
+            raise ValueError(f"{params_file} is no ROS 2 parameter file: {' '.join(str(error).split())}") from error
 
     def _open(self) -> None:
         """Create publishers and subscriptions."""
@@ -92,6 +108,11 @@ class Node:
         if not topics:
             raise ValueError(f"no topic {family!r}; there are: {', '.join(sorted(self._topics))}")
         return any(topic.subscription_count for topic in topics)
+
+    @property
+    def set_parameters(self) -> dict[str, Any]:
+        """Values of the parameters that were ever set, by name; another object after each change."""
+        return self._parameters.set_by_user
 
     @property
     def sent(self) -> dict[str, int]:

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import rclpy.node
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.parameter import Parameter
 
 
 class Parameters:
     """The parameters of one node. The receiving thread changes them; every thread may read them."""
 
-    def __init__(self, node: rclpy.node.Node) -> None:
+    def __init__(self, node: rclpy.node.Node, values: Mapping[str, Any] | None = None) -> None:
+        """``values``: of parameters that were set before, in an earlier run of the node."""
         self._node = node
+        self.set_by_user = dict(values or {})
+        """Values of the parameters that were ever set, by name; replaced, never changed."""
         self._values: dict[str, Any] = {}
+        self._defaults: dict[str, Any] = {}
         self._changed: dict[str, Callable[[], None]] = {}
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
@@ -31,6 +36,8 @@ class Parameters:
     ) -> None:
         """Declare a parameter of the type of its ``default``: bool, int or float.
 
+        A value that was set before counts, else that of the node's parameter file; :class:`ValueError` if that is none.
+
         ``between``: the least and the greatest value of a number. ``changed`` is called after it was set.
         """  # fmt: skip
         descriptor = ParameterDescriptor(description=description)
@@ -38,10 +45,25 @@ class Parameters:
             descriptor.integer_range = [IntegerRange(from_value=int(between[0]), to_value=int(between[1]))]
         elif between is not None:
             descriptor.floating_point_range = [FloatingPointRange(from_value=between[0], to_value=between[1])]
-        self._values[name] = default
-        self._node.declare_parameter(name, default, descriptor)
+        before = self.set_by_user
+        self._values[name] = before.get(name, default)
+        self._defaults[name] = default
+        try:
+            declared = self._node.declare_parameter(
+                name, self._values[name], descriptor, ignore_override=name in before
+            )
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
+            raise ValueError(" ".join(str(error).split())) from error
+        self._values[name] = declared.value
+        self.set_by_user = before  # rclpy calls a declaration a setting, too
         if changed is not None:
             self._changed[name] = changed
+
+    def apply(self) -> None:
+        """When all are declared: call what is to be called for those that have not their defaults."""
+        for name, changed in self._changed.items():
+            if self._values[name] != self._defaults[name]:
+                changed()
 
     def __getitem__(self, name: str) -> Any:
         return self._values[name]
@@ -58,6 +80,7 @@ class Parameters:
         for one in parameters:
             if one.name in self._values:
                 self._values[one.name] = one.value
+                self.set_by_user = self.set_by_user | {one.name: one.value}
         for one in parameters:
             if one.name in self._changed:
                 self._changed[one.name]()

@@ -5,7 +5,9 @@ Every message is built and sent by the thread that passes its values, in order.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import pathlib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -39,7 +41,8 @@ class RobotNode(Node):
     ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
     sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none. All topics but /clock
     and /diagnostics stand under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether
-    this node may publish it, which one node of a ROS domain does.
+    this node may publish it, which one node of a ROS domain does. ``params_file``,
+    ``parameters``: see :class:`Node`.
     """
 
     def __init__(
@@ -55,6 +58,8 @@ class RobotNode(Node):
         bunch_of_body: np.ndarray | None = None,
         base: str = "base_footprint",
         clock: bool = True,
+        params_file: pathlib.Path | None = None,
+        parameters: Mapping[str, Any] | None = None,
     ) -> None:
         message_packages.ensure_importable(OWN_MESSAGES)
         self._urdf, self._static_transforms, self._base = urdf, static_transforms, base
@@ -64,7 +69,7 @@ class RobotNode(Node):
         self._commands = CommandQueue()
         self._steps = 0
         names = [spec.name for spec in controllers]
-        super().__init__(name, namespace, [*names, *imus, *wrenches])
+        super().__init__(name, namespace, [*names, *imus, *wrenches], params_file, parameters)
 
     def _open(self) -> None:
         from tf2_msgs.msg import TFMessage

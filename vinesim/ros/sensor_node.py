@@ -6,9 +6,10 @@ only the newest frame waits: an older one that was not sent is replaced and coun
 
 from __future__ import annotations
 
+import pathlib
 import threading
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from vinesim.ros.messages import message_packages
 from vinesim.ros.node import Node
@@ -33,8 +34,11 @@ class SensorNode(Node):
         cameras: Sequence[str] = (),
         lidars: Sequence[str] = (),
         rates: Mapping[str, float] | None = None,
+        params_file: pathlib.Path | None = None,
+        parameters: Mapping[str, Any] | None = None,
     ) -> None:
-        """``rates``: those of sensors [Hz], with which their parameters start; others have none."""
+        """``rates``: those of sensors [Hz], with which their parameters start; others have none. ``params_file``,
+        ``parameters``: see :class:`Node`."""
         if cameras:
             message_packages.ensure_importable(["vision_msgs"])
         self._camera_names, self._lidar_names = cameras, lidars
@@ -43,7 +47,7 @@ class SensorNode(Node):
         """The newest message of each topic; the one that waits longest is the first."""
         self._changed = threading.Condition()
         self._sending = False
-        super().__init__(name, namespace, (*cameras, *lidars))
+        super().__init__(name, namespace, (*cameras, *lidars), params_file, parameters)
 
     def _open(self) -> None:
         parameters = self._parameters

@@ -1,4 +1,4 @@
-"""simulation_interfaces: services by which test programs pause and step a simulation, and ask what is in it.
+"""simulation_interfaces: services by which test programs pause, step and reset a simulation, and change what is in it.
 
 Services wait for an answer of the simulation, which is given between two steps; so this node has a thread and a context
 of its own. What is not supported says so: result 0, with a text.
@@ -12,21 +12,42 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from vinesim.ros.commands.types import Entity, EntityCategory, SimulationAction, SimulationReply, SimulationRequest
+import numpy as np
+from geometry_msgs.msg import Pose, Twist
+
+from vinesim.ros.commands.types import (
+    Entity,
+    EntityArguments,
+    EntityCategory,
+    Refusal,
+    SimulationAction,
+    SimulationReply,
+    SimulationRequest,
+)
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.node import Node
 from vinesim.ros.publishers.robot import MAP_FRAME
 
 REPLY_TIMEOUT = 10.0
 """[s] A simulation that has not answered by then stands still."""
+RESET_TIMEOUT = 120.0
+"""[s] The same of a reset, which takes as long as a start of the physics."""
 STEP_TIMEOUT = 1.0
 """[s] More for each step that was asked for: the slowest simulation that is waited for."""
 UNSUPPORTED = (
-    "SpawnEntity", "SpawnEntities", "DeleteEntity", "SetEntityState", "SetEntityInfo", "ResetSimulation", "LoadWorld",
-    "UnloadWorld", "GetSpawnables", "GetNamedPoses", "GetEntityBounds",
+    "SpawnEntities", "SetEntityInfo", "LoadWorld", "UnloadWorld", "GetNamedPoses", "GetEntityBounds",
 )  # fmt: skip
 """Services that answer that they are not supported."""
 _REMEDY = "not supported by vinesim; scene, robots and people are options of vinesim client and server"
+
+
+_CODES = {
+    Refusal.UNSUPPORTED: 0, Refusal.NOT_FOUND: 2, Refusal.INCORRECT_STATE: 3, Refusal.FAILED: 4,
+    Refusal.NAME_NOT_UNIQUE: 101, Refusal.NAME_INVALID: 102, Refusal.UNSUPPORTED_FORMAT: 103,
+    Refusal.NO_RESOURCE: 104, Refusal.RESOURCE_PARSE_ERROR: 106, Refusal.MISSING_ASSETS: 107,
+}  # fmt: skip
+INVALID_SPAWN_POSE, INVALID_POSE = 109, 101
+"""Results of simulation_interfaces; an invalid pose has one for each service."""
 
 
 class SimulationNode(Node):
@@ -66,7 +87,9 @@ class SimulationNode(Node):
             "GetSimulatorFeatures": self._get_features, "GetSimulationState": self._get_state,
             "SetSimulationState": self._set_state, "StepSimulation": self._step, "GetEntities": self._get_entities,
             "GetEntitiesStates": self._get_states, "GetEntityState": self._get_entity_state,
-            "GetEntityInfo": self._get_entity_info, **dict.fromkeys(UNSUPPORTED, self._refuse),
+            "GetEntityInfo": self._get_entity_info, "GetSpawnables": self._get_spawnables,
+            "SpawnEntity": self._spawn, "DeleteEntity": self._delete, "SetEntityState": self._set_entity_state,
+            "ResetSimulation": self._reset, **dict.fromkeys(UNSUPPORTED, self._refuse),
         }  # fmt: skip
         for name, serve in served.items():
             topic = re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
@@ -77,11 +100,16 @@ class SimulationNode(Node):
     def _get_features(self, _: Any, response: Any) -> Any:
         known = self._features
         response.features.features = [
+            known.SPAWNING, known.DELETING, known.SPAWNABLES, known.ENTITY_STATE_SETTING,
+            known.SIMULATION_RESET, known.SIMULATION_RESET_STATE, known.SIMULATION_RESET_SPAWNED,
             known.ENTITY_CATEGORIES, known.ENTITY_STATE_GETTING, known.ENTITY_INFO_GETTING,
             known.SIMULATION_STATE_GETTING, known.SIMULATION_STATE_SETTING, known.SIMULATION_STATE_PAUSE,
             known.STEP_SIMULATION_SINGLE, known.STEP_SIMULATION_MULTIPLE,
         ]  # fmt: skip
-        response.features.custom_info = "pause and step: of a client without a server"
+        response.features.custom_info = (
+            "only a client without a server pauses, steps, resets and changes entities; time goes on over a reset; "
+            "get_spawnables lists the URIs that can be spawned"
+        )
         return response
 
     def _get_state(self, _: Any, response: Any) -> Any:
@@ -120,6 +148,52 @@ class SimulationNode(Node):
     def _get_entity_info(self, request: Any, response: Any) -> Any:
         if (entity := self._named(request.entity, response.result)) is not None:
             response.info.category.category = self._categories[entity.category]
+            response.info.description = entity.description
+        return response
+
+    def _get_spawnables(self, _: Any, response: Any) -> Any:
+        from geometry_msgs.msg import Vector3
+        from simulation_interfaces.msg import Bounds, Spawnable
+
+        reply = self._request(SimulationAction.GET_SPAWNABLES, response.result)
+        for one in () if reply is None else reply.spawnables:
+            corners = [Vector3(x=x, y=y, z=z) for x, y, z in (one.high, one.low)]
+            bounds = Bounds(type=Bounds.TYPE_BOX, points=corners)
+            response.spawnables.append(Spawnable(uri=one.uri, description=one.description, spawn_bounds=bounds))
+        return response
+
+    def _spawn(self, request: Any, response: Any) -> Any:
+        if request.resource_string:
+            text = "no resource strings; get_spawnables lists the URIs that can be spawned"
+            self._fail(response.result, response.UNSUPPORTED_FORMAT, text)
+            return response
+        pose = _read_pose(request.initial_pose.header, request.initial_pose.pose)
+        given = EntityArguments(request.name, pose, None, request.uri, request.allow_renaming)
+        reply = self._request(SimulationAction.SPAWN, response.result, entity=given)
+        response.entity_name = "" if reply is None else reply.name
+        return response
+
+    def _delete(self, request: Any, response: Any) -> Any:
+        self._request(SimulationAction.DELETE, response.result, entity=EntityArguments(request.entity))
+        return response
+
+    def _set_entity_state(self, request: Any, response: Any) -> Any:
+        state = request.state
+        given = EntityArguments(request.entity, _read_pose(state.header, state.pose), _read_twist(state.twist))
+        self._request(SimulationAction.SET_ENTITY_STATE, response.result, entity=given)
+        return response
+
+    def _reset(self, request: Any, response: Any) -> Any:
+        scope = request.scope or request.SCOPE_ALL
+        known = request.SCOPE_STATE | request.SCOPE_SPAWNED
+        if scope != request.SCOPE_ALL and scope & ~known:
+            text = "time goes on over a reset; give the scope STATE, SPAWNED, both, ALL or DEFAULT"
+            self._fail(response.result, self._result.RESULT_FEATURE_UNSUPPORTED, text)
+            return response
+        self._request(
+            SimulationAction.RESET, response.result, timeout=RESET_TIMEOUT,
+            keep_state=not scope & request.SCOPE_STATE, keep_spawned=not scope & request.SCOPE_SPAWNED,
+        )  # fmt: skip
         return response
 
     def _refuse(self, _: Any, response: Any) -> Any:
@@ -128,20 +202,26 @@ class SimulationNode(Node):
 
     # ------------------------------------------------------------------ the simulation's answers
 
-    def _request(self, action: SimulationAction, result: Any, steps: int = 0) -> SimulationReply | None:
-        """Ask the simulation and wait; fills ``result``. None if it refused or did not answer."""
+    def _request(
+        self, action: SimulationAction, result: Any, *, steps: int = 0, timeout: float = REPLY_TIMEOUT, **values: Any
+    ) -> SimulationReply | None:
+        """Ask the simulation and wait up to ``timeout`` [s]; fills ``result``. None if it refused or did not answer.
+
+        ``values``: fields of the request.
+        """
         number, done = next(self._numbers), threading.Event()
         self._waiting[number] = done
         try:
-            self._ask(SimulationRequest(number, action, steps))
-            done.wait(REPLY_TIMEOUT + STEP_TIMEOUT * min(steps, 1000))
+            self._ask(SimulationRequest(number, action, steps, **values))
+            done.wait(timeout + STEP_TIMEOUT * min(steps, 1000))
         finally:
             del self._waiting[number]
         reply = self._replies.pop(number, None)
         if reply is None:
             self._fail(result, self._result.RESULT_OPERATION_FAILED, "the simulation did not answer")
         elif reply.refusal:
-            self._fail(result, self._result.RESULT_INCORRECT_STATE, reply.refusal)
+            pose_code = INVALID_SPAWN_POSE if action is SimulationAction.SPAWN else INVALID_POSE
+            self._fail(result, _CODES.get(reply.kind, pose_code), reply.refusal)
             return None
         else:
             self._time = reply.time
@@ -186,3 +266,14 @@ class SimulationNode(Node):
         convert.set_vector(state.twist.linear, entity.velocity[:3])
         convert.set_vector(state.twist.angular, entity.velocity[3:])
         return state
+
+
+def _read_pose(header: Any, message: Pose) -> np.ndarray | None:
+    """A pose [7]; None if it is in another frame than the map."""
+    x, q = message.position, message.orientation
+    return np.array([x.x, x.y, x.z, q.x, q.y, q.z, q.w]) if header.frame_id in ("", MAP_FRAME) else None
+
+
+def _read_twist(message: Twist) -> np.ndarray:
+    """A velocity [6]."""
+    return np.array([getattr(part, axis) for part in (message.linear, message.angular) for axis in "xyz"])

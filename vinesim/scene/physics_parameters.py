@@ -36,7 +36,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     gravity: NotNegative = 9.81
     """[m/s^2] Downwards. READ: standard gravity, 9.80665, rounded. The rest shape of plants is computed with 9.81."""
     friction: Positive = 0.8
-    """[1] Coulomb coefficient of every contact. GUESSED for rubber pads, plastic crates and bark alike."""
+    """[1] Coulomb coefficient of every contact whose pair of materials ``data/materials`` does not list. GUESSED for
+    rubber pads, plastic crates and berries alike."""
     sleep: bool = True
     """Whether plants that are at rest are put to sleep. Off: every plant that was woken stays awake."""
 
@@ -96,7 +97,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     # ------------------------------------------------------------------ contacts with plants
     contact_stiffness: Positive = 2e4
-    """[N/m] Of every contact, normal and (as the anchor of friction) tangential. GUESSED."""
+    """[N/m] Of a contact with a plant, normal and (as the anchor of friction) tangential, unless ``data/materials``
+    lists the pair. GUESSED."""
     contact_damping_time: NotNegative = 0.02
     """[s] Damping of a contact divided by its stiffness. TUNED: two steps of 10 ms."""
     contact_margin: Positive = 0.002

@@ -29,6 +29,9 @@ StartPose = Annotated[Pose | None, typer.Option(help="Start at X Y [m] with YAW 
 Approach = Annotated[float, typer.Option(help="Of a robot: start this far behind the start pose and drive to it [m].")]
 Namespace = Annotated[str, typer.Option(help="Of a robot: prefix of all ROS topics.")]
 Ros = Annotated[bool, typer.Option(help="Of a robot: run a ROS 2 node, if ROS 2 is installed.")]
+ParamsFile = Annotated[
+    pathlib.Path | None, typer.Option(help="Of a robot: a ROS 2 parameter file for its nodes (YAML).")
+]
 Job = Annotated[str | None, typer.Option(help="Of a robot: do a job and stop: pick or exchange.")]
 Height = Annotated[float, typer.Option(min=1.0, max=2.5, help="Of a human [m].")]
 InterestRadius = Annotated[
@@ -48,6 +51,18 @@ Out = Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, tra
 SensorRate = Annotated[
     float | None, typer.Option(min=0.1, help="Pictures and scans a second; each sensor's own rate unless given.")
 ]
+Page = Annotated[
+    int | None,
+    typer.Option(
+        min=0, max=65535, help="Show the vineyard in a browser, on this port; people and spectators: on a free one."
+    ),
+]
+PageLan = Annotated[
+    bool, typer.Option("--page-lan", help="Let other machines of the network open the page, by https with a token.")
+]
+OwnGestures = Annotated[
+    pathlib.Path | None, typer.Option("--gestures", help="Of a human: TOML file of finger poses for the buttons.")
+]
 # what the clients of a demo and of a benchmark are told to do
 Push = Annotated[int | None, typer.Option(hidden=True, help="Of a robot: reach for this bunch and push it repeatedly.")]
 Watch = Annotated[
@@ -65,11 +80,13 @@ Reach = Annotated[
 def client(
     ctx: typer.Context, role: Role = "robot", name: Name = None, connect: Server = None, tls: Certificates = None,
     scene: Scene = "demo", seed: Seed = None, robot: Robots = None, spawn: Spawn = 0, pose: StartPose = None,
-    approach: Approach = 0.0, namespace: Namespace = "", ros: Ros = True, push: Push = None, job: Job = None,
-    walk: Walk = None, reach: Reach = None, height: Height = 1.75, watch: Watch = None,
+    approach: Approach = 0.0, namespace: Namespace = "", params_file: ParamsFile = None, ros: Ros = True,
+    push: Push = None,
+    job: Job = None, walk: Walk = None, reach: Reach = None, height: Height = 1.75, watch: Watch = None,
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
-    sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None,
+    sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,
+    page_lan: PageLan = False, gestures: OwnGestures = None,
 ) -> None:  # fmt: skip
     """Join the vineyard as one actor, with a simulation of its own.
 
@@ -80,6 +97,7 @@ def client(
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
       vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
       vinesim client --role spectator --connect tcp/127.0.0.1:7447 --pose 2 0 1.57 --out pictures
+      vinesim client --role spectator --connect tcp/127.0.0.1:7447
       vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva
     """
     gc.disable()  # a sixth of the time of the start; the loop enables it

@@ -31,7 +31,9 @@ def bench(
     What a user waits for: start. Of physics: plants, contact, tick, asleep. Of jobs: picking (every bunch in reach, in
     simulated time). Of sensors: camera and lidar (speed),
     sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
-    beside budgets). Of the network: sync (what delay does, in simulated time), link (real clients over emulated links;
+    beside budgets). Of ROS: ros (topics of every step in another process, one subscriber stopped; actions). Of
+    browsers: page (input of a person to the state that shows it). Of the
+    network: sync (what delay does, in simulated time), link (real clients over emulated links;
     needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz
     (broken messages and well-formed lies), kill (programs killed at random moments, while all others go on).
     Of a long run: soak (memory, threads and open files of robots, people and a recorder; Linux).
@@ -42,6 +44,7 @@ def bench(
       vinesim bench plants camera
       vinesim bench live --json
       vinesim bench live --row demo --row camera
+      vinesim bench ros --json
       vinesim bench kill --times 12 --json
       vinesim bench fuzz --messages 1000000 --lies 2000
       vinesim bench sync --json --plot docs/pictures/network-sync.png

@@ -14,7 +14,7 @@ from vinesim.cli.demo.placement import APPROACH_DISTANCE, choose_poses
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
-from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, process_group
+from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, free_port, process_group
 from vinesim.client.processes.ros_listener import RosListener
 from vinesim.errors import writing
 from vinesim.robot.description.description import RobotDescription
@@ -22,6 +22,7 @@ from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
+from vinesim.web import page_files
 
 CAMERA_TOPICS = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info")
 COSTLY_TOPICS = ("depth/points", "labels")
@@ -71,11 +72,17 @@ def run_push(
         console.print(f"server on {endpoint}; {PICKER} will push bunch {bunch} for {seconds:.0f} s")
         common = ["--connect", endpoint, "--scene", scene, "--robot", robot, "--device", device]
         common += [] if seed is None else ["--seed", str(seed)]
-        clients = _start_clients(group, common, bunch, poses, out)
+        no_page = page_files.missing()
+        page = None if no_page else free_port()
+        clients = _start_clients(group, common, bunch, poses, page, out)
         newest = Statuses()
         ready = wait_until_ready(clients, [server], listener, newest, topics.describe, console, START_TIMEOUT)
         took = time.time() - begin
         console.print(f"all ready after {took:.1f} s; {seconds:.0f} s to go", highlight=False)
+        if page is None:
+            console.print(f"nothing to watch in a browser: {no_page}")
+        else:
+            console.print(f"watch it in a browser: http://127.0.0.1:{page}/", highlight=False)
         timer = _RunTimer(newest[PICKER]["time"] + seconds, listener)
         show_progress(clients[PICKER], clients[VISITOR], server, newest, console, headless, timer.is_over)
         received = {} if listener is None else listener.report()
@@ -119,14 +126,17 @@ class _RunTimer:
 
 
 def _start_clients(
-    group: ProcessGroup, common: list[str], bunch: int, poses: tuple[list[str], list[str]], out: pathlib.Path
-) -> dict[str, Process]:
-    """The clients by name, with ``common`` options: one pushes the ``bunch``, the other drives up to it."""
+    group: ProcessGroup, common: list[str], bunch: int, poses: tuple[list[str], list[str]], page: int | None,
+    out: pathlib.Path,
+) -> dict[str, Process]:  # fmt: skip
+    """The clients by name, with ``common`` options: one pushes the ``bunch``, the other drives up to it and shows all
+    of it on the port ``page``."""
     common = ["-m", "vinesim.cli", "client", "--role", "robot", *common, "--status", "json", "--watch", str(bunch)]
     own = {
         PICKER: [*poses[0], "--push", str(bunch)],
         VISITOR: [
-            *poses[1], "--approach", str(APPROACH_DISTANCE), "--namespace", VISITOR, "--sensor-hz", VISITOR_SENSOR_HZ
+            *poses[1], "--approach", str(APPROACH_DISTANCE), "--namespace", VISITOR, "--sensor-hz", VISITOR_SENSOR_HZ,
+            *([] if page is None else ["--page", str(page)]),
         ],
     }  # fmt: skip
     clients = {}

@@ -7,6 +7,7 @@ import dataclasses
 import os
 import queue
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -150,6 +151,13 @@ class ProcessGroup:
         """Start a server on a free port of this machine; the process and its endpoint."""
         server = self.start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0")
         return server, server.next_line(START_TIMEOUT).removeprefix("listening on ")
+
+
+def free_port() -> int:
+    """A TCP port of this machine that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 @contextlib.contextmanager

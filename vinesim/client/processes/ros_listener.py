@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pathlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,12 +17,15 @@ class RosListener:
     """Subscribes to named topics as they appear. Raises :class:`ProcessFailed` if its process ends."""
 
     def __init__(
-        self, group: ProcessGroup, topics: Sequence[str], once: Sequence[str] = (), events: Sequence[str] = ()
-    ) -> None:
-        """``once``: topics that it leaves after their first message; ``events``: topics that may stay silent."""
+        self, group: ProcessGroup, topics: Sequence[str], once: Sequence[str] = (), events: Sequence[str] = (),
+        arrivals: pathlib.Path | None = None,
+    ) -> None:  # fmt: skip
+        """``once``: topics that it leaves after their first message; ``events``: topics that may stay silent;
+        ``arrivals``: file for the times of every message, see :attr:`TopicStats.arrivals`."""
         self.topics = (*topics, *once)
         words = [word for topic in (*topics, *events) for word in ("--topic", topic)]
         words += [word for topic in once for word in ("--once", topic)]
+        words += [] if arrivals is None else ["--arrivals", str(arrivals)]
         self._process: Process = group.start(
             "ROS listener", "-m", "vinesim.ros.tools.topic_monitor", "--announce", *words
         )
@@ -29,6 +33,11 @@ class RosListener:
         """Wall time at which it began to look for topics [s since the epoch]; None before."""
         self.first: dict[str, float] = {}
         """Wall time of the first message of each topic that has come [s since the epoch]."""
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.child.pid
 
     @property
     def started(self) -> float:

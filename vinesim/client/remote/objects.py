@@ -6,7 +6,7 @@ frame of what it rests on, wherever that moves, unless an actor of this client m
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Iterable
+from collections.abc import Callable, Collection, Container, Iterable
 
 import numpy as np
 
@@ -31,6 +31,9 @@ FAR_ANGLE = 0.1
 one of the two has slipped off. TUNED."""
 ACTIVATION_PERIOD = 20
 """Ticks between two activations of dormant bunches."""
+CARRIED_DISTANCE = 3.0
+"""The record of what rests on an actor is published again when it was carried so far [m]: half a cell, so that those
+who come later receive it from the cells around them."""
 ACTIVATION_BATCH = 4
 """Dormant bunches that get bodies at once: making one takes milliseconds."""
 
@@ -38,9 +41,12 @@ ACTIVATION_BATCH = 4
 class ObjectSync:
     """The state of shared objects, and of changes to trees, that one client knows; numbers are ids of :mod:`ids`."""
 
-    def __init__(self, physics: Physics, local_actors: Collection[str]) -> None:
-        """``local_actors``: the names of all actors that this client simulates."""
-        self.physics, self._local_actors = physics, local_actors
+    def __init__(
+        self, physics: Physics, local_actors: Collection[str], is_present: Callable[[str], bool] = lambda _: True
+    ) -> None:
+        """``local_actors``: the names of all actors that this client simulates; ``is_present(name)``: whether another
+        actor is in the world now."""
+        self.physics, self._local_actors, self._is_present = physics, local_actors, is_present
         self._remote_updates: dict[int, ObjectUpdate] = {}
         """Objects that remote actors move now."""
         self._resting: dict[int, RetainedRecord] = {}
@@ -95,8 +101,9 @@ class ObjectSync:
             bunches = [split_object_id(record.object)[1] for record in dormant]
             self._changed_trees.update(self._tree_of(bunch) for bunch in bunches)
             self.physics.dormant_bunches.add(
-                bunches, [record.parent for record in dormant], np.array([record.pose for record in dormant])
-            )
+                bunches, [record.parent for record in dormant], np.array([record.pose for record in dormant]),
+                np.array([record.place or record.pose for record in dormant]),
+            )  # fmt: skip
 
     def _apply_object_record(self, record: RetainedRecord, holds: bool) -> bool:
         """Put a box or a bunch where a record says; True if it is a bunch that has no body here and needs none yet."""
@@ -106,18 +113,39 @@ class ObjectSync:
         if not (holds or (bodiless and bunch not in self.physics.dormant_bunches)):
             return False
         self._remote_updates.pop(number, None)
-        if record.moving:
-            self._clear_resting(number)
-            pose = np.array(record.pose)
-            self._ensure_body(
-                number, *(self.physics.support_tracker.to_world(record.parent, pose) or (pose, np.zeros(6)))
-            )
-            self.physics.support_tracker.set_moving([number])
+        mover = record.author if record.moving else _carrier(record.parent)
+        has_left = bool(mover) and mover not in self._local_actors and not self._is_present(mover)
+        if record.moving or has_left:
+            self._let_fall(record, is_known=not has_left)
             return False
         self._set_resting(number, record)
         if not bodiless:
             self._place_on_support([number])
         return bodiless
+
+    def _let_fall(self, record: RetainedRecord, *, is_known: bool) -> None:
+        """Let a box or a bunch move from where a record says; one with a body stays where it is if that ``is_known``
+        better than from the record."""
+        number, tracker = record.object, self.physics.support_tracker
+        self._clear_resting(number)
+        known_place = np.array(record.pose if record.place is None else record.place)
+        pose, velocity = tracker.to_world(record.parent, np.array(record.pose)) or (known_place, np.zeros(6))
+        had_body = number in tracker
+        self._ensure_body(number, pose, velocity)
+        if not (had_body and is_known):
+            tracker.set_state(number, pose, velocity)
+        tracker.set_moving([number])
+
+    def carrier_left(self, name: str) -> None:
+        """An actor has left: what rested on it and has no body here gets one, and falls when the actor's copy is gone.
+
+        To be called while the copy is still there.
+        """
+        for parent in [parent for parent in self._supported if _carrier(parent) == name]:
+            has_frame = self.physics.support_tracker.support_state(parent) is not None
+            for number in sorted(self._supported[parent]):
+                if not has_frame or number not in self.physics.support_tracker:
+                    self._let_fall(self._resting[number], is_known=False)
 
     def _apply_cuts(self, record: RetainedRecord) -> None:
         """Cut off the bodies that the record of a tree names."""
@@ -192,7 +220,7 @@ class ObjectSync:
         boxes, base = self._supports(parent)
         if any(box in self._remote_updates for box in boxes):
             return True
-        return base != GROUND and base.partition("/")[0] not in self._local_actors
+        return base != GROUND and _carrier(base) not in self._local_actors
 
     def _place_on_support(self, numbers: list[int]) -> None:
         """Put objects of one parent, as far as they have bodies, where they rest in its frame."""
@@ -207,6 +235,11 @@ class ObjectSync:
             tracker.set_states(numbers, *there)
             for number, pose in zip(numbers, relative, strict=True):
                 tracker.set_at_rest(number, parent, pose)
+        elif self._is_present(_carrier(parent)):  # it has no body here yet
+            for number in numbers:
+                if (place := self._resting[number].place) is not None:
+                    tracker.set_state(number, np.array(place), np.zeros(6))
+                    tracker.set_at_rest(number, GROUND, np.array(place))
 
     def touched_blend(self, update: TreeUpdate) -> float:
         """Share for :meth:`blend_tree` of a tree that an actor of this client touches."""
@@ -243,7 +276,13 @@ class ObjectSync:
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
         """Objects that actor ``name`` detached in the last step; and those of no local actor if ``all_others``."""
         mine = [p for p in self._detachments if p.actor == name or (all_others and p.actor not in self._local_actors)]
-        return [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
+        numbers = [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
+        return [number for number in numbers if is_tree(number) or number in self.physics.support_tracker]
+
+    def forget(self, number: int) -> None:
+        """A box or free bunch has left the world."""
+        self._clear_resting(number)
+        self._remote_updates.pop(number, None)
 
     def with_trees(self, detached: Iterable[int]) -> list[int]:
         """Detached objects and the trees that they were detached from."""
@@ -273,7 +312,7 @@ class ObjectSync:
             return ""
         boxes, base = self._supports(record.parent)
         if base != GROUND:
-            return base.partition("/")[0]
+            return _carrier(base)
         resting = [self._resting[box].author for box in boxes if box in self._resting]
         return resting[-1] if resting else ""
 
@@ -326,6 +365,17 @@ class ObjectSync:
             if number in tracker
         )
 
+    def carried_on(self, name: str) -> list[int]:
+        """Objects at rest on an actor of this client whose records name a place that is far from where they are now."""
+        if self.physics.tick % ACTIVATION_PERIOD:
+            return []
+        return [
+            number
+            for number in self.supported_by(name)
+            if (place := self._resting[number].place) is not None
+            and np.hypot(*(self.read_state(number)[0][:2] - place[:2])) > CARRIED_DISTANCE
+        ]
+
     def mark_resting(self, record: RetainedRecord | None) -> None:
         """A record of an object at rest was sent: from now on it rests here as for all other clients."""
         if record is not None and not record.moving and record.object in self.physics.support_tracker:
@@ -344,3 +394,8 @@ class ObjectSync:
 
     def _tree_of(self, bunch: int) -> int:
         return int(self.physics.model.body_tree[self.physics.model.bunch_body[bunch]])
+
+
+def _carrier(parent: str) -> str:
+    """The actor that a parent frame is a link of; empty for the ground and for boxes."""
+    return "" if parse_object_name(parent) is not None else parent.partition("/")[0]

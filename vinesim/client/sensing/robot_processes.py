@@ -31,10 +31,12 @@ class RobotProcesses:
 
     def __init__(
         self, name: str, scene: Scene, model: Model, description: RobotDescription, *, namespace: str = "",
+        params_file: pathlib.Path | None = None,
         ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
         renderer: str = "warp", device: str = "cpu",
     ) -> None:  # fmt: skip
-        """``clock``: may publish /clock, as one node of a ROS domain does. For the others see
+        """``clock``: may publish /clock, as one node of a ROS domain does; ``params_file``: ROS parameters of the
+        nodes. For the others see
         :class:`SensorProcess`."""
         if ros and (reason := middleware.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
@@ -42,12 +44,14 @@ class RobotProcesses:
         with contextlib.ExitStack() as stack:
             self.sensors = stack.enter_context(
                 SensorProcess(
-                    name, scene, model, description, namespace=namespace, ros=ros, keep_pictures=keep_pictures,
-                    sensor_hz=sensor_hz, renderer=renderer, device=device,
+                    name, scene, model, description, namespace=namespace, params_file=params_file, ros=ros,
+                    keep_pictures=keep_pictures, sensor_hz=sensor_hz, renderer=renderer, device=device,
                 )
             )  # fmt: skip
             self.ros = (
-                stack.enter_context(RosProcess(name, model, description, namespace=namespace, clock=clock))
+                stack.enter_context(
+                    RosProcess(name, model, description, namespace=namespace, params_file=params_file, clock=clock)
+                )
                 if ros
                 else None
             )
@@ -113,6 +117,11 @@ class RobotProcesses:
                 ),
             ],
         )
+
+    def close_ros(self) -> None:
+        """End the ROS node; the counts of its messages are complete then."""
+        if self.ros is not None:
+            self.ros.close()
 
     def save_picture(self, folder: pathlib.Path) -> None:
         """Write the kept picture; see :meth:`SensorProcess.save_picture`."""

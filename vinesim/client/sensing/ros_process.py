@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import pathlib
 import types
 from collections.abc import Sequence
 from typing import Any, Self
@@ -37,10 +38,11 @@ class RosProcess:
     """The ROS node of one robot of the client, in a process of its own. A context: the process ends with it."""
 
     def __init__(
-        self, name: str, model: Model, description: RobotDescription, *, namespace: str = "", clock: bool = True
-    ) -> None:
+        self, name: str, model: Model, description: RobotDescription, *, namespace: str = "",
+        params_file: pathlib.Path | None = None, clock: bool = True,
+    ) -> None:  # fmt: skip
         """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock, and
-        serves simulation_interfaces."""
+        serves simulation_interfaces. ``params_file``: ROS parameters of its node."""
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
         self._sent: dict[str, int] = {}
@@ -61,7 +63,7 @@ class RosProcess:
             frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
             model.bunch_of_body(),
             description.controllers, tuple(mount.name for mount in description.imus),
-            tuple(mount.name for mount in description.wrenches),
+            tuple(mount.name for mount in description.wrenches), params_file,
         )  # fmt: skip
         self._visuals: tuple[RigidVisual, ...] | None = None
         """All rigid bodies when the list of those in the truth was made."""
@@ -75,6 +77,7 @@ class RosProcess:
         """[topic] messages of steps that found no room on the way to the process."""
         body_sensors = {*config.imus, *config.wrenches}
         self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
+        self._parameters = config.parameters
         self.worker = WorkerProcess(
             f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
             lambda context: RosChannel(config, context), self._receive,
@@ -93,6 +96,7 @@ class RosProcess:
             self.robot, self._take_commands, lambda result: self.worker.send("finish", result), client.world_time
         )
         client.pre_step.insert(0, self._control)
+        client.after_reset.append(self._begin_anew)
         if self._leads:
             self._simulation = SimulationControl(client, lambda reply: self.worker.send("simulated", reply))
             client.between_steps.append(self._simulation)
@@ -105,6 +109,12 @@ class RosProcess:
             self._is_restarted = False
             self.handler.cancel_all(time)
         self.handler(time)
+
+    def _begin_anew(self) -> None:
+        """After a reset: obey no earlier command, and publish the new robot."""
+        self._take_commands()
+        self.robot = self.client.robots[self.robot.name]
+        self.handler.begin_anew(self.robot)
 
     def _after_step(self, client: Client) -> None:
         """Pass the state to the process, as far as its topics have subscribers."""
@@ -172,6 +182,8 @@ class RosProcess:
             self._simulation.put(value)
         elif kind == "statistics":
             self._sent, self._dropped = value["sent"], value["dropped"]
+        elif kind == "parameters":
+            self._parameters.update(value)
         elif kind == "restarted":
             self._is_restarted = True
             self._sent_before.update(self._sent)
@@ -195,7 +207,7 @@ class RosProcess:
         self.worker.send("diagnose", (time, list(components)))
 
     def close(self) -> None:
-        """End the process."""
+        """End the process; its counts are complete then. A second call does nothing."""
         self.worker.close()
         self._truth_list.close()
 

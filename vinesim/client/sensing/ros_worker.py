@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import pathlib
 import queue
 import time
 from multiprocessing.connection import Connection
@@ -61,6 +62,10 @@ class RosConfig:
     controllers: tuple[ControllerSpec, ...]
     imus: tuple[str, ...]
     wrenches: tuple[str, ...]
+    params_file: pathlib.Path | None = None
+    """ROS parameters of the node."""
+    parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Values of the node's parameters that were set; the client changes it, and each run starts with it."""
 
     @property
     def step_topics(self) -> tuple[str, ...]:
@@ -113,6 +118,8 @@ class RosWorker:
             ros_name(config.name), config.urdf, namespace=config.namespace, static_transforms=config.static_transforms,
             controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
             bunch_of_body=config.bunch_of_body, base=config.base, clock=config.clock,
+            params_file=config.params_file,
+            parameters=config.parameters,
         )  # fmt: skip
         self._requests: queue.SimpleQueue[SimulationRequest] = queue.SimpleQueue()
         self.simulation = None
@@ -127,6 +134,7 @@ class RosWorker:
         self._named: tuple[int, bytes] = 0, b""
         """Version of the list of rigid bodies, and attached bunches, that :attr:`_truth_names` belong to."""
         self._next_statistics = 0.0
+        self._reported_parameters = self.node.set_parameters
 
     def run(self) -> None:
         """Publish until a "stop"."""
@@ -145,6 +153,7 @@ class RosWorker:
                 if commands := self.node.commands():
                     self.pipe.send(("commands", commands))
                 self._report()
+        self._send_statistics()  # what was sent last is counted, too
 
     def _take_requests(self) -> bool:
         """Answer the client's requests; False after a "stop"."""
@@ -182,11 +191,17 @@ class RosWorker:
         wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
         wanted["goals"][0] = self.node.has_goals
         wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
+        if (parameters := self.node.set_parameters) is not self._reported_parameters:
+            self._reported_parameters = parameters
+            self.pipe.send(("parameters", parameters))
         now = time.monotonic()
         if now >= self._next_statistics:
             self._next_statistics = now + STATISTICS_PERIOD
-            statistics: dict[str, Any] = {"sent": self.node.sent, "dropped": self.node.dropped}
-            self.pipe.send(("statistics", statistics))
+            self._send_statistics()
+
+    def _send_statistics(self) -> None:
+        statistics: dict[str, Any] = {"sent": self.node.sent, "dropped": self.node.dropped}
+        self.pipe.send(("statistics", statistics))
 
 
 def truth_frame(visual: RigidVisual) -> str:

@@ -51,6 +51,7 @@ class SensorProcess:
         description: RobotDescription,
         *,
         namespace: str = "",
+        params_file: pathlib.Path | None = None,
         ros: bool = True,
         keep_pictures: bool = False,
         sensor_hz: float | None = None,
@@ -79,9 +80,10 @@ class SensorProcess:
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
             name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer,
-            device, wind=wind_of(scene),
+            device, wind=wind_of(scene), params_file=params_file,
         )  # fmt: skip
         self._frames = tuple(config.sensor_frames.values())
+        self._parameters = config.parameters
         self.worker = WorkerProcess(
             f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
             lambda context: SensorChannel(config, context), self._receive, rehearsal=SENSOR_REHEARSAL,
@@ -102,8 +104,14 @@ class SensorProcess:
         self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
+        client.after_reset.append(self._begin_anew)
 
     # ------------------------------------------------------------------ in the loop
+
+    def _begin_anew(self) -> None:
+        """After a reset: all plants are elsewhere, and the sensors are on the new robot."""
+        self._moved_trees[:] = True
+        self.robot = self.client.robots[self.robot.name]
 
     def _after_step(self, client: Client) -> None:
         """Write the next snapshot if it is due."""
@@ -168,6 +176,8 @@ class SensorProcess:
                 log.info("the sensors of %s are not ready, awaited: %s", self.name, ", ".join(value))
         elif kind == "statistics":
             self._counts = value
+        elif kind == "parameters":
+            self._parameters.update(value)
         elif kind == "restarted":
             for what, counts in self._counts.items():
                 self._counts_before.setdefault(what, collections.Counter()).update(counts)

@@ -71,6 +71,10 @@ class SensorConfig:
     """Where they compute; the CPU from the next start on if a GPU fails."""
     wind: Wind | None = None
     """That of the scene."""
+    params_file: pathlib.Path | None = None
+    """ROS parameters of its node."""
+    parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Values of the node's parameters that were set; the client changes it, and each run starts with it."""
 
     @property
     def sensor_frames(self) -> dict[str, str]:
@@ -142,6 +146,7 @@ class SensorWorker:
         self._next_statistics = 0.0
         self._awaits("kernels and scene")
         self.node = self._open_node(stack) if config.ros else None
+        self._reported_parameters = None if self.node is None else self.node.set_parameters
         self.scheduler = self._open_sensors()
 
     def _awaits(self, *parts: str) -> None:
@@ -157,7 +162,7 @@ class SensorWorker:
             SensorNode(
                 f"{ros_name(config.name)}_sensors", namespace=config.namespace,
                 cameras=[m.name for m in description.cameras], lidars=[m.name for m in description.lidars],
-                rates=self._rates(),
+                rates=self._rates(), params_file=config.params_file, parameters=config.parameters,
             )
         )  # fmt: skip
 
@@ -242,9 +247,16 @@ class SensorWorker:
                     report_ready(self.pipe, NICENESS)
                     allocator.release_free_memory()  # takes 0.1 s, which nothing has to wait for
             self.channel.wanted["renders"][0] = any(sensor.wanted() for sensor in self.scheduler.sensors)
+            self._report_parameters()
             if time.monotonic() >= self._next_statistics:
                 self._next_statistics = time.monotonic() + STATISTICS_PERIOD
                 self.pipe.send(("statistics", self._statistics()))
+
+    def _report_parameters(self) -> None:
+        """Tell the client which parameters were set, so that a further run starts with them."""
+        if self.node is not None and (parameters := self.node.set_parameters) is not self._reported_parameters:
+            self._reported_parameters = parameters
+            self.pipe.send(("parameters", parameters))
 
     def _wait_for_snapshot(self) -> bool:
         """Whether there is a snapshot to read: a new one, or one that was skipped and whose list arrived since."""

@@ -68,6 +68,13 @@ class RosCommandHandler:
         self.controllers.cancel_all(time)
         self.controllers.take_results()
 
+    def begin_anew(self, robot: Robot) -> None:
+        """Abort all goals, and command ``robot`` from now on: the one that has taken the place of the former."""
+        self.controllers.abort_all("the simulation was reset")
+        for result in self.controllers.take_results():
+            self._finish(_goal_result(result))
+        self.robot, self.controllers = robot, ControllerManager(robot)
+
     def _apply(self, command: Command, time: float) -> None:
         controllers = self.controllers
         match command:

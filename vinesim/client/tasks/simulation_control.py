@@ -1,20 +1,24 @@
-"""Requests of ROS to a client's simulation: pause, single steps, and what is in the world."""
+"""Requests of ROS to a client's simulation: pause, single steps, reset, and what is in the world."""
 
 from __future__ import annotations
 
 import collections
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from typing import Any
 
-import numpy as np
-
-from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.client.remote.remote_human import RemoteHuman
-from vinesim.ros.commands.types import Entity, EntityCategory, SimulationAction, SimulationReply, SimulationRequest
+from vinesim.client.tasks.entities import WorldEditor
+from vinesim.ros.commands.types import (
+    EntityArguments,
+    Refusal,
+    RequestRefused,
+    SimulationAction,
+    SimulationReply,
+    SimulationRequest,
+)
 
 MAX_STEPS = 100_000
 """Steps that one request may ask for."""
-_UNKNOWN = np.full(6, np.nan)
 
 
 class SimulationControl:
@@ -25,6 +29,7 @@ class SimulationControl:
 
     def __init__(self, client: Client, reply: Callable[[SimulationReply], None]) -> None:
         self._client, self._reply = client, reply
+        self._editor = WorldEditor(client)
         self._requests: collections.deque[SimulationRequest] = collections.deque()
         self._stepping: SimulationRequest | None = None
         """A request whose steps are being simulated."""
@@ -45,53 +50,50 @@ class SimulationControl:
             self._serve(self._requests.popleft())
 
     def _serve(self, request: SimulationRequest) -> None:
-        client = self._client
-        if request.action is SimulationAction.GET_ENTITIES:
-            self._answer(request, entities=tuple(entities(client)))
-            return
-        if request.action is SimulationAction.GET_STATE:
-            self._answer(request)
-            return
-        if client.world_time.is_shared:
-            self._answer(request, "a client of a shared world cannot pause; start it without --connect")
-            return
-        if request.action is SimulationAction.STEP:
-            if client.steps_before_pause is None:
-                self._answer(request, "the simulation runs; pause it first")
-            elif not 1 <= request.steps <= MAX_STEPS:
-                self._answer(request, f"{request.steps} steps; give 1 to {MAX_STEPS}")
-            else:
-                client.steps_before_pause, self._stepping = request.steps, request
-            return
-        client.steps_before_pause = 0 if request.action is SimulationAction.PAUSE else None
-        self._answer(request)
+        try:
+            result = self._do(request)
+        except RequestRefused as error:
+            self._answer(request, refusal=str(error), kind=error.kind)
+        else:
+            if self._stepping is None:
+                self._answer(request, **result)
 
-    def _answer(self, request: SimulationRequest, refusal: str = "", entities: tuple[Entity, ...] = ()) -> None:
+    def _do(self, request: SimulationRequest) -> dict[str, Any]:
+        """Do what can be done at once; what the answer says beside time and pause."""
+        editor, arguments = self._editor, request.entity or EntityArguments("")
+        match request.action:
+            case SimulationAction.GET_ENTITIES:
+                return {"entities": tuple(editor.entities())}
+            case SimulationAction.GET_SPAWNABLES:
+                return {"spawnables": editor.spawnables}
+            case SimulationAction.SPAWN:
+                return {"name": editor.spawn(arguments)}
+            case SimulationAction.DELETE:
+                editor.delete(arguments.name)
+            case SimulationAction.SET_ENTITY_STATE:
+                editor.set_state(arguments)
+            case SimulationAction.RESET:
+                editor.reset(keep_state=request.keep_state, keep_spawned=request.keep_spawned)
+            case SimulationAction.PLAY | SimulationAction.PAUSE | SimulationAction.STEP:
+                self._play(request)
+        return {}
+
+    def _play(self, request: SimulationRequest) -> None:
+        """Play, pause, or begin to step."""
+        client = self._client
+        if client.world_time.is_shared:
+            text = "a client of a shared world cannot pause; start it without --connect"
+            raise RequestRefused(Refusal.INCORRECT_STATE, text)
+        if request.action is not SimulationAction.STEP:
+            client.steps_before_pause = 0 if request.action is SimulationAction.PAUSE else None
+        elif client.steps_before_pause is None:
+            raise RequestRefused(Refusal.INCORRECT_STATE, "the simulation runs; pause it first")
+        elif not 1 <= request.steps <= MAX_STEPS:
+            raise RequestRefused(Refusal.FAILED, f"{request.steps} steps; give 1 to {MAX_STEPS}")
+        else:
+            client.steps_before_pause, self._stepping = request.steps, request
+
+    def _answer(self, request: SimulationRequest, **values: Any) -> None:
         client = self._client
         now = client.physics.time + client.world_time.offset
-        self._reply(SimulationReply(request.number, now, client.steps_before_pause is not None, refusal, entities))
-
-
-def entities(client: Client) -> Iterator[Entity]:
-    """Robots, people, boxes and bunches as this client has them, by name as in ``tf_environment``."""
-    physics, rigid = client.physics, client.physics.rigid
-    physics.update_kinematics()
-    for name in sorted(rigid.actors):
-        if name in client.humans or isinstance(client.remote_actors.get(name), RemoteHuman):
-            pose = frames.pose(rigid.actor_position(name).astype(float))
-            yield Entity(name, EntityCategory.HUMAN, pose, _UNKNOWN)
-        else:
-            pose, velocity = rigid.base_state(name)
-            yield Entity(name, EntityCategory.ROBOT, np.array(pose, float), np.array(velocity, float))
-    shown = {visual.name: i for i, visual in enumerate(rigid.visuals())}
-    poses = rigid.visual_q()
-    for box in range(len(client.model.box_size)):
-        yield Entity(f"box_{box}", EntityCategory.DYNAMIC_OBJECT, poses[shown[f"box/{box}"]].copy(), _UNKNOWN)
-    attached = physics.state.bunch_attached
-    for bunch in range(len(attached)):
-        body = client.model.bunch_body[bunch]
-        if attached[bunch]:
-            pose, velocity = physics.state.body_q[body], physics.state.body_qd[body]
-            yield Entity(f"bunch_{bunch:05d}", EntityCategory.OBJECT, pose.astype(float), velocity.astype(float))
-        elif (row := shown.get(f"bunch/{bunch}")) is not None:
-            yield Entity(f"bunch_{bunch:05d}", EntityCategory.DYNAMIC_OBJECT, poses[row].copy(), _UNKNOWN)
+        self._reply(SimulationReply(request.number, now, client.steps_before_pause is not None, **values))

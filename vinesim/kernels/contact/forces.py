@@ -44,10 +44,10 @@ def store_warm_start(
     slip_u = velocity_along(slip_u, n + 1, geoms, rigid, contacts_out, islands, rows)
     slip_v = velocity_along(slip_v, n + 2, geoms, rigid, contacts_out, islands, rows)
     # the stretch with which spring and damper give just this friction: a contact that slides drags its anchor along
-    force_u = impulse[1] / parameters.dt + parameters.damping * slip_u
-    force_v = impulse[2] / parameters.dt + parameters.damping * slip_v
-    anchor = -force_u / parameters.stiffness * t1
-    anchor = anchor - force_v / parameters.stiffness * t2
+    force_u = impulse[1] / parameters.dt + contacts_out.damping[c] * slip_u
+    force_v = impulse[2] / parameters.dt + contacts_out.damping[c] * slip_v
+    anchor = -force_u / contacts_out.stiffness[c] * t1
+    anchor = anchor - force_v / contacts_out.stiffness[c] * t2
     warm_start_out.feature[c] = contacts_out.feature[c]
     warm_start_out.other[c] = contacts_out.other[c]
     warm_start_out.normal_impulse[c] = impulse[0]

@@ -10,8 +10,10 @@ import warp as wp
 from vinesim.kernels.contact.body_motion import to_double, velocity_at
 from vinesim.kernels.contact.structs import (
     Candidates,
+    Capsules,
     Contacts,
     Geoms,
+    MaterialPairs,
     Parameters,
     PlantBodies,
     RigidBodies,
@@ -67,19 +69,31 @@ def write_rigid_row(
 
 
 @wp.func
+def write_material_numbers(c: int, material: int, other: int, pairs: MaterialPairs, contacts_out: Contacts):
+    """Write the numbers of a contact that follow from the two materials."""
+    contacts_out.friction[c] = pairs.friction[material, other]
+    contacts_out.stiffness[c] = pairs.stiffness[material, other]
+    contacts_out.damping[c] = pairs.damping[material, other]
+    contacts_out.compliance[c] = pairs.compliance[material, other]
+
+
+@wp.func
 def write_bias(
-    c: int, parameters: Parameters, feature: int, other: int, end_gap: wp.float64, axes: wp.mat33d,
-    warm_start: WarmStart, rows_out: Rows,
-):  # fmt: skip
+    c: int, parameters: Parameters, end_gap: wp.float64, contacts: Contacts, warm_start: WarmStart, rows_out: Rows
+):
     """Write bias velocities and the guess of the impulses of one contact.
 
     The spring of an open gap does not push yet: the gap only must not close further within the step.
     """
-    share = parameters.stiffness * parameters.dt + parameters.damping
+    feature = contacts.feature[c]
+    other = contacts.other[c]
+    axes = contacts.axes[c]
+    stiffness = contacts.stiffness[c]
+    share = stiffness * parameters.dt + contacts.damping[c]
     if end_gap > wp.float64(0.0):
         rows_out.bias[3 * c] = end_gap / parameters.dt
     else:
-        rows_out.bias[3 * c] = wp.max(end_gap * parameters.stiffness / share, -parameters.max_separation_speed)
+        rows_out.bias[3 * c] = wp.max(end_gap * stiffness / share, -parameters.max_separation_speed)
     t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
     count = warm_start.count[0]
@@ -92,14 +106,16 @@ def write_bias(
             rows_out.impulse[3 * c] = warm_start.normal_impulse[k]
             rows_out.impulse[3 * c + 1] = wp.dot(t1, warm_start.friction_impulse[k])
             rows_out.impulse[3 * c + 2] = wp.dot(t2, warm_start.friction_impulse[k])
-            rows_out.bias[3 * c + 1] = wp.dot(t1, warm_start.anchor[k]) * parameters.stiffness / share
-            rows_out.bias[3 * c + 2] = wp.dot(t2, warm_start.anchor[k]) * parameters.stiffness / share
+            rows_out.bias[3 * c + 1] = wp.dot(t1, warm_start.anchor[k]) * stiffness / share
+            rows_out.bias[3 * c + 2] = wp.dot(t2, warm_start.anchor[k]) * stiffness / share
 
 
 @wp.kernel
 def write_contact_rows(
     # model
     parameters: Parameters,
+    pairs: MaterialPairs,
+    capsules: Capsules,
     geoms: Geoms,
     # in
     bodies: PlantBodies,
@@ -126,16 +142,19 @@ def write_contact_rows(
     body = contacts_out.body[c]
     lever = x - to_double(wp.transform_get_translation(bodies.q[body]))
     velocity = velocity_at(bodies.q[body], bodies.qd_free[body], x)
-    contacts_out.friction[c] = parameters.plant_friction
+    material = capsules.material[contacts_out.feature[c] // 2]
     other = contacts_out.other_body[c]
     other_lever = lever
     last_dof = int(-1)  # noqa: RUF046
     arm = lever
     if g >= 0:
-        contacts_out.friction[c] = geoms.friction[g]
+        write_material_numbers(c, material, geoms.material[g], pairs, contacts_out)
+        if geoms.friction[g] > wp.float64(0.0):
+            contacts_out.friction[c] = geoms.friction[g]
         last_dof = geoms.dof[g]
         arm = x - rigid.subtree_com[geoms.root[g]]
     else:
+        write_material_numbers(c, material, capsules.material[-1 - g], pairs, contacts_out)
         other_lever = x - to_double(wp.transform_get_translation(bodies.q[other]))
         velocity = velocity - velocity_at(bodies.q[other], bodies.qd_free[other], x)
 
@@ -153,7 +172,4 @@ def write_contact_rows(
         rows_out.velocity_free[row] = wp.dot(axis, velocity) - rigid_velocity
         rows_out.bias[row] = wp.float64(0.0)
         rows_out.impulse[row] = wp.float64(0.0)
-    write_bias(
-        c, parameters, contacts_out.feature[c], g, candidates.end_gap[tree_row, slot], contacts_out.axes[c],
-        warm_start, rows_out,
-    )  # fmt: skip
+    write_bias(c, parameters, candidates.end_gap[tree_row, slot], contacts_out, warm_start, rows_out)

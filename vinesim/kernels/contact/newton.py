@@ -18,10 +18,7 @@ SLIDING_SHARE = wp.constant(wp.float64(0.999999))
 
 
 @wp.func
-def write_block(
-    block: int, island: int, compliance: wp.float64, contacts: Contacts, islands: Islands, rows: Rows,
-    scratch_out: SolverScratch,
-):  # fmt: skip
+def write_block(block: int, island: int, contacts: Contacts, islands: Islands, rows: Rows, scratch_out: SolverScratch):
     """Write the linear system of one block: its matrix, and right-hand sides for w = 0 and for each entry of w.
 
     Sticking rows: (B + compliance) x = -velocity - bias - J_r w. Rows of open contacts: x = 0. Friction of sliding
@@ -51,7 +48,7 @@ def write_block(
             else:
                 for k in range(size):
                     scratch_out.matrix[at + k] = rows.delassus[at + k]
-                scratch_out.matrix[at + 3 * p + axis] = scratch_out.matrix[at + 3 * p + axis] + compliance
+                scratch_out.matrix[at + 3 * p + axis] = scratch_out.matrix[at + 3 * p + axis] + contacts.compliance[c]
                 scratch_out.columns[row, 0] = -rows.velocity_free[row] - rows.bias[row]
                 for k in range(dofs):
                     dof = islands.dof[islands.first_dof[island] + k]
@@ -185,7 +182,6 @@ def project_into_cones(island: int, contacts: Contacts, islands: Islands, rows_o
 @wp.func
 def newton_step(
     island: int,
-    compliance: wp.float64,
     contacts: Contacts,
     islands: Islands,
     scratch_out: SolverScratch,
@@ -195,7 +191,7 @@ def newton_step(
     first = islands.first_dof[island]
     dofs = islands.first_dof[island + 1] - first
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
-        write_block(block, island, compliance, contacts, islands, rows_out, scratch_out)
+        write_block(block, island, contacts, islands, rows_out, scratch_out)
         solve_block(block, 1 + dofs, islands, scratch_out)
     solve_rigid(island, contacts, islands, rows_out, scratch_out)
     for m in range(islands.start[island], islands.start[island + 1]):

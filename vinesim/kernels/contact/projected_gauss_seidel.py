@@ -9,7 +9,7 @@ import warp as wp
 from vinesim.kernels.contact.conjugate_gradient import follow_conjugate_direction
 from vinesim.kernels.contact.newton import newton_step
 from vinesim.kernels.contact.row_velocity import add_impulse, delassus_entry, update_rigid_velocity, velocity_along
-from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Parameters, RigidBodies, Rows, SolverScratch
+from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, RigidBodies, Rows, SolverScratch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,24 +18,22 @@ MIN_IMPULSE_SCALE = wp.constant(wp.float64(1.0e-5))
 
 
 @wp.func
-def row_residual(
-    row: int, compliance: wp.float64, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows
-):
+def row_residual(row: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows):
     """Velocity [m/s] along a row, bias and compliance included, with the impulses of its island."""
-    r = rows.velocity_free[row] + rows.bias[row] + compliance * rows.impulse[row]
+    r = rows.velocity_free[row] + rows.bias[row] + contacts.compliance[row // 3] * rows.impulse[row]
     return velocity_along(r, row, geoms, rigid, contacts, islands, rows)
 
 
 @wp.func
 def relax_contact(
-    c: int, island: int, compliance: wp.float64, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands,
-    rows_out: Rows,
-):  # fmt: skip
+    c: int, island: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows_out: Rows
+):
     """One Gauss-Seidel step of a contact, normal and then friction; returns the largest change of an impulse [N s]."""
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
+    compliance = contacts.compliance[c]
     n = 3 * c
-    r = row_residual(n, compliance, geoms, rigid, contacts, islands, rows_out)
+    r = row_residual(n, geoms, rigid, contacts, islands, rows_out)
     before = rows_out.impulse[n]
     normal = wp.max(zero, before - r / (delassus_entry(n, 0, geoms, rigid, contacts, islands, rows_out) + compliance))
     if normal != before:
@@ -44,8 +42,8 @@ def relax_contact(
 
     u = n + 1
     v = n + 2
-    ru = row_residual(u, compliance, geoms, rigid, contacts, islands, rows_out)
-    rv = row_residual(v, compliance, geoms, rigid, contacts, islands, rows_out)
+    ru = row_residual(u, geoms, rigid, contacts, islands, rows_out)
+    rv = row_residual(v, geoms, rigid, contacts, islands, rows_out)
     # the larger eigenvalue of the tangential block: the step stays inside the cone's convergence
     uu = delassus_entry(u, 1, geoms, rigid, contacts, islands, rows_out)
     vv = delassus_entry(v, 2, geoms, rigid, contacts, islands, rows_out)
@@ -90,7 +88,6 @@ def copy_impulses(
 @wp.kernel
 def solve_islands(
     # model
-    parameters: Parameters,
     max_sweeps: int,
     max_newton_steps: int,
     max_newton_contacts: int,
@@ -127,7 +124,7 @@ def solve_islands(
         largest = wp.float64(MIN_IMPULSE_SCALE)
         for m in range(first, last):
             c = islands_out.contact[m]
-            moved = relax_contact(c, island, parameters.compliance, geoms, rigid, contacts, islands_out, rows_out)
+            moved = relax_contact(c, island, geoms, rigid, contacts, islands_out, rows_out)
             change = wp.max(change, moved)
             largest = wp.max(largest, rows_out.impulse[3 * c])
         sweeps = sweeps + 1
@@ -141,5 +138,5 @@ def solve_islands(
             elif sweeps % 2 == 0:
                 if sweeps == 2:
                     copy_impulses(island, islands_out, rows_out.impulse, scratch_out.impulse_first)
-                newton_step(island, parameters.compliance, contacts, islands_out, scratch_out, rows_out)
+                newton_step(island, contacts, islands_out, scratch_out, rows_out)
     islands_out.sweeps[island] = sweeps

@@ -40,12 +40,6 @@ class Parameters:
 
     dt: wp.float64
     """[s]"""
-    stiffness: wp.float64
-    """[N/m]"""
-    damping: wp.float64
-    """[N s/m]"""
-    compliance: wp.float64
-    """[m/(N s^2)] 1 / (dt (stiffness dt + damping)), on the diagonal of the Delassus matrix."""
     margin: wp.float64
     """[m] Contacts with movable geoms exist from this gap on."""
     static_margin: wp.float64
@@ -54,8 +48,20 @@ class Parameters:
     """[m/s]"""
     impact_speed: wp.float64
     """[m/s] A contact that closes faster is an impact."""
-    plant_friction: wp.float64
-    """[1] Coulomb coefficient between plants."""
+
+
+@wp.struct
+class MaterialPairs:
+    """The same by the two materials in contact [material, material], symmetric."""
+
+    friction: wp.array2d(dtype=wp.float64)
+    """[1] Coulomb coefficient."""
+    stiffness: wp.array2d(dtype=wp.float64)
+    """[N/m] normal, and as the anchor of friction tangential."""
+    damping: wp.array2d(dtype=wp.float64)
+    """[N s/m]"""
+    compliance: wp.array2d(dtype=wp.float64)
+    """[m/(N s^2)] 1 / (dt (stiffness dt + damping)), on the diagonal of the Delassus matrix."""
 
 
 @wp.struct
@@ -118,6 +124,8 @@ class Capsules:
     local_end: wp.array(dtype=wp.vec3)
     radius: wp.array(dtype=float)
     """[capsule] m"""
+    material: wp.array(dtype=wp.int32)
+    """[capsule] Material"""
     extent: wp.array(dtype=float)
     """[capsule] m, farthest point from the body's origin."""
     rest_start: wp.array(dtype=wp.vec3)
@@ -179,7 +187,10 @@ class Geoms:
     """[m] half edges of its box, in its own axes."""
     radius: wp.array(dtype=wp.float64)
     """[m] of its bounding sphere."""
+    material: wp.array(dtype=wp.int32)
+    """Material"""
     friction: wp.array(dtype=wp.float64)
+    """[1] its own coefficient, whatever it touches; 0: that of the two materials."""
     is_remote: wp.array(dtype=wp.bool)
     """whether it belongs to the copy of another client's robot or person: that touches remote trees only."""
 
@@ -327,6 +338,12 @@ class Contacts:
     other_slot: wp.array(dtype=wp.int32)
     gap: wp.array(dtype=wp.float64)
     friction: wp.array(dtype=wp.float64)
+    stiffness: wp.array(dtype=wp.float64)
+    """[N/m]"""
+    damping: wp.array(dtype=wp.float64)
+    """[N s/m]"""
+    compliance: wp.array(dtype=wp.float64)
+    """[m/(N s^2)] see :class:`MaterialPairs`."""
     point: wp.array(dtype=wp.vec3d)
     axes: wp.array(dtype=wp.mat33d)
     """rows: normal, first and second tangent."""

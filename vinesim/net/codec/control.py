@@ -101,6 +101,8 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """State of the tree as a message of one tree (:func:`vinesim.net.codec.trees.encode_trees`)."""
     moving: bool = False
     """The object was falling or carried when this was published; states follow for clients nearby."""
+    place: tuple[float, float, float, float, float, float, float] | None = None
+    """On a link of an actor: pose in the world [m, 1] when this was published, for those who come when it has left."""
 
     @property
     def claim(self) -> Claim:
@@ -211,12 +213,11 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
         check_object_id(record.object, counts)
         if not (0 <= record.ownership < 1 << 16 and 0 <= record.authority < 1 << 16 and is_valid_name(record.author)):
             raise MessageError(f"record by {record.author[:60]!r} with claim ({record.ownership}, {record.authority})")
-        if not all(-MAX_COORDINATE < number < MAX_COORDINATE for number in record.pose):
-            raise MessageError(f"record of object {record.object} at {record.pose}, not finite or too far away")
-        if not 0.95 < math.hypot(*record.pose[3:]) < 1.05:
-            raise MessageError(
-                f"record of object {record.object} with orientation {record.pose[3:]}, no unit quaternion"
-            )
+        for pose in (record.pose, record.place or record.pose):
+            if not all(-MAX_COORDINATE < number < MAX_COORDINATE for number in pose):
+                raise MessageError(f"record of object {record.object} at {pose}, not finite or too far away")
+            if not 0.95 < math.hypot(*pose[3:]) < 1.05:
+                raise MessageError(f"record of object {record.object} with orientation {pose[3:]}, no unit quaternion")
         if len(record.parent) > 200 or len(record.cut) > MAX_BODIES or any(body < 0 for body in record.cut):
             raise MessageError(f"record of object {record.object} with an impossible parent or list of cut bodies")
     return records

@@ -57,6 +57,8 @@ class Ownership:
         self.name = name
         self._live = live
         self._known: collections.defaultdict[int, ObjectRecord] = collections.defaultdict(ObjectRecord)
+        self.siblings: tuple[Ownership, ...] = ()
+        """Of the other actors of the same client: what they own is not heard from them, but seen here."""
         self.owned: set[int] = set()
         self.remote: set[int] = set()
         self._losing_claims: list[tuple[int, Claim]] = []
@@ -77,6 +79,8 @@ class Ownership:
 
     def owner(self, object_id: int) -> str | None:
         """Name of the live actor that owns an object now (perhaps the own one), or None."""
+        if object_id not in self.owned and (sibling := self._owning_sibling(object_id)) is not None:
+            return sibling.name
         if object_id not in self._known:
             return None
         known = self._known[object_id]
@@ -85,10 +89,15 @@ class Ownership:
             return owner
         return owner if owner in self._live and not known.silent else None
 
+    def _owning_sibling(self, object_id: int) -> Ownership | None:
+        """The other actor of the same client that owns an object now."""
+        return next((sibling for sibling in self.siblings if object_id in sibling.owned), None)
+
     # ------------------------------------------------------------ what I do
 
     def touch(self, object_id: int) -> None:
         """Claim an object by contact, unless its live owner is in contact with it, too."""
+        self._merge_sibling(object_id)
         known = self._known[object_id]
         claim = authority.claim_by_touch(known.claim, self.name, self.owner(object_id) is not None and known.touching)
         if claim is not known.claim:
@@ -96,16 +105,27 @@ class Ownership:
 
     def grab(self, object_id: int) -> None:
         """Claim an object by grabbing, picking or cutting it, whatever its owner."""
+        self._merge_sibling(object_id)
         self._take(object_id, authority.claim_by_grab(self.claim(object_id), self.name))
 
     def take_over(self, object_id: int) -> None:
         """Claim an object that has no live owner."""
         self._take(object_id, authority.claim_by_touch(self.claim(object_id), self.name, False))
 
+    def _merge_sibling(self, object_id: int) -> None:
+        """Hold the claim of the other actor of the same client that owns an object, unless a greater is known."""
+        sibling = None if object_id in self.owned else self._owning_sibling(object_id)
+        if sibling is not None and not authority.wins(self.claim(object_id), sibling.claim(object_id)):
+            self._adopt(object_id, sibling.claim(object_id), sibling[object_id].touching)
+
     def _take(self, object_id: int, claim: Claim) -> None:
         known = self._known[object_id]
         if object_id not in self.owned or known.announced:
             known.previous = known.claim
+        if (sibling := self._owning_sibling(object_id)) is not None:
+            theirs = sibling[object_id]
+            known.previous = theirs.claim if theirs.announced else theirs.previous
+            sibling._adopt(object_id, claim, True)
         known.claim, known.touching, known.announced, known.silent = claim, True, False, False
         known.listener_count = known.near_listener_count = 0
         self.owned.add(object_id)
@@ -192,7 +212,7 @@ class Ownership:
             known = self._known[object_id]
             recent = not known.silent and time - known.received_at < OWNER_TIMEOUT
             known.silent = True
-            if recent and successor(object_id) == self.name:
+            if recent and self._owning_sibling(object_id) is None and successor(object_id) == self.name:
                 self.take_over(object_id)
 
     def shift_time(self, step: float) -> None:

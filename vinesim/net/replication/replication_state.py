@@ -38,6 +38,8 @@ class ReplicationState:
         self.wrench_sync = WrenchSync(bus, hello.name, self.counters, hand_force)
         self.coupling_sync = CouplingSync(bus, hello.name, model, self.counters)
         self.ownership = Ownership(hello.name, self.peers.known)
+        self.siblings: tuple[ReplicationState, ...] = ()
+        """Of the other actors of the same client."""
         self.retained = RetainedSync(bus, self.counters)
         self.tree_stream = TreeStream(model)
         self.object_stream = ObjectStream()
@@ -61,8 +63,9 @@ class ReplicationState:
         """Positions [3] m of all actors that can own objects: all but spectators."""
         known, positions = self.peers.known, self.peers.positions()
         positions = {name: place for name, place in positions.items() if known[name].hello.kind != SPECTATOR}
-        if self.cells.centre is not None and not self.is_spectator:
-            positions[self.hello.name] = self.cells.position
+        for state in (self, *self.siblings):
+            if state.cells.centre is not None and not state.is_spectator:
+                positions[state.hello.name] = state.cells.position
         return positions
 
     def successor_of(self, object_id: int) -> str:

@@ -69,18 +69,21 @@ class Replicator:
         """Interest radius [m]."""
         return self._state.cells.interest_radius
 
-    @property
-    def local_actors(self) -> set[str]:
-        """Other actors of the same client: they share its simulation, so nothing is exchanged with them."""
-        return self._state.peers.local_actors
-
-    @local_actors.setter
-    def local_actors(self, names: set[str]) -> None:
-        self._state.peers.local_actors = set(names)
+    def share_client(self, siblings: Iterable[Replicator]) -> None:
+        """The other actors of the same client: they share its simulation, so nothing is exchanged with them, and of
+        what they own nothing is taken over."""
+        states = tuple(sibling._state for sibling in siblings)
+        self._state.siblings = states
+        self._state.ownership.siblings = tuple(state.ownership for state in states)
+        self._state.peers.local_actors = {state.hello.name for state in states}
 
     def owner(self, object_id: int) -> str | None:
         """Name of the live actor that owns an object now (perhaps this one), or None."""
         return self._state.ownership.owner(object_id)
+
+    def is_present(self, name: str) -> bool:
+        """Whether an actor is in this world now, as a peer or before its hello has arrived."""
+        return self._state.peers.may_join(name)
 
     def claim(self, object_id: int) -> Claim:
         """The greatest claim on an object that was made or received."""
@@ -142,6 +145,7 @@ class Replicator:
         wrenches: dict[str, dict[str, np.ndarray]] | None = None,
         has_body: Callable[[int], bool] = lambda _: True,
         couplings: Iterable[Coupling] = (),
+        carried_on: Iterable[int] = (),
     ) -> list[TreeUpdate]:
         """Publish one step; return the states of trees at rest that left, as all copies hold them.
 
@@ -157,6 +161,8 @@ class Replicator:
         ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
         ``wrenches``: wrench [6] of this actor's hands on other clients' robots in this step, by robot and link.
         ``couplings``: of this actor's contacts with trees; sent if other actors touch them, too.
+        ``carried_on``: objects at rest on this actor that it has carried on so far that their records are published
+        again, with the place where they are now.
         """
         state = self._state
         self._follow_clock()
@@ -167,13 +173,13 @@ class Replicator:
             state.counters.force.count_out(payload)
         for payload in state.coupling_sync.publish(self._by_partner(couplings, now), now, time):
             state.counters.force.count_out(payload)
-        touched, moving, grabbed, detached = (
-            {int(object_id) for object_id in ids} for ids in (touched, moving, grabbed, detached)
+        touched, moving, grabbed, detached, carried_on = (
+            {int(object_id) for object_id in ids} for ids in (touched, moving, grabbed, detached, carried_on)
         )
         return self._sender.send(
             LocalStep(
                 now, time, touched, moving, grabbed, detached, read, detached_roots, pose_on_support, is_changed,
-                has_body,
+                has_body, carried_on,
             )
         )  # fmt: skip
 

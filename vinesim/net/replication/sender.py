@@ -27,7 +27,7 @@ from vinesim.net.replication.streams import (
     with_roots,
 )
 from vinesim.net.transport.bus import Publisher
-from vinesim.scene.ids import is_tree
+from vinesim.scene.ids import is_tree, parse_object_name
 from vinesim.scene.values import TreeUpdate
 
 ADOPTION_DELAY = 0.5
@@ -55,6 +55,7 @@ class LocalStep:
     pose_on_support: Callable[[int], tuple[str, np.ndarray]] | None
     is_changed: Callable[[int], bool]
     has_body: Callable[[int], bool]
+    carried_on: set[int]
 
 
 class Sender:
@@ -75,6 +76,9 @@ class Sender:
             state.ownership.touch(object_id)
         if step.moving or self._orphans:
             self._adopt_orphans(step.moving - touched, step)
+        for object_id in sorted(step.carried_on):
+            if state.ownership.owner(object_id) is None:
+                state.ownership.take_over(object_id)
         self._update_interest(step.now)
         owned = state.ownership.owned
         active = tuple(sorted(owned & (touched | step.moving)))
@@ -275,10 +279,12 @@ class Sender:
         state.object_stream.positions((object_id,), step.read)
         parent, pose = step.pose_on_support(object_id)
         state.ownership[object_id].announced = True
-        state.retained.publish(
-            state.object_stream.cells((object_id,))[0],
-            RetainedRecord(object_id, claim.ownership, claim.authority, state.hello.name, _within_range(pose), parent),
+        record = RetainedRecord(
+            object_id, claim.ownership, claim.authority, state.hello.name, _within_range(pose), parent
         )
+        if parent and parse_object_name(parent) is None:
+            record = msgspec.structs.replace(record, place=_within_range(step.read(object_id)[0]))
+        state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_detachment(self, object_id: int, step: LocalStep) -> None:
         """Publish, to everyone, that an object has left its plant and moves."""

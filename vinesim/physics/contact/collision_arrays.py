@@ -17,19 +17,30 @@ from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.berry_clusters import spans
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import FIRST_FIXED_GEOM
+from vinesim.scene.materials import pair_table
 from vinesim.scene.model import Model
 
 
 def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
     """The numbers of the contact model as a Warp struct."""
     made = structs.Parameters()
-    stiffness, damping = p.contact_stiffness, p.contact_damping_time * p.contact_stiffness
-    made.dt, made.stiffness, made.damping = p.dt, stiffness, damping
-    made.compliance = 1.0 / (p.dt * (stiffness * p.dt + damping))
+    made.dt = p.dt
     made.margin, made.static_margin = p.contact_margin, p.static_contact_margin
     made.max_separation_speed, made.impact_speed = p.max_separation_speed, p.impact_speed
-    made.plant_friction = p.friction
     return made
+
+
+def material_pairs(p: PhysicsParameters) -> SharedArrays:
+    """Friction, stiffness and damping of contacts by their two materials, as the kernels see them."""
+    stiffness = pair_table("stiffness", p.contact_stiffness)
+    damping = p.contact_damping_time * stiffness
+    return SharedArrays(
+        structs.MaterialPairs,
+        friction=pair_table("friction", p.friction),
+        stiffness=stiffness,
+        damping=damping,
+        compliance=1.0 / (p.dt * (stiffness * p.dt + damping)),
+    )
 
 
 class PlantArrays:
@@ -72,6 +83,7 @@ class PlantArrays:
             local_start=capsules.start,
             local_end=capsules.end,
             radius=capsules.radius,
+            material=capsules.material,
             extent=(ends + capsules.radius).astype(np.float32),
             rest_start=rest_start,
             rest_end=rest_end,

@@ -40,8 +40,10 @@ class RigidGeoms:
     """[geom, 3] m, centre of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray
     """[geom] of the bounding sphere about the middle."""
+    material: np.ndarray
+    """[geom] :class:`Material`"""
     friction: np.ndarray
-    """[geom] Coulomb coefficient."""
+    """[geom] Coulomb coefficient of its own; 0: that of the two materials in contact."""
     dof: np.ndarray
     """[geom] last degree of freedom that moves it (-1: none); its ancestors follow ``dof_parentid``."""
     root: np.ndarray
@@ -98,7 +100,8 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
         half=half,
         center=center,
         radius=radius,
-        friction=m.geom_friction[ids, 0].copy(),
+        material=m.geom_user[ids, 0].astype(np.int32),
+        friction=np.where(m.geom_user[ids, 1] > 0.0, m.geom_friction[ids, 0], 0.0),
         dof=last.astype(np.int32)[body],
         root=m.body_rootid[body].astype(np.int32),
         actor=tuple(actor for actor, _ in names),

@@ -13,7 +13,7 @@ import warp as wp
 
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
 from vinesim.kernels.launch import bind_launch
-from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
+from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
 from vinesim.physics.contact.detection import ContactDetection
 from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
@@ -39,6 +39,7 @@ class ImpulseSolver:
     ) -> None:
         self.plants, self.rigid, self.arrays, self.parameters = plants, rigid, arrays, parameters
         self._kernel_parameters = kernel_parameters
+        self._pairs = material_pairs(parameters)
         n = self.capacity = parameters.contact_capacity
         self.contacts = SharedArrays.zeros(structs.Contacts, n)
         self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
@@ -183,7 +184,7 @@ class ImpulseSolver:
         )
         self._write_contact_rows = bind_launch(
             jacobians.write_contact_rows,
-            [parameters, geoms, bodies, rigid_bodies, candidates, warm_start],
+            [parameters, self._pairs.struct, capsules, geoms, bodies, rigid_bodies, candidates, warm_start],
             [contacts, rows],
         )
         self._inverse_mass_times_jacobian = bind_launch(
@@ -194,7 +195,7 @@ class ImpulseSolver:
         self._assemble_delassus = bind_launch(delassus.assemble_delassus, [contacts, touched, groups], [rows])
         self._solve_islands = bind_launch(
             projected_gauss_seidel.solve_islands,
-            [parameters, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms,
+            [p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms,
              rigid_bodies, contacts],
             [groups, self.scratch.struct, rows],
         )  # fmt: skip

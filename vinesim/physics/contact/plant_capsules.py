@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
+from vinesim.scene.materials import materials_of_organs
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -32,6 +33,8 @@ class PlantCapsules:
     """[capsule, 3] m"""
     radius: np.ndarray
     """[capsule] m"""
+    material: np.ndarray
+    """[capsule] :class:`Material`"""
 
 
 def plant_capsules(model: Model) -> PlantCapsules:
@@ -70,6 +73,7 @@ def plant_capsules(model: Model) -> PlantCapsules:
         start=start.astype(np.float32)[:, None] * along,
         end=end.astype(np.float32)[:, None] * along,
         radius=radius.astype(np.float32),
+        material=materials_of_organs(model.body_organ[body.astype(np.int32)]),
     )
 
 

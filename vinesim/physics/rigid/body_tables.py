@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -14,12 +14,11 @@ from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
-from vinesim.scene.model import Model
-from vinesim.scene.values import RigidVisual
+from vinesim.scene.values import RigidBox, RigidVisual
 
 
 def list_visuals(
-    model: Model,
+    boxes: Mapping[int, RigidBox],
     names: WorldNames,
     robots: Mapping[str, RobotBody],
     humans: Mapping[str, HumanBody],
@@ -30,10 +29,11 @@ def list_visuals(
     ``bunches`` gives the shapes and the MuJoCo body of every free bunch.
     """
     visuals, bodies = [], []
-    for box, size in enumerate(model.box_size):
-        length, width, height = map(float, size)
-        visuals.append(RigidVisual(f"box/{box}", Organ.BOX, box, appearance.crate_shapes((length, width, height), box)))
-        bodies.append(names.body[f"box/{box}"])
+    for number, box in boxes.items():
+        length, width, height = map(float, box.size)
+        shapes = appearance.crate_shapes((length, width, height), number)
+        visuals.append(RigidVisual(f"box/{number}", Organ.BOX, number, shapes))
+        bodies.append(names.body[f"box/{number}"])
     for name, robot in robots.items():
         for link, shapes in robot.shapes.items():
             if shapes:
@@ -52,14 +52,14 @@ def list_visuals(
 
 
 def list_owners(
-    model: Model,
+    boxes: Collection[int],
     names: WorldNames,
     robots: Mapping[str, RobotBody],
     humans: Mapping[str, HumanBody],
     bunch_body: Mapping[int, int],
 ) -> dict[int, tuple[str, str]]:
     """By MuJoCo body: actor and link of everything that can be added, removed or moved."""
-    owners = {names.body[f"box/{i}"]: (f"box/{i}", "box") for i in range(len(model.box_size))}
+    owners = {names.body[f"box/{i}"]: (f"box/{i}", "box") for i in boxes}
     actors: dict[str, RobotBody | HumanBody] = {**robots, **humans}
     for name, actor in actors.items():
         owners.update({body: (name, link) for link, body in actor.bodies.items()})

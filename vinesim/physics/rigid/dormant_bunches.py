@@ -29,9 +29,11 @@ class DormantBunches:
         self._bunches: dict[int, FreeBunch] = {}
         self._support: dict[int, str] = {}
         self._relative: dict[int, np.ndarray] = {}
+        self._place: dict[int, np.ndarray] = {}
+        """Poses [7] in the world, for those whose support does not exist."""
         self._visuals: tuple[RigidVisual, ...] | None = ()
-        self._groups: list[tuple[str, np.ndarray, np.ndarray]] = []
-        """By support: its name, rows of :meth:`visuals` and poses [k, 7] in its frame."""
+        self._groups: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []
+        """By support: its name, rows of :meth:`visuals`, poses [k, 7] in its frame and in the world without it."""
         capsules = contact_solver.capsules
         of_bunches = np.flatnonzero(
             (plants.model.body_organ[capsules.body] == int(Organ.BUNCH)) & (capsules.level != 2)
@@ -45,8 +47,9 @@ class DormantBunches:
     def __len__(self) -> int:
         return len(self._bunches)
 
-    def add(self, bunches: list[int], supports: list[str], poses: np.ndarray) -> None:
-        """Add picked bunches, or move them: ``poses`` [k, 7] in the frames of their ``supports`` (names).
+    def add(self, bunches: list[int], supports: list[str], poses: np.ndarray, places: np.ndarray | None = None) -> None:
+        """Add picked bunches, or move them: ``poses`` [k, 7] in the frames of their ``supports`` (names), ``places``
+        [k, 7] in the world as long as the support does not exist (None: ``poses``).
 
         Bunches that still hang are taken off their vines without waking these.
         """
@@ -68,8 +71,10 @@ class DormantBunches:
             plants.body_drag[bodies] = 0.0
             for body in bodies.tolist():
                 plants.set_mass(body, STUB_MASS)
-        for bunch, support, pose in zip(bunches, supports, poses, strict=True):
+        places = poses if places is None else places
+        for bunch, support, pose, place in zip(bunches, supports, poses, places, strict=True):
             self._support[bunch], self._relative[bunch] = support, np.asarray(pose, float)
+            self._place[bunch] = np.asarray(place, float)
         self._visuals = None
 
     def activate(self, bunches: list[int]) -> None:
@@ -78,13 +83,13 @@ class DormantBunches:
             states = {bunch: self._world_state(bunch) for bunch in bunches}
             self.rigid.add_bunches({bunch: (self._bunches.pop(bunch), *states[bunch]) for bunch in bunches})
             for bunch in bunches:
-                del self._support[bunch], self._relative[bunch]
+                del self._support[bunch], self._relative[bunch], self._place[bunch]
             self._visuals = None
 
     def _world_state(self, bunch: int) -> tuple[np.ndarray, np.ndarray]:
         """World pose [7] and velocity [6]."""
         state = self.supports.to_world(self._support[bunch], self._relative[bunch])
-        return (self._relative[bunch], np.zeros(6)) if state is None else state
+        return (self._place[bunch], np.zeros(6)) if state is None else state
 
     def nearest(self, actors: np.ndarray, most: int) -> list[int]:
         """At most ``most`` bunches within ``dormant_radius`` of one of the ``actors`` [k, 3] m, the nearest first."""
@@ -102,13 +107,14 @@ class DormantBunches:
             supports = np.array([self._support[i] for i in order])
             poses = np.array([self._relative[i] for i in order]).reshape(-1, 7)
             rows_on = [(str(support), np.flatnonzero(supports == support)) for support in np.unique(supports)]
-            self._groups = [(support, rows, poses[rows]) for support, rows in rows_on]
+            places = np.array([self._place[i] for i in order]).reshape(-1, 7)
+            self._groups = [(support, rows, poses[rows], places[rows]) for support, rows in rows_on]
         return self._visuals
 
     def visual_q(self) -> np.ndarray:
         """World poses [visual, 7] of :meth:`visuals`."""
         pose = np.zeros((len(self.visuals()), 7))
-        for support, rows, relative in self._groups:
+        for support, rows, relative, place in self._groups:
             frame = self.supports.support_state(support)
-            pose[rows] = relative if frame is None else frames.compose(frame[0], relative)
+            pose[rows] = place if frame is None else frames.compose(frame[0], relative)
         return pose

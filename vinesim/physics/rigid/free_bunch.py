@@ -14,7 +14,8 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid.static_world import ALL_BITS, CRATE_FLOOR, FREE_BUNCH, contact_friction
+from vinesim.physics.rigid.static_world import ALL_BITS, CRATE_FLOOR, FREE_BUNCH, contact_friction, geom_user
+from vinesim.scene.materials import Material
 from vinesim.scene.values import Shape
 
 MAX_GEOMS = 12
@@ -85,7 +86,7 @@ def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
     for _ in range(MAX_GEOMS):
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0.05, 0.0, 0.0], mass=0.0, contype=FREE_BUNCH,
-            conaffinity=ALL_BITS & ~CRATE_FLOOR,
+            conaffinity=ALL_BITS & ~CRATE_FLOOR, userdata=geom_user(Material.BERRY),
         )  # fmt: skip  # with collision bits, or MuJoCo makes no bounding volumes
 
 

@@ -24,7 +24,8 @@ from vinesim.physics.rigid.human_posture import PostureSolver
 from vinesim.physics.rigid.human_shapes import BODY_PARTS, SIDES, body_shapes, hand_shapes
 from vinesim.physics.rigid.passing_parts import HEAVY_PART_MASS, PassingParts
 from vinesim.physics.rigid.recompile import WorldNames
-from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROBOTS, contact_friction
+from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROBOTS, contact_friction, geom_user
+from vinesim.scene.materials import Material
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
 
 KINEMATIC_MASS = HEAVY_PART_MASS
@@ -142,7 +143,7 @@ class HumanBody:
                 ipos=np.zeros(3), inertia=[KINEMATIC_MASS] * 3, explicitinertial=True, gravcomp=1.0, sleep=never,
             )  # fmt: skip
             body.add_freejoint(name=f"{name}/{part}")
-            _add_geom(body, shape, (me, meets & ~GROUND), p.friction)
+            _add_geom(body, shape, (me, meets & ~GROUND), p.friction, Material.UNKNOWN)
         for hand in self.hands:
             hand.collision_bits = (REMOTE_HAND, meets & ~ROBOTS) if self.is_remote else (me, meets)
             at = self.controller_pose(hand)
@@ -152,7 +153,7 @@ class HumanBody:
             )  # fmt: skip
             body.add_freejoint(name=f"{name}/{hand.link}")
             for shape in hand_shapes(hand.side):
-                _add_geom(body, shape, hand.collision_bits, p.friction)
+                _add_geom(body, shape, hand.collision_bits, p.friction, Material.HAND)
             spec.add_equality(
                 name=f"{name}/{hand.link}", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY,
                 name1=f"{name}/{hand.link}", active=False, solref=[0.02, 1.0], solimp=_SOLIMP,
@@ -238,10 +239,11 @@ class HumanBody:
         d.qpos[self._part_q[:, 3:]] = frames.to_wxyz(parts[:, 3:])
 
 
-def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], friction: float) -> None:
+def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], friction: float, material: Material) -> None:
     """Add a collision shape; ``bits``: contype and conaffinity."""
     size = [*shape.size, 0.0, 0.0][:3]
     body.add_geom(
         type=_KINDS[shape.kind], size=size, pos=shape.pose[:3], quat=frames.to_wxyz(shape.pose[3:]), mass=0.0,
         contype=bits[0], conaffinity=bits[1], friction=contact_friction(friction), priority=1, solimp=_SOLIMP,
+        userdata=geom_user(material),
     )  # fmt: skip

@@ -26,6 +26,7 @@ from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_posture import VISUAL_PARTS
 from vinesim.physics.rigid.link_sensors import LinkSensors
+from vinesim.physics.rigid.pair_friction import PairFriction
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.scene.model import Model
@@ -40,6 +41,8 @@ class CompiledWorld:
 
     robots: tuple[RobotBody, ...]
     humans: tuple[HumanBody, ...]
+    boxes: tuple[int, ...]
+    """Numbers of the boxes in it."""
     bunch_slots: int
     """Number of free bunches that it has bodies for."""
     mj_model: mujoco.MjModel
@@ -66,6 +69,7 @@ class WorldCore:
         self.model, self.parameters = model, parameters
         self._robots: dict[str, RobotBody] = {}
         self._humans: dict[str, HumanBody] = {}
+        self._boxes = static_world.boxes_of(model)
         self._free_bunches: dict[int, FreeBunch] = {}
         self._bunch_slot: dict[int, int] = {}
         """By free bunch: the number of its body in the pool."""
@@ -84,6 +88,7 @@ class WorldCore:
         self.owners: dict[int, tuple[str, str]] = {}
         """Actor and link of every MuJoCo body that can be added, removed or moved, as in :class:`RigidGeoms`."""
         self._link_sensors = LinkSensors()
+        self._pair_friction = PairFriction(parameters)
         _log_mujoco_warnings()
         self._recompile()
 
@@ -103,6 +108,11 @@ class WorldCore:
     def humans(self) -> tuple[str, ...]:
         """Names in the order in which they joined."""
         return tuple(self._humans)
+
+    @property
+    def boxes(self) -> tuple[int, ...]:
+        """Numbers of the boxes that are here, in the order in which they came."""
+        return tuple(self._boxes)
 
     @property
     def free_bunches(self) -> tuple[int, ...]:
@@ -193,7 +203,7 @@ class WorldCore:
         slots = max(slot_of.values(), default=-1) + 1 + self.parameters.bunch_pool_size
         bunches = {bunch: (slot_of[bunch], body) for bunch, body in bodies.items() if bunch in slot_of}
         with self._compile_lock:
-            spec = self._static_spec.copy()
+            spec, boxes = self._static_spec.copy(), self.boxes
             for robot in robots:
                 robot.add_to(spec)
             for human in humans:
@@ -208,7 +218,9 @@ class WorldCore:
             free_bunch.disable_collision(mj_model, slot)
         for slot, body in bunches.values():
             free_bunch.activate(mj_model, slot, body, self._derive(body))
-        return CompiledWorld(robots, humans, slots, mj_model, WorldNames.of(mj_model), bunches, hull_arrays(mj_model))
+        return CompiledWorld(
+            robots, humans, boxes, slots, mj_model, WorldNames.of(mj_model), bunches, hull_arrays(mj_model)
+        )
 
     def _derive(self, body: FreeBunch) -> mujoco.MjModel:
         """Constants of a free bunch; ``ValueError`` if it has too many shapes or none."""
@@ -245,6 +257,7 @@ class WorldCore:
         for actor in (*self._robots.values(), *self._humans.values()):
             actor.find_indices(m, self._names)
         self._link_sensors.find_indices(m, self._robots)
+        self._pair_friction.find_materials(m)
         for human in self._humans.values():
             for hand in human.hands:
                 self._restore_grasp(hand)
@@ -268,11 +281,11 @@ class WorldCore:
         m = self.mj_model
         bunch_body = {i: self._names.body[free_bunch.slot_name(slot)] for i, slot in self._bunch_slot.items()}
         bunches = {i: (body, bunch_body[i]) for i, body in self._free_bunches.items()}
-        self._visuals, self._visual_body = list_visuals(self.model, self._names, self._robots, self._humans, bunches)
+        self._visuals, self._visual_body = list_visuals(self._boxes, self._names, self._robots, self._humans, bunches)
         self._visual_row = np.zeros(m.nbody, int)
         own = self._visual_body > 0
         self._visual_row[self._visual_body[own]] = np.flatnonzero(own)
-        self.owners = list_owners(self.model, self._names, self._robots, self._humans, bunch_body)
+        self.owners = list_owners(self._boxes, self._names, self._robots, self._humans, bunch_body)
         self._owned_geoms = collision_geoms.owned_geoms(m, self.owners)
         self._update_geoms()
 

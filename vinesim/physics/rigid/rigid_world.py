@@ -22,6 +22,7 @@ from vinesim.physics.rigid import free_bunch, mujoco_sleep, recompile, static_wo
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
 from vinesim.physics.rigid.mujoco_world import CompiledWorld
+from vinesim.physics.rigid.rigid_world_boxes import BoxAccess
 from vinesim.physics.rigid.rigid_world_bunches import BunchAccess
 from vinesim.physics.rigid.rigid_world_humans import HumanAccess
 from vinesim.physics.rigid.rigid_world_robots import RobotAccess
@@ -37,7 +38,7 @@ MAX_RATE = 1e4
 """[m/s, rad/s] No body moves as fast, unless the simulation has become unstable."""
 
 
-class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
+class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
     """Robots, people, crates, free bunches and static geoms in one MuJoCo world, and their step."""
 
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
@@ -115,7 +116,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         """Use a world that was compiled with more or fewer actors, with other shapes of robots, or with more room for
         free bunches; between steps.
 
-        False, and nothing is changed, if other actors joined or left meanwhile: compile it anew.
+        False, and nothing is changed, if other actors or boxes came or went meanwhile: compile it anew.
         """
         present = tuple(
             actor for actor in (*self._robots.values(), *self._humans.values()) if actor not in compiled.removed
@@ -132,7 +133,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
             for actor in planned
             if actor in replaced or actor not in added
         ]
-        stays = tuple(kept) == present
+        stays = tuple(kept) == present and compiled.boxes == self.boxes
         if not stays or compiled.bunch_slots <= max(self._bunch_slot.values(), default=-1):
             return False
         for new, old in replaced.items():
@@ -173,6 +174,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         self._valid_qpos[:] = d.qpos
         # qfrc_applied is still that of the last step: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
+        self._pair_friction.apply(m, d)
         d.qfrc_applied[:] = 0.0
         # the whole forward pass after the velocity stage: single calls of its parts leave out dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
@@ -244,6 +246,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess):
         for robot in self._robots.values():
             robot.find_indices(mj_model, self._names)
         self._link_sensors.find_indices(mj_model, self._robots)
+        self._pair_friction.find_materials(mj_model)
 
     def _stop_faulty_trees(self) -> None:
         """Stop the kinematic trees with a number that is not finite, or a rate beyond :data:`MAX_RATE`, where the step

@@ -14,8 +14,16 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.rigid import recompile, self_collision
-from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction
-from vinesim.physics.rigid.urdf import RobotError, check, collision_urdf, link_friction, shapes_of_robot
+from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction, geom_user
+from vinesim.physics.rigid.urdf import (
+    RobotError,
+    check,
+    collision_materials,
+    collision_urdf,
+    link_friction,
+    shapes_of_robot,
+)
+from vinesim.scene.materials import Material
 from vinesim.scene.triangles import to_stl
 from vinesim.scene.values import RobotSpec
 
@@ -246,10 +254,13 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
     text = collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives))
     child = mujoco.MjSpec.from_string(text, assets={name: to_stl(corners) for name, corners in given.meshes.items()})
     own_friction = link_friction(given.urdf)
+    materials = {link: iter(found) for link, found in collision_materials(given.urdf).items()}
     for geom in child.geoms:
         geom.contype, geom.conaffinity = code, ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
         own = own_friction.get(geom.parent.name)
         geom.friction = contact_friction(friction if own is None else min(max(own, MIN_FRICTION), MAX_FRICTION))
+        material = next(materials.get(geom.parent.name, iter(())), Material.UNKNOWN)
+        geom.userdata = geom_user(material, has_own_friction=own is not None)
         geom.priority = int(own is not None)  # or MuJoCo would take the larger coefficient of the two in contact
         geom.solimp[:2] = CONTACT_IMPEDANCE
     for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume

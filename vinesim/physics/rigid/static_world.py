@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
 
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
+from vinesim.scene.materials import Material, materials_of_organs
 from vinesim.scene.model import Model
-from vinesim.scene.values import Shape
+from vinesim.scene.values import RigidBox, Shape
 
 CRATE_WALL = 0.012
 """[m] Thickness of a crate's bottom and walls. GUESSED."""
@@ -55,27 +57,45 @@ def contact_friction(coefficient: float, rolling_arm: float = 0.0001) -> list[fl
     return [coefficient, 0.005, rolling_arm]
 
 
-def build_static_world(model: Model, parameters: PhysicsParameters) -> mujoco.MjSpec:
-    """A world with ground, poles, wires, trunks, arms and crates, and MuJoCo's options."""
+def geom_user(material: int, *, has_own_friction: bool = False) -> list[float]:
+    """User data of a geom: its :class:`Material`, and whether its friction is its own, whatever it touches."""
+    return [float(material), float(has_own_friction)]
+
+
+def boxes_of(model: Model) -> dict[int, RigidBox]:
+    """The boxes of a scene as generated, by number."""
+    rows = zip(model.box_pose.astype(float), model.box_size.astype(float), model.box_mass.tolist(), strict=True)
+    return {number: RigidBox(*row) for number, row in enumerate(rows)}
+
+
+def build_static_world(
+    model: Model, parameters: PhysicsParameters, boxes: Mapping[int, RigidBox] | None = None
+) -> mujoco.MjSpec:
+    """A world with ground, poles, wires, trunks, arms and crates, and MuJoCo's options.
+
+    ``boxes``: the crates by number; those of the model unless given.
+    """
     spec = mujoco.MjSpec()
     _set_options(spec, parameters)
+    spec.nuser_geom = len(geom_user(Material.UNKNOWN))
     friction = contact_friction(parameters.friction)
     spec.worldbody.add_geom(
         name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=GROUND,
-        conaffinity=BOX | CRATE_FLOOR | FREE_BUNCH, friction=friction,
+        conaffinity=BOX | CRATE_FLOOR | FREE_BUNCH, friction=friction, userdata=geom_user(Material.SOIL),
     )  # fmt: skip
-    radius = model.fixed_radius.mean(1)
+    radius, material = model.fixed_radius.mean(1), materials_of_organs(model.fixed_organ)
     for piece in range(len(radius)):
         spec.worldbody.add_geom(
             name=f"fixed/{piece}", type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             fromto=np.concatenate([model.fixed_start[piece], model.fixed_end[piece]]).astype(float),
             size=[float(radius[piece]), 0, 0], contype=FIXED, conaffinity=0, friction=friction,
-            margin=max(MIN_STATIC_RADIUS - float(radius[piece]), 0.0),
+            margin=max(MIN_STATIC_RADIUS - float(radius[piece]), 0.0), userdata=geom_user(material[piece]),
         )  # fmt: skip
-    for box, pose in enumerate(model.box_pose.astype(float)):
-        body = spec.worldbody.add_body(name=f"box/{box}", pos=pose[:3], quat=frames.to_wxyz(frames.normalize(pose[3:])))
-        body.add_freejoint(name=f"box/{box}")
-        _add_crate(body, model.box_size[box], float(model.box_mass[box]), friction)
+    for number, box in (boxes_of(model) if boxes is None else boxes).items():
+        turn = frames.to_wxyz(frames.normalize(box.pose[3:]))
+        body = spec.worldbody.add_body(name=f"box/{number}", pos=box.pose[:3], quat=turn)
+        body.add_freejoint(name=f"box/{number}")
+        _add_crate(body, box.size, box.mass, friction)
     return spec
 
 
@@ -103,12 +123,12 @@ def _add_crate(body: mujoco.MjsBody, size: np.ndarray, mass: float, friction: li
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX, size=wall.size, pos=wall.pose[:3], friction=friction,
             mass=mass * share / sum(volume), contype=CRATE_FLOOR if is_floor else BOX,
-            conaffinity=ALL_BITS & ~FREE_BUNCH if is_floor else ALL_BITS,
+            conaffinity=ALL_BITS & ~FREE_BUNCH if is_floor else ALL_BITS, userdata=geom_user(Material.PLASTIC),
         )  # fmt: skip
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_BOX, size=[*walls[0].size[:2], CRATE_BED_DEPTH / 2],
         pos=[0.0, 0.0, CRATE_WALL - CRATE_BED_DEPTH / 2], friction=friction, mass=0.0, contype=0,
-        conaffinity=FREE_BUNCH,
+        conaffinity=FREE_BUNCH, userdata=geom_user(Material.PLASTIC),
     )  # fmt: skip
 
 

@@ -324,7 +324,7 @@ class SupportTracker:
             for number, row in self._row_of_object.items()
         }
         self._generation = rigid.generation
-        boxes = [object_id(ObjectKind.BOX, i) for i in range(len(rigid.model.box_mass))]
+        boxes = [object_id(ObjectKind.BOX, i) for i in rigid.boxes]
         bunches = [object_id(ObjectKind.BUNCH, i) for i in rigid.free_bunches]
         self.object_ids = np.array(sorted(boxes + bunches), np.int64)
         self._row_of_object = {number: row for row, number in enumerate(self.object_ids.tolist())}

@@ -10,6 +10,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.scene.appearance import SURFACES, received_surface
+from vinesim.scene.materials import Material
 from vinesim.scene.triangles import TrianglesError
 from vinesim.scene.values import Mesh, RobotSpec, Shape
 
@@ -77,6 +78,41 @@ def link_friction(urdf: str) -> dict[str, float]:
         for element in gazebo.findall("mu1"):
             found[gazebo.get("reference", "")] = float(element.get("value") or element.text or "")
     return found
+
+
+_MATERIALS = {"rubber": Material.RUBBER, "plastic": Material.PLASTIC, "metal": Material.STEEL}
+"""Material of contact of what looks like that surface."""
+
+
+@functools.lru_cache(16)
+def collision_materials(urdf: str) -> dict[str, tuple[Material, ...]]:
+    """Materials of the collision shapes of each link, in the order of the URDF.
+
+    A URDF names materials of what is seen: a collision shape is made of what the visual shape at the same place and of
+    the same size is made of, or else of what all visual shapes of its link are made of.
+    """
+    root = ElementTree.fromstring(urdf)
+    paints = {m.get("name"): m for m in root.findall("material")}
+    found = {}
+    for link in root.findall("link"):
+        seen = [shape for shape in (_shape(element, paints) for element in link.findall("visual")) if shape]
+        surfaces = {shape.surface for shape in seen}
+        common = surfaces.pop() if len(surfaces) == 1 else ""
+        materials = []
+        for element in link.findall("collision"):
+            shape = _shape(element, paints)
+            same = (one.surface for one in seen if shape and _is_same_solid(one, shape))
+            materials.append(_MATERIALS.get(next(same, common), Material.UNKNOWN))
+        found[link.get("name", "")] = tuple(materials)
+    return found
+
+
+def _is_same_solid(one: Shape, other: Shape) -> bool:
+    return (
+        (one.kind, one.file) == (other.kind, other.file)
+        and np.allclose(one.size, other.size)
+        and np.allclose(one.pose, other.pose)
+    )
 
 
 @functools.lru_cache(16)

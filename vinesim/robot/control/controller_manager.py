@@ -136,6 +136,11 @@ class ControllerManager:
         for active in list(self._goals.values()):
             self.cancel(active.id, time)
 
+    def abort_all(self, text: str) -> None:
+        """Abort all goals; ``text`` says why."""
+        for name in list(self._goals):
+            self._end(name, Outcome.PREEMPTED, text)
+
     def take_results(self) -> list[GoalResult]:
         """The goals that have ended since the last call."""
         results, self._results = self._results, []

@@ -161,20 +161,23 @@ class TrajectoryController:
         began = max(trajectory.start_time, time) if trajectory.start_time > 0.0 else time
         self._end(Outcome.PREEMPTED, "a newer trajectory took over")
         active = self.indices[order]
+        by_servo = np.isin(self.robot.interface[active], (CommandInterface.POSITION, CommandInterface.VELOCITY))
+        here = np.where(
+            by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active]
+        )
+        moving = (
+            self._desired_velocity[order] if self.active_goal is not None and began <= time else np.zeros(len(order))
+        )
+        self._desired[order], self._desired_velocity[order] = here, moving
         self._knot_times, self._knot_positions, self._knot_velocities = (
             trajectory.times,
             trajectory.positions,
             trajectory.velocities,
         )
         if trajectory.times[0] > 0.0:  # from the present set-points, or positions
-            by_servo = np.isin(self.robot.interface[active], (CommandInterface.POSITION, CommandInterface.VELOCITY))
-            here = np.where(
-                by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active]
-            )
             self._knot_times = np.concatenate([[0.0], self._knot_times])
             self._knot_positions = np.concatenate([here[None], self._knot_positions])
             if self._knot_velocities is not None:
-                moving = self._desired_velocity[order] if self.active_goal is not None else np.zeros(len(order))
                 self._knot_velocities = np.concatenate([moving[None], self._knot_velocities])
         self._active, self._order = active, order
         self.active_goal = GoalHandle(trajectory, began)
@@ -229,7 +232,10 @@ class TrajectoryController:
     # ------------------------------------------------------------------ each step
 
     def __call__(self, time: float) -> None:
-        """Command the set-points of the step that starts at ``time`` [s], and check the errors after the last one."""
+        """Command the set-points of the step that starts at ``time`` [s], and check the errors after the last one.
+
+        The desired state is that of the end of the step, where the joints will be measured.
+        """
         goal = self.active_goal
         if goal is None:
             return
@@ -238,7 +244,8 @@ class TrajectoryController:
             return
         position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
         wanted, rate = self._sample(elapsed)
-        self._desired[self._order], self._desired_velocity[self._order] = wanted, rate
+        ahead = self._sample(elapsed + self.robot.rigid.dt)
+        self._desired[self._order], self._desired_velocity[self._order] = ahead
         error, slip = wanted - position[self._active], rate - velocity[self._active]
         if elapsed < self._knot_times[-1]:
             tolerance = goal.trajectory.path_tolerance or _reordered(self.path_tolerance, self._order)
@@ -259,7 +266,7 @@ class TrajectoryController:
             elif late > 0.0 and elapsed > self._knot_times[-1] + late:
                 self._fail(goal, Outcome.GOAL_TOLERANCE_VIOLATED, off[0], error, slip, f"{late:.2f} s after the end")
                 return
-        self.robot.command_position(self._sample(elapsed + self.robot.rigid.dt)[0], self._active)
+        self.robot.command_position(ahead[0], self._active)
 
     def state(self, time: float) -> ControllerState:
         """Desired and actual joint states at ``time`` [s]."""

@@ -138,6 +138,35 @@ class SimulationAction(enum.StrEnum):
     PAUSE = "pause"
     STEP = "step_simulation"
     GET_ENTITIES = "get_entities"
+    GET_SPAWNABLES = "get_spawnables"
+    SPAWN = "spawn_entity"
+    DELETE = "delete_entity"
+    SET_ENTITY_STATE = "set_entity_state"
+    RESET = "reset_simulation"
+
+
+class Refusal(enum.StrEnum):
+    """Why a request was not done, as the results of simulation_interfaces tell it."""
+
+    UNSUPPORTED = "feature unsupported"
+    NOT_FOUND = "not found"
+    INCORRECT_STATE = "incorrect state"
+    FAILED = "operation failed"
+    NAME_NOT_UNIQUE = "name not unique"
+    NAME_INVALID = "name invalid"
+    UNSUPPORTED_FORMAT = "unsupported format"
+    NO_RESOURCE = "no resource"
+    RESOURCE_PARSE_ERROR = "resource parse error"
+    MISSING_ASSETS = "missing assets"
+    INVALID_POSE = "invalid pose"
+
+
+class RequestRefused(Exception):
+    """A request was not done: ``kind`` for programs, the text for people."""
+
+    def __init__(self, kind: Refusal, text: str) -> None:
+        super().__init__(text)
+        self.kind = kind
 
 
 class EntityCategory(enum.StrEnum):
@@ -159,6 +188,33 @@ class Entity:
     """[7] m, 1 in the map"""
     velocity: np.ndarray
     """[6] m/s, rad/s, world axes; NaN where it is not known"""
+    description: str = ""
+    """What it is, for people."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Spawnable:
+    """Something that can be added to the world."""
+
+    uri: str
+    description: str
+    low: tuple[float, float, float]
+    """[m] Lower corner of the room that it takes, about its pose."""
+    high: tuple[float, float, float]
+    """[m] Upper corner."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class EntityArguments:
+    """Of :attr:`SimulationAction.SPAWN`, ``DELETE`` and ``SET_ENTITY_STATE``."""
+
+    name: str
+    pose: np.ndarray | None = None
+    """[7] m, 1 in the map, not checked yet."""
+    velocity: np.ndarray | None = None
+    """[6] m/s, rad/s, world axes, not checked yet."""
+    uri: str = ""
+    allow_renaming: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -169,6 +225,11 @@ class SimulationRequest:
     action: SimulationAction
     steps: int = 0
     """Of :attr:`SimulationAction.STEP`."""
+    entity: EntityArguments | None = None
+    keep_state: bool = False
+    """Of :attr:`SimulationAction.RESET`: only spawned entities go."""
+    keep_spawned: bool = False
+    """Of :attr:`SimulationAction.RESET`: spawned entities stay, where they were spawned."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -181,4 +242,9 @@ class SimulationReply:
     is_paused: bool
     refusal: str = ""
     """Why it was not done, in one line; empty if it was."""
+    kind: Refusal = Refusal.INCORRECT_STATE
+    """Of the refusal, if there is one."""
+    name: str = ""
+    """Of the entity that was spawned."""
+    spawnables: tuple[Spawnable, ...] = ()
     entities: tuple[Entity, ...] = ()

@@ -21,6 +21,7 @@ class GroundTruthPublisher:
         self._poles: tuple[Sequence[str], np.ndarray] = (), np.zeros((0, 7))
         self._names: Sequence[str] | None = None
         self._transforms = SerializedTransforms([])
+        self._is_muted = False
 
     def pending(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
         """The message of true poses [name, 7] of what moves. Pass the same tuple object as long as the names stay."""
@@ -29,14 +30,17 @@ class GroundTruthPublisher:
     def pending_static(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
         """The message of true poses [name, 7] of what never moves."""
         self._poles = names, poses
-        transforms = SerializedTransforms([(MAP_FRAME, name) for name in names])
-        yield self._static, partial(transforms.message, 0.0, poses)
+        yield self._static, self._static_message
 
     def mute(self, is_muted: bool) -> None:
         """Whether true poses are kept back; late subscribers then receive an empty message of what never moves."""
+        self._is_muted = is_muted
         self._moving.mute(is_muted)
-        names, poses = ((), np.zeros((0, 7))) if is_muted else self._poles
-        self._static.send(SerializedTransforms([(MAP_FRAME, name) for name in names]).message(0.0, poses))
+        self._static.send(self._static_message())
+
+    def _static_message(self) -> bytes:
+        names, poses = ((), np.zeros((0, 7))) if self._is_muted else self._poles
+        return SerializedTransforms([(MAP_FRAME, name) for name in names]).message(0.0, poses)
 
     def _message(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> bytes:
         if names is not self._names:

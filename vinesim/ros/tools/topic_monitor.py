@@ -8,8 +8,9 @@ until its standard input is closed; a line "restart" there begins the counts ane
 the number of messages of each topic, a JSON object on one line.
 
 With ``--announce`` it prints a JSON object when it listens and for the first message of every topic, each on a line,
-as the report then. With
-``--once TOPIC`` a topic is left after its first message, so that it costs its publisher nothing from then on.
+as the report then. With ``--once TOPIC`` a topic is left after its first message, so that it costs its publisher
+nothing from then on. With ``--arrivals FILE`` it writes when each message was sent and came, with its stamp and number:
+one array [message, 4] int64 a topic, see :attr:`TopicStats.arrivals`.
 
 It takes messages in their serialised form, so that counting costs next to nothing; the first one of every topic is
 deserialised, to check that it is well-formed. It runs without vinesim's middleware profile, as any other node.
@@ -31,6 +32,8 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from typing import Any
+
+import numpy as np
 
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
@@ -76,6 +79,8 @@ class TopicStats:
         self._stamp_at = _stamp_offset(message)
         self._stamp = (-1, 0)
         self._sequence: int | None = None
+        self.arrivals: list[tuple[int, int, int, int]] | None = None
+        """Arrival, sending and stamp [ns], and number of every message, -1 where it has none; None: not kept."""
         self.restart(None)
 
     def restart(self, since: float | None) -> None:
@@ -106,10 +111,15 @@ class TopicStats:
             if self._sequence is not None:
                 self.lost += max(sequence - self._sequence - 1, 0)
             self._sequence = sequence
+        simulated = -1
         if self._stamp_at is not None and len(message) >= self._stamp_at + 8:
-            self._add_stamp(now, struct.unpack_from(("<" if message[1] & 1 else ">") + "iI", message, self._stamp_at))
+            stamp = struct.unpack_from(("<" if message[1] & 1 else ">") + "iI", message, self._stamp_at)
+            simulated = self._add_stamp(now, stamp)
+        if self.arrivals is not None:
+            self.arrivals.append((now, info["source_timestamp"], simulated, -1 if sequence is None else sequence))
 
-    def _add_stamp(self, now: int, stamp: tuple[int, int]) -> None:
+    def _add_stamp(self, now: int, stamp: tuple[int, int]) -> int:
+        """Note the stamp of a message; the same in ns."""
         self.stamps_rise &= stamp >= self._stamp
         self._stamp = stamp
         simulated = stamp[0] * 1_000_000_000 + stamp[1]
@@ -117,6 +127,7 @@ class TopicStats:
             self._clock.add(now, simulated)
         if (age := self._clock.age(now, simulated)) is not None:
             self._ages.append(age)
+        return simulated
 
     def report(self, until: float | None = None) -> dict[str, Any]:
         """The statistics until a wall time [s] as plain values; ``lost`` is None if several publishers number their
@@ -143,10 +154,11 @@ class TopicMonitor:
 
     def __init__(
         self, topics: Sequence[str] = (), once: Sequence[str] = (),
-        announce: Callable[[str, float], None] | None = None, queue_depth: int = QUEUE_DEPTH,
+        announce: Callable[[str, float], None] | None = None, queue_depth: int = QUEUE_DEPTH, arrivals: bool = False,
     ) -> None:  # fmt: skip
         """``topics`` and ``once`` name the topics, all if both are empty; ``announce`` is called with each topic and
-        the wall time of its first message [s]; ``queue_depth``: messages of one topic that may wait for this node."""
+        the wall time of its first message [s]; ``queue_depth``: messages of one topic that may wait for this node;
+        ``arrivals``: keep the times of every message."""
         from rclpy.context import Context
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
@@ -154,7 +166,7 @@ class TopicMonitor:
         self.stats: dict[str, TopicStats] = {}
         self._topics, self._once = {*topics, *once}, set(once)
         self._announce = announce
-        self._queue_depth = queue_depth
+        self._queue_depth, self._keeps_arrivals = queue_depth, arrivals
         self._unannounced: set[str] = set()
         self._clock = SimulationClock()
         self._context = Context()
@@ -197,6 +209,11 @@ class TopicMonitor:
         now = time.time()
         return {name: topic.report(now) for name, topic in sorted(self.stats.items())}
 
+    def save_arrivals(self, path: pathlib.Path) -> None:
+        """Write the times of every message: one array [message, 4] int64 a topic: see :attr:`TopicStats.arrivals`."""
+        rows: dict[str, Any] = {n: np.array(t.arrivals, np.int64).reshape(-1, 4) for n, t in self.stats.items()}
+        np.savez(path, **rows)
+
     def close(self) -> None:
         """Leave the graph."""
         self._executor.shutdown()
@@ -220,6 +237,7 @@ class TopicMonitor:
         qos = offered_qos(offered, self._queue_depth)
         topic = TopicStats(type_name, str(offered[0].topic_type_hash), message, len(offered), self._clock)
         topic.is_clock = name == CLOCK
+        topic.arrivals = [] if self._keeps_arrivals else None
         self.stats[name] = topic
         self._unannounced.add(name)
         add: Any = topic.add  # rclpy hands over what the signature has room for, its annotations know less
@@ -260,6 +278,7 @@ class Arguments:
     queue: int
     seconds: float | None
     out: pathlib.Path | None
+    arrivals: pathlib.Path | None
 
 
 def parse(arguments: Sequence[str] | None = None) -> Arguments:
@@ -273,8 +292,11 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
     parser.add_argument("--queue", type=int, default=QUEUE_DEPTH, help="messages of a topic that may wait for it")
     parser.add_argument("--seconds", type=float, help="from the first message on; default: until stdin is closed")
     parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
+    parser.add_argument("--arrivals", type=pathlib.Path, help="write the times of every message here (.npz)")
     given = parser.parse_args(arguments)
-    return Arguments(given.topic, given.once, given.announce, given.queue, given.seconds, given.out)
+    return Arguments(
+        given.topic, given.once, given.announce, given.queue, given.seconds, given.out, given.arrivals
+    )  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -289,13 +311,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     requests: queue.SimpleQueue[str] = queue.SimpleQueue()
     if given.seconds is None:
         threading.Thread(target=_read_requests, args=(requests,), daemon=True).start()
-    monitor = TopicMonitor(given.topics, given.once, _print_first if given.announce else None, given.queue)
+    announce = _print_first if given.announce else None
+    monitor = TopicMonitor(given.topics, given.once, announce, given.queue, given.arrivals is not None)
     if given.announce:
         _print_line({"listening": time.time()})
     with contextlib.suppress(KeyboardInterrupt):
         monitor.run(requests, given.seconds)
     text = json.dumps(monitor.report(), indent=None if given.announce else 1)
     monitor.close()
+    if given.arrivals is not None:
+        monitor.save_arrivals(given.arrivals)
     if given.out is None:
         sys.stdout.write(text + "\n")
     else:

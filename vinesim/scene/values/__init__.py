@@ -7,7 +7,7 @@ A value that leaves the physics thread owns its arrays: they are never written a
 from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPose, HumanSpec
 from vinesim.scene.values.measurement import Measurement
 from vinesim.scene.values.network import Coupling, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
-from vinesim.scene.values.rigid import Mesh, RigidVisual, Shape
+from vinesim.scene.values.rigid import Mesh, RigidBox, RigidVisual, Shape
 from vinesim.scene.values.robot import (
     FORWARD_KINDS,
     ControllerKind,
@@ -66,6 +66,7 @@ __all__ = [
     "Measurement",
     "Mesh",
     "ObjectUpdate",
+    "RigidBox",
     "RigidVisual",
     "RobotSample",
     "RobotSpec",

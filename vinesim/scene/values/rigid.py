@@ -40,6 +40,18 @@ class Shape:
     mesh: Mesh | None = None
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class RigidBox:
+    """An open box that can be moved, as it is when it comes into the world."""
+
+    pose: np.ndarray
+    """[7] m, 1 of the middle of its underside."""
+    size: np.ndarray
+    """[3] m, outer length, width, height."""
+    mass: float
+    """[kg]"""
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class RigidVisual:
     """One rigid body as sensors see it: its name, what it is, and its shapes."""

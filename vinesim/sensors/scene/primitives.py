@@ -121,6 +121,14 @@ class Primitives:
         """Whether each cluster is drawn [cluster]; those of picked bunches are not."""
         return self.ball.numpy()[:, 3] > 0.0
 
+    def local_columns(self, rows: slice) -> dict[str, np.ndarray]:
+        """Some primitives in the frames of their carriers: ``a`` to ``d`` [n, 4] (see
+        :mod:`vinesim.kernels.raster.primitives`), ``tint`` [n, 3], ``sky``, ``material``, ``label``, ``carrier`` [n].
+        """
+        names = {name: f"local_{name}" for name in "abcd"}
+        names |= {name: name for name in ("tint", "sky", "material", "label", "carrier")}
+        return {name: self._columns[column][rows].numpy() for name, column in names.items()}
+
     def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
         """Poses [..., 7] m, 1 of the carriers of some primitives [...]: a plant's body, a rigid body, or the world."""
         return self._poses[self._carrier.numpy()[primitive]].astype(float)
@@ -211,7 +219,7 @@ class Primitives:
         end = rows if empty else rows + len(rigid.label)
         self.label, self.organ = (self._columns[name][:end].numpy() for name in ("label", "organ"))
         self.cluster_first, self.cluster_size, self.cluster_kind = joined["first"], joined["size"], joined["kind"]
-        self._owner, self._cluster_bunch = joined["owner"], joined["bunch"]
+        self._owner, self.cluster_bunch = joined["owner"], joined["bunch"]
         self.rigid_clusters = np.arange(clusters, len(self.cluster_first))
         version = np.zeros(len(self.cluster_first), np.int64)
         if self.layout_version:
@@ -322,10 +330,10 @@ class Primitives:
         changed = np.flatnonzero(attached != self._attached)
         if len(changed):
             self._attached = attached.copy()
-            self.clusters.shown.assign(_clusters_shown(self._cluster_bunch, attached))
+            self.clusters.shown.assign(_clusters_shown(self.cluster_bunch, attached))
         dirty = self._tree_clusters(trees)
         if len(changed):
-            dirty = np.union1d(dirty, np.flatnonzero(np.isin(self._cluster_bunch, changed)))
+            dirty = np.union1d(dirty, np.flatnonzero(np.isin(self.cluster_bunch, changed)))
         first_visual = self._static_carrier + 1
         if new_visuals or not np.array_equal(self._poses[first_visual:], visual_q):
             dirty = np.concatenate([dirty, self.rigid_clusters])

@@ -1,0 +1,53 @@
+"""Makes the left arm soft: it gives way when something pushes it, and comes back.
+
+    vinesim client --role robot --name vinebot           # in one terminal
+    python examples/ros/compliant_arm.py                 # in another
+
+A stock ROS 2 node: it holds the arm where it is with little stiffness, and prints what the joints do.
+"""
+
+import rclpy
+from rclpy.node import Node
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+STIFFNESS, DAMPING = 50.0, 15.0  # N m/rad, N m s/rad
+PUSHED, BACK = 0.03, 0.01  # rad
+
+
+class CompliantArm(Node):
+    def __init__(self, arm: str = "arm_left") -> None:
+        super().__init__("compliant_arm")
+        self.joints = [f"{arm}_{i}_joint" for i in range(1, 8)]
+        self.equilibrium: list[float] = []
+        self.is_pushed = False
+        self.topics = {
+            what: self.create_publisher(Float64MultiArray, f"/{arm}_impedance_controller/{what}", 1)
+            for what in ("stiffness", "damping", "equilibrium")
+        }
+        self.create_subscription(JointState, "/joint_states", self.take, 10)
+
+    def take(self, message: JointState) -> None:
+        """Soften the arm at the first message that comes with the controller there; then watch its joints."""
+        places = dict(zip(message.name, message.position, strict=True))
+        here = [places[joint] for joint in self.joints]
+        if not self.equilibrium:
+            if all(topic.get_subscription_count() for topic in self.topics.values()):
+                self.equilibrium = here
+                for what, values in (
+                    ("stiffness", [STIFFNESS] * 7), ("damping", [DAMPING] * 7), ("equilibrium", here)
+                ):  # fmt: skip
+                    self.topics[what].publish(Float64MultiArray(data=values))
+                print("soft", flush=True)
+            return
+        away, joint = max((abs(a - b), name) for a, b, name in zip(here, self.equilibrium, self.joints, strict=True))
+        if away > PUSHED and not self.is_pushed:
+            print(f"{joint} gives way by {away:.3f} rad", flush=True)
+        elif away < BACK and self.is_pushed:
+            print("back", flush=True)
+        self.is_pushed = away > (BACK if self.is_pushed else PUSHED)
+
+
+if __name__ == "__main__":
+    rclpy.init()
+    rclpy.spin(CompliantArm())

@@ -1,0 +1,63 @@
+"""A person moved by tracked points: they are reached evenly, hands without a controller hang, feet follow."""
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.avatar.gestures import FIST, OPEN_HAND
+from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
+
+DT = 0.01
+ROOT = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(0.5))
+
+
+@pytest.fixture
+def human():
+    return TrackedHuman(ROOT, 1.75, DT)
+
+
+def test_without_input_it_stands_still(human):
+    before = human.pose.points
+    for step in range(50):
+        np.testing.assert_allclose(human(step * DT).points[1:], before[1:], atol=1e-9)
+
+
+def test_inputs_at_the_rate_of_a_display_give_the_velocity_of_the_person(human):
+    """A hand that moves at 1 m/s, told 50 times a second, moves at 1 m/s in every step once the rate is known."""
+    start, head = human.pose.right.copy(), human.pose.head
+    places = []
+    for step in range(200):
+        if step % 2 == 0:
+            hand = start.copy()
+            hand[0] += step * DT
+            human.take(TrackedPoints(head, None, hand))
+        places.append(human(step * DT).right[0])
+    speed = np.diff(places[60:]) / DT
+    np.testing.assert_allclose(speed, 1.0, atol=0.02)
+    assert start[0] + 199 * DT - places[-1] < 0.04, "late by one interval at most"
+
+
+def test_a_turn_goes_the_short_way(human):
+    head = human.pose.head.copy()
+    goal = np.concatenate([head[:3], -frames.multiply(frames.from_yaw(0.4), head[3:])])  # the same turn, other sign
+    human.take(TrackedPoints(goal))
+    yaws = [frames.to_yaw(human(step * DT).head[3:]) for step in range(10)]
+    assert np.all(np.diff([frames.to_yaw(head[3:]), *yaws]) > -1e-9)
+    assert yaws[-1] == pytest.approx(0.9, abs=1e-6)
+
+
+def test_a_hand_without_a_controller_hangs_beside_the_person_wherever_it_walks(human):
+    below = frames.compose(frames.inverse(human.pose.head), human.pose.left)
+    head = frames.pose(np.array([4.0, -1.0, 1.6]), frames.from_yaw(2.0))
+    human.take(TrackedPoints(head))
+    for step in range(20):
+        pose = human(step * DT)
+    np.testing.assert_allclose(frames.compose(frames.inverse(pose.head), pose.left), below, atol=1e-9)
+    np.testing.assert_allclose(pose.root[:3], [*pose.hips[:2], 0.0])
+
+
+def test_closing_a_hand_and_bending_fingers_pass_through(human):
+    human.take(TrackedPoints(human.pose.head, None, human.pose.right, (False, True), (OPEN_HAND, FIST)))
+    pose = human(0.0)
+    assert (pose.left_closed, pose.right_closed) == (False, True)
+    assert pose.right_fingers == FIST

@@ -1,0 +1,193 @@
+"""The page in a real browser: it draws the live vineyard within its budgets, and what happens there is seen."""
+
+import pathlib
+import threading
+
+import numpy as np
+import pytest
+
+from tests.support.browser import browser_page
+from tests.support.waiting import wait
+from vinesim import frames
+from vinesim.avatar.gestures import GESTURES, Gestures
+from vinesim.avatar.tracked_human import TrackedHuman
+from vinesim.client.client import Client
+from vinesim.client.page_world import PageWorld
+from vinesim.client.spectator import Spectator
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load_scene
+from vinesim.web.page_server import WINDOW, PageServer
+
+MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
+"""Of one picture for one eye, and of the vineyard that a page loads [B]."""
+BUNCH = 10
+VICTORY = (1.0, 0.0, 0.0, 1.0, 1.0)
+HEADSET = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
+"""Put there by tools/build_page."""
+
+
+class LiveVineyard:
+    """A client that steps in a thread of its own, as in its process: a spectator or a person before a bunch."""
+
+    def __init__(self, bus, *, is_person=False):
+        scene = load_scene("demo")
+        model = generate(scene)
+        hangs = model.forward_kinematics(model.joint_settled)[model.bunch_body[BUNCH]]
+        self.bunch = frames.compose(hangs, frames.pose(np.array([0.06, 0.0, 0.0])))[:3]
+        person = None
+        if is_person:
+            start = frames.pose(np.array([self.bunch[0] - 0.75, self.bunch[1], 0.0]))
+            person = TrackedHuman(start, 1.75, gestures=Gestures(GESTURES, {"a": VICTORY}))
+            self.client = Client(scene, model, None, bus, name="viewer", pose=start, source=person)
+        else:
+            eye = frames.pose(self.bunch - np.array([0.7, 0.0, 0.0]))
+            self.client = Spectator(scene, model, None, bus, name="viewer", pose=eye)
+        self.world = PageWorld(self.client, person)
+        self.server = PageServer(self.world)
+        self.client.post_step.append(lambda _: self.world.collect(self.server))
+        self.due = []
+        """Called once before the next step."""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="client")
+
+    def _run(self):
+        while not self._stop.wait(0.005):
+            while self.due:
+                self.due.pop()()
+            self.client.tick()
+
+    def __enter__(self):
+        self.server.__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception):
+        self._stop.set()
+        self._thread.join()
+        self.server.__exit__(*exception)
+
+
+def open_page(page, live, before=""):
+    """Open the page, and let it draw little: the browser of a test has no graphics card."""
+    page.open(live.server.address + "?triangles=60000", before=before)
+    wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
+    assert page.run("vinesim.failure") is None
+    assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_the_live_vineyard_in_a_browser():
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live, browser_page() as page:
+        page.open(live.server.address)
+        wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
+        assert page.run("vinesim.failure") is None
+        assert 0 < page.run("vinesim.calls") <= MAX_CALLS
+        assert 50_000 < page.run("vinesim.triangles") <= MAX_TRIANGLES
+        assert len(live.world.scene()) <= MAX_BYTES
+        page.run("vinesim.viewer.world.budget = 60000, vinesim.viewer.world.listedAt = null")  # for a slow machine
+        wait(lambda: page.run("vinesim.triangles") <= 60_000, "fewer triangles are drawn")
+        before = page.picture()
+        assert before.std() > 30.0, "a vineyard, not one colour"
+
+        # a page whose loop stands still gets no more than the window
+        page.run("vinesim.viewer.renderer.setAnimationLoop(null)")
+        sent = live.server.states_sent
+        tick = live.client.physics.tick
+        wait(lambda: live.client.physics.tick > tick + 40, "40 steps without a picture")
+        assert live.server.states_sent - sent <= WINDOW
+        page.run("vinesim.viewer.renderer.setAnimationLoop(() => vinesim.viewer.draw())")
+        drawn = page.run("vinesim.drawn")
+        wait(lambda: page.run("vinesim.drawn") > drawn + 1, "the page goes on")
+
+        # the bunch before the eyes is picked, and falls out of sight
+        live.due.append(lambda: live.client.physics.pick(BUNCH))
+        wait(lambda: page.run("vinesim.viewer.world.picked.size") == 1, "the page knows of the picked bunch")
+        carrier = f"vinesim.viewer.world.bodies + 1 + vinesim.viewer.world.names.findIndex(n => n.includes('{BUNCH}'))"
+        wait(lambda: page.run(f"vinesim.viewer.world.place({carrier}).z") < 0.5, "the bunch has fallen")
+        drawn = page.run("vinesim.drawn")
+        wait(lambda: page.run("vinesim.drawn") > drawn + 1, "it is drawn there")
+        change = np.abs(page.picture().astype(float) - before).mean(2)
+        high, wide = change.shape
+        middle = change[high // 2 - 25 : high // 2 + 25, wide // 2 - 25 : wide // 2 + 25].mean()
+        assert middle > 8.0 * change.mean(), "where the bunch hung, the picture has changed"
+
+        # keys fly, and the client knows where the eyes are
+        page.key("KeyS", down=True)
+        wait(lambda: np.linalg.norm(live.client.pose[:3] - live.bunch) > 1.2, "the eyes have flown away")
+        page.key("KeyS", down=False)
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, browser_page() as page:
+        open_page(page, live)
+        physics, body = live.client.physics, live.client.model.bunch_body[BUNCH]
+        here = physics.state.body_q[body, :3].copy()
+        eye = np.array(page.run("vinesim.viewer.eyes.place"))
+        assert np.linalg.norm(eye - live.client.humans["viewer"].pose.head[:3]) < 1e-3, "the person's own eyes"
+        way = live.bunch - eye
+        pitch = np.arctan2(way[2], np.hypot(*way[:2]))
+        page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
+        page.run(f"vinesim.viewer.hand.distance = {np.linalg.norm(way) + 0.02}")
+        page.key("KeyR", down=True)
+        page.key("KeyR", down=False)
+        wait(lambda: physics.hand("viewer", "right").touching, "the hand reaches the bunch")
+        page.key("Digit3", down=True)
+        wait(lambda: live.client.humans["viewer"].pose.right_fingers == GESTURES["point"], "the hand points")
+        page.key("Digit3", down=True)
+        page.key("Space", down=True)
+        page.key("Space", down=False)
+        wait(lambda: page.run("vinesim.haptics.right?.[0] > 0"), "the page is told to vibrate")
+        wait(lambda: np.linalg.norm(physics.state.body_q[body, :3] - here) > 2e-3, "the bunch gives way")
+        wait(lambda: physics.hand("viewer", "right").held is not None, "the hand holds the bunch")
+        page.key("KeyS", down=True)
+        wait(lambda: not physics.state.bunch_attached[BUNCH], "who walks away with it in the hand picks it")
+        page.key("KeyS", down=False)
+        assert np.linalg.norm(physics.hand("viewer", "right").force) <= 100.0 + 1e-6
+        wait(lambda: page.run("vinesim.viewer.world.picked.size") == 1, "the page knows of the picked bunch")
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_a_headset_moves_head_and_hands():
+    """An emulated headset (iwer) at known places: the person in the physics is there, in the world's axes."""
+    device = ";window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
+    device += "device.installRuntime({forceInstall: true});"
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, browser_page() as page:
+        open_page(page, live, HEADSET.read_text() + device)
+        human = live.client.humans["viewer"]
+        start = human.pose.head.copy()
+        page.run("vinesim.viewer.eyes.yaw = 0.5, 0")
+        wait(lambda: page.run("!document.getElementById('enter').hidden"), "the page offers the headset")
+        page.run("device.position.set(0.1, 1.5, -0.2), device.quaternion.set(0, 0, 0, 1), 0")
+        page.run("device.controllers.right.position.set(0.3, 1.2, -0.6), 0")
+        page.run("device.controllers.right.quaternion.set(0, 0, 0, 1), 0")
+        page.run("document.getElementById('enter').click()")
+        wait(lambda: page.run("vinesim.viewer.headset.isWorn"), "the headset is worn")
+        # 0.2 m ahead and 0.1 m to the right of the floor's middle, which looks along 0.5 rad
+        ahead, right = np.array([np.cos(0.5), np.sin(0.5)]), np.array([np.sin(0.5), -np.cos(0.5)])
+        head = np.array([*(start[:2] + 0.2 * ahead + 0.1 * right), 1.5])
+        wait(lambda: np.linalg.norm(human.pose.head[:3] - head) < 5e-3, "the head is where the headset is")
+        assert frames.to_yaw(human.pose.head[3:]) == pytest.approx(0.5, abs=1e-3)
+        palm = np.array([*(start[:2] + 0.6 * ahead + 0.3 * right), 1.2])
+        wait(lambda: np.linalg.norm(human.pose.right[:3] - palm) < 0.1, "the hand is where its controller is")
+        fingers = frames.rotate(human.pose.right[3:], np.array([1.0, 0.0, 0.0]))
+        assert np.dot(fingers[:2], ahead) > 0.7, "it points ahead"
+        page.run("device.controllers.right.updateButtonValue('squeeze', 1), 0")
+        wait(lambda: human.pose.right_closed, "the hand closes")
+        assert human.pose.right_fingers[2:] == (1.0, 1.0, 1.0)
+        page.run("device.controllers.right.updateButtonValue('squeeze', 0), 0")
+        page.run("device.controllers.right.updateButtonValue('a-button', 1), 0")
+        wait(lambda: human.pose.right_fingers == VICTORY, "a button makes the person's own pose")
+        page.run("device.controllers.left.updateAxes('thumbstick', 0, -1), 0")
+        wait(lambda: np.dot(human.pose.head[:2] - head[:2], ahead) > 0.5, "the stick walks ahead")
+        page.run("device.controllers.left.updateAxes('thumbstick', 0, 0), 0")
+        page.run("device.controllers.right.updateAxes('thumbstick', 1, 0), 0")
+        wait(lambda: frames.to_yaw(human.pose.head[3:]) < 0.0, "the stick turns to the right")
+        assert page.run("vinesim.calls") <= 2 * MAX_CALLS
+        assert page.errors == []

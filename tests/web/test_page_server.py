@@ -1,0 +1,163 @@
+"""The page's server, by real requests: what is new reaches a page, and no page is behind by more than the window."""
+
+import asyncio
+import json
+import ssl
+import urllib.error
+import urllib.request
+
+import aiohttp
+import pytest
+
+from tests.support.waiting import wait
+from vinesim.client import page_access
+from vinesim.errors import UsageError
+from vinesim.web.page_server import WINDOW, PageServer
+
+HERE = [1.0, 2.0, 1.6, 0.0, 0.0, 0.0, 1.0]
+
+
+class CountingWorld:
+    """A world whose state is the number of its tick."""
+
+    def __init__(self):
+        self.tick, self.poses = -1, []
+
+    def scene(self):
+        return b"scene"
+
+    def rigid(self):
+        return b"rigid"
+
+    def state(self, since):
+        return (self.tick, str(self.tick).encode()) if self.tick > since else None
+
+    def take(self, page, said):
+        self.poses.append(list(said.view))
+
+    def leave(self, page):
+        pass
+
+
+@pytest.fixture
+def served():
+    world = CountingWorld()
+    with PageServer(world) as server:
+        yield world, server
+
+
+def advance(world, server, ticks):
+    for _ in range(ticks):
+        world.tick += 1
+        server.notify()
+
+
+async def settle(server, count):
+    while server.states_sent < count:
+        await asyncio.sleep(0.002)
+
+
+def test_files_and_arrays_are_served(served):
+    _, server = served
+    for path, part in (("", b"<title>vinesim</title>"), ("main.js", b"import"), ("vendor/three.module.js", b"WebGL")):
+        assert part in urllib.request.urlopen(server.address + path, timeout=10).read()
+    assert urllib.request.urlopen(server.address + "scene", timeout=10).read() == b"scene"
+    with pytest.raises(urllib.error.HTTPError, match="404"):
+        urllib.request.urlopen(server.address + "..%2f..%2fpyproject.toml", timeout=10)
+
+
+def test_a_page_that_stalls_gets_no_more_than_the_window_and_then_the_newest_state(served):
+    world, server = served
+
+    async def page():
+        async with aiohttp.ClientSession() as session, session.ws_connect(server.address + "state") as socket:
+            world.tick = 1
+            server.notify()
+            got = [int((await socket.receive()).data)]
+            for _ in range(100):
+                advance(world, server, 1)
+                await asyncio.sleep(0.001)
+            await settle(server, WINDOW)
+            assert server.states_sent == WINDOW
+            got.append(int((await socket.receive()).data))
+            await socket.send_json({"drawn": got[-1], "view": HERE})
+            got.append(int((await socket.receive()).data))
+            return got
+
+    got = asyncio.run(page())
+    assert got[0] >= 1
+    assert got == sorted(got)
+    assert got[-1] == 101, "after the stall comes the newest state, not the one after the last"
+    assert world.poses == [HERE]
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "no json", "[]", "{}", '{"drawn": 1}', '{"drawn": 1, "view": [1, 2]}', '{"drawn": 1, "view": "x"}',
+        json.dumps({"drawn": 1, "view": [1e9, 0, 0, 0, 0, 0, 1]}),
+        json.dumps({"drawn": 1, "view": [0, 0, 0, 0, 0, 0, 0]}),
+        '{"drawn": 1, "view": [NaN, 0, 0, 0, 0, 0, 1]}', '{"drawn": 1e999, "view": [0, 0, 0, 0, 0, 0, 1]}',
+        json.dumps({"drawn": 1, "view": HERE, "person": {"head": HERE, "left": {"pose": HERE, "closed": 1}}}),
+        json.dumps({"drawn": 1, "view": HERE, "person": {"head": [0.0] * 7}}),
+        json.dumps({"drawn": 1, "view": HERE, "more": 1}),
+        "[" * 3000,
+    ],
+)  # fmt: skip
+def test_what_is_no_message_of_a_page_is_counted_and_changes_nothing(served, message):
+    world, server = served
+
+    async def page():
+        async with aiohttp.ClientSession() as session, session.ws_connect(server.address + "state") as socket:
+            await socket.send_str(message)
+            advance(world, server, 1)
+            await socket.receive()
+            while server.refused == 0:
+                await asyncio.sleep(0.002)
+
+    asyncio.run(page())
+    assert server.refused == 1
+    assert world.poses == []
+
+
+def test_a_site_of_another_origin_is_refused(served):
+    _, server = served
+    request = urllib.request.Request(server.address + "scene", headers={"Origin": "http://example.org"})
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request, timeout=10)
+
+
+def test_a_port_that_is_taken_is_said(served):
+    _, server = served
+    with pytest.raises(UsageError, match=f"--page {server.port}: "), PageServer(CountingWorld(), server.port):
+        pass
+
+
+def test_viewers_come_and_go(served):
+    _, server = served
+
+    async def page():
+        async with aiohttp.ClientSession() as session, session.ws_connect(server.address + "state"):
+            wait(lambda: server.has_viewers, "the page is connected")
+
+    assert not server.has_viewers
+    asyncio.run(page())
+    wait(lambda: not server.has_viewers, "the page is gone")
+
+
+def test_other_machines_need_the_token_and_get_https(tmp_path, monkeypatch):
+    monkeypatch.setenv("VINESIM_CACHE", str(tmp_path))
+    monkeypatch.setattr(page_access, "own_address", lambda: "127.0.0.1")
+    access = page_access.network_access()
+    trusting = ssl.create_default_context(cafile=tmp_path / "page-certificate" / "ca.pem")
+    with PageServer(CountingWorld(), 0, access.host, tls=access.tls, token=access.token) as server:
+        assert server.address.startswith(f"https://{access.host}:{server.port}/?token=")
+        plain = server.address.split("?")[0]
+        for path in ("", "scene", "main.js", "?token=", "?token=x", "state"):
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(plain + path, timeout=10, context=trusting)
+        browser = urllib.request.build_opener(
+            urllib.request.HTTPSHandler(context=trusting), urllib.request.HTTPCookieProcessor()
+        )
+        assert b"vinesim" in browser.open(server.address, timeout=10).read()
+        assert browser.open(plain + "scene", timeout=10).read() == b"scene", "a cookie holds the token from then on"

@@ -1,0 +1,165 @@
+"""What pages are told: the cameras' primitives once, then the poses of what has moved, and of nothing else."""
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.client.client import Client
+from vinesim.client.page_world import PageWorld
+from vinesim.client.spectator import FOLLOW_YAW, Spectator, standing_view
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.robot.description.loader import load_description
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Organ
+from vinesim.scene.spec import load_scene
+from vinesim.web.array_message import decode
+from vinesim.web.page_input import PageInput
+
+
+class OnePage:
+    """Stands for the server: one page looks all the time."""
+
+    has_viewers = True
+
+    def notify(self):
+        pass
+
+
+@pytest.fixture
+def shown():
+    with MemoryHub().bus("viewer") as bus:
+        client = Spectator(
+            load_scene("demo"),
+            generate(load_scene("demo")),
+            None,
+            bus,
+            name="viewer",
+            pose=standing_view(1.0, 2.0, 0.5),
+        )
+        world = PageWorld(client)
+        client.post_step.append(lambda _: world.collect(OnePage()))
+        yield client, world
+
+
+def swing(client, tree):
+    """Let one tree move."""
+    client.physics.plants.wake(np.array([tree]))
+    client.physics.state.joint_qd[client.model.bodies_of(tree)] = 0.3
+
+
+def test_nothing_is_laid_out_before_a_page_asks(shown):
+    client, world = shown
+    client.tick()
+    assert world.state(-1) is None
+    assert world._primitives is None
+
+
+def test_the_scene_holds_what_cameras_see(shown):
+    client, world = shown
+    header, arrays = decode(world.scene())
+    model = client.model
+    assert header["bodies"] == len(model.body_mass)
+    np.testing.assert_allclose(arrays["start"], client.pose, atol=1e-6)
+    np.testing.assert_allclose(arrays["poses"], client.physics.snapshot().body_q, atol=1e-6)
+    kinds = np.repeat(arrays["kind"], arrays["size"])
+    assert len(kinds) == len(arrays["material"]) == len(arrays["shape"]) == len(arrays["carrier"])
+    assert (kinds == 1).sum() == model.bunch_berries.sum()
+    assert ((kinds == 2) & (arrays["material"] == 0) & (arrays["carrier"] < header["bodies"])).sum() == len(
+        model.leaf_body
+    )
+    assert arrays["first"][0] == 0
+    np.testing.assert_array_equal(arrays["first"][1:], np.cumsum(arrays["size"])[:-1])
+
+
+def test_a_state_holds_the_trees_that_have_moved_since_the_last_one(shown):
+    client, world = shown
+    world.scene()
+    client.tick()
+    tick, first = world.state(-1)
+    assert len(decode(first)[1]["body"]) == 0, "a page knows the vineyard at rest"
+    assert world.state(tick) is None, "nothing is new"
+    swing(client, 3)
+    client.tick()
+    tick, message = world.state(tick)
+    bodies, arrays = client.model.bodies_of(3), decode(message)[1]
+    assert set(range(bodies.start, bodies.stop)) <= set(arrays["body"].tolist())
+    assert len(arrays["body"]) < 100, "it and what it has touched"
+    pose = client.physics.state.body_q[arrays["body"]]
+    np.testing.assert_allclose(arrays["place"].reshape(-1, 3), pose[:, :3], atol=1e-6)
+    np.testing.assert_allclose(arrays["turn"].reshape(-1, 4) / 32767.0, pose[:, 3:], atol=2e-5)
+
+
+def test_a_page_that_skips_states_still_gets_every_tree(shown):
+    client, world = shown
+    world.scene()
+    client.tick()
+    seen, _ = world.state(-1)
+    for tree in (2, 5):
+        swing(client, tree)
+        client.tick()
+    bodies = set(decode(world.state(seen)[1])[1]["body"].tolist())
+    for tree in (2, 5):
+        own = client.model.bodies_of(tree)
+        assert set(range(own.start, own.stop)) <= bodies
+
+
+def test_a_picked_bunch_becomes_a_rigid_body_of_the_page(shown):
+    client, world = shown
+    world.scene()
+    client.tick()
+    tick, before = world.state(-1)
+    client.physics.pick(4)
+    client.tick()
+    header, arrays = decode(world.state(tick)[1])
+    assert arrays["picked"].tolist() == [4]
+    assert header["rigid"] == decode(before)[0]["rigid"] + 1
+    rigid, shapes = decode(world.rigid())
+    assert len(rigid["names"]) * 4 == len(arrays["rigid_turn"].ravel())
+    row = next(i for i, name in enumerate(rigid["names"]) if "bunch" in name or Organ.BUNCH.name.lower() in name)
+    carriers = shapes["carrier"]
+    assert (carriers == len(client.model.body_mass) + 1 + row).sum() >= client.model.bunch_berries[4]
+
+
+def test_the_eyes_of_a_spectator_follow_the_page(shown):
+    client, world = shown
+    here, there = (4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0)
+    world.take(0, PageInput(1, here))
+    world.take(1, PageInput(1, there))
+    client.tick()
+    assert tuple(client.pose) == here, "the first page leads"
+    world.leave(0)
+    world.take(1, PageInput(1, there))
+    client.tick()
+    assert tuple(client.pose) == there
+
+
+def test_the_page_of_a_robot_far_away_looks_over_its_shoulder_to_the_vines():
+    with MemoryHub().bus("visitor") as bus:
+        scene = load_scene("demo")
+        model = generate(scene)
+        start = frames.pose(np.array([-12.0, 3.0, 0.0]), frames.from_yaw(2.5))
+        client = Client(scene, model, load_description("vinebot"), bus, name="visitor", pose=start)
+        view = decode(PageWorld(client).scene())[1]["start"]
+    ahead = frames.rotate(view[3:], np.array([1.0, 0.0, 0.0]))[:2]
+    ways = model.tree_pose[:, :2] - view[:2]
+    angles = np.arccos(ways @ ahead / np.linalg.norm(ways, axis=1))
+    assert angles.min() < FOLLOW_YAW + 0.1
+    assert np.linalg.norm(view[:2] - start[:2]) < 3.0
+
+
+def test_of_a_large_vineyard_a_page_loads_what_is_nearest(shown):
+    client, _ = shown
+    whole = decode(PageWorld(client).scene())[1]
+    part = decode(PageWorld(client, most=5000).scene())[1]
+    assert 4900 < len(part["material"]) <= 5000
+    np.testing.assert_array_equal(part["first"], np.cumsum(part["size"]) - part["size"])
+
+    def away(arrays):
+        return np.linalg.norm(arrays["ball"].reshape(-1, 4)[:, :3] - client.pose[:3], axis=1)
+
+    left_out = np.sort(away(whole))[len(part["size"]) :]
+    assert away(part).max() <= left_out.min() + 1e-6
+    cluster = len(part["size"]) // 2
+    same = np.flatnonzero((whole["ball"].reshape(-1, 4) == part["ball"].reshape(-1, 4)[cluster]).all(1))[0]
+    rows = [slice(int(a["first"][k]), int(a["first"][k] + a["size"][k])) for a, k in ((part, cluster), (whole, same))]
+    np.testing.assert_array_equal(part["shape"].reshape(-1, 16)[rows[0]], whole["shape"].reshape(-1, 16)[rows[1]])

@@ -1,0 +1,112 @@
+"""A person whose head and hands are tracked: by a headset and its controllers, or by mouse and keys."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.avatar.gestures import OPEN_HAND, FingerBend, Gestures
+from vinesim.avatar.leg_estimator import LegEstimator
+from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.scene.values import HumanPose
+
+MAX_PERIOD = 0.1
+"""Inputs that are further apart are not interpolated over the whole time between them [s]. GUESSED."""
+_SMOOTHING = 0.2
+"""Weight of the newest interval in the mean time between inputs [1]."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class TrackedPoints:
+    """One input: where the person's head and hands are."""
+
+    head: np.ndarray
+    """[7] m, 1, world: between the eyes, x forward, z up."""
+    left: np.ndarray | None = None
+    """[7] of the palm as in :class:`HumanPose`; None: it hangs down."""
+    right: np.ndarray | None = None
+    closed: tuple[bool, bool] = (False, False)
+    """Left, right."""
+    fingers: tuple[FingerBend, FingerBend] = (OPEN_HAND, OPEN_HAND)
+
+
+class TrackedHuman:
+    """A source for :class:`vinesim.avatar.local_human.LocalHuman`.
+
+    Inputs come at the rate of a display, 60 to 90 a second, steps are 100 a second: between inputs the points move
+    evenly, so that their velocities are those of the person; that costs one interval of delay.
+    """
+
+    def __init__(
+        self,
+        root: np.ndarray,
+        height: float = 1.75,
+        dt: float = 0.01,
+        clock: Callable[[], float] | None = None,
+        gestures: Gestures | None = None,
+    ) -> None:
+        """Stands at ``root`` [7] until the first input; ``clock`` [s] measures their intervals: unless given, steps."""
+        self.dt = dt
+        self.gestures = gestures or Gestures()
+        """The finger poses that this person can make."""
+        self.pose = standing_pose(root, height)
+        self._below_head = frames.compose(frames.inverse(self.pose.head), np.stack([self.pose.left, self.pose.right]))
+        """Of hands that hang down, in the upright frame of the head."""
+        self._legs = LegEstimator(self.pose, dt)
+        self._lock = threading.Lock()
+        self._next: TrackedPoints | None = None
+        self._points: TrackedPoints | None = None
+        self._clock = clock
+        self._steps, self._input_at = 0, 0.0
+        self._period = 2.0 * dt
+        self._start = np.stack([self.pose.head, self.pose.left, self.pose.right])
+        self._goal, self._share = self._start.copy(), 1.0
+
+    def take(self, points: TrackedPoints) -> None:
+        """The newest input; may be called from any thread."""
+        with self._lock:
+            self._next = points
+
+    def __call__(self, time: float) -> HumanPose:
+        """The pose a step later."""
+        self._steps += 1
+        with self._lock:
+            points, self._next = self._next, None
+        if points is not None:
+            self._begin(points)
+        self._share = min(1.0, self._share + self.dt / self._period)
+        head, left, right = _between(self._start, self._goal, self._share)
+        hips, left_foot, right_foot = self._legs.update(head)
+        root = frames.pose(np.array([*hips[:2], self.pose.root[2]]), frames.from_yaw(frames.to_yaw(head[3:])))
+        closed, fingers = ((False, False), (OPEN_HAND, OPEN_HAND)) if self._points is None else (
+            self._points.closed, self._points.fingers
+        )  # fmt: skip
+        self.pose = HumanPose(
+            root, head, left, right, hips, left_foot, right_foot, *closed, left_fingers=fingers[0],
+            right_fingers=fingers[1],
+        )  # fmt: skip
+        return self.pose
+
+    def _begin(self, points: TrackedPoints) -> None:
+        """Move to an input from where everything is now."""
+        now = self._steps * self.dt if self._clock is None else self._clock()
+        if self._points is not None:
+            interval = float(np.clip(now - self._input_at, self.dt, MAX_PERIOD))
+            self._period += _SMOOTHING * (interval - self._period)
+        self._input_at, self._points = now, points
+        self._start = np.stack([self.pose.head, self.pose.left, self.pose.right])
+        upright = frames.pose(points.head[:3], frames.from_yaw(frames.to_yaw(points.head[3:])))
+        hanging = frames.compose(upright, self._below_head)
+        left, right = (hanging[k] if hand is None else hand for k, hand in enumerate((points.left, points.right)))
+        self._goal, self._share = np.stack([points.head, left, right]).astype(float), 0.0
+
+
+def _between(start: np.ndarray, goal: np.ndarray, share: float) -> np.ndarray:
+    """Poses [k, 7] at a ``share`` of the way."""
+    way = frames.log(frames.multiply(frames.conjugate(start[:, 3:]), goal[:, 3:]))
+    turn = frames.multiply(start[:, 3:], frames.exp(share * way))
+    return np.concatenate([start[:, :3] + share * (goal[:, :3] - start[:, :3]), turn], 1)

@@ -1,0 +1,307 @@
+"""A stock node that sends trajectory goals to a robot: random ones, some cancelled, some preempted; and judges them.
+
+``python -m vinesim.bench.goal_sender --goals 50 --cancels 10 --preempts 10`` waits for the controllers of vinebot,
+sends one goal after the other, and prints a JSON object for each and one at the end. It knows the robot by
+/robot_description and /joint_states alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import rclpy
+from rclpy.action.client import ActionClient
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from vinesim.ros import middleware
+from vinesim.ros.messages import message_packages
+
+TIMEOUT = 120.0
+"""Longest wait for anything [s]."""
+CONTROLLERS = {
+    "head_controller": "head_", "torso_controller": "torso_", "arm_left_controller": "arm_left_",
+    "arm_right_controller": "arm_right_",
+}  # fmt: skip
+"""Trajectory controllers of vinebot, and how the names of their joints begin."""
+REACH = 0.3
+"""Targets are so far at most from where the joints were in the beginning [rad, m]."""
+SPEED_SHARE = 0.4
+"""Fastest motion as a share of the joints' limits."""
+TOLERANCE = 0.01
+"""Of the goals, for each joint [rad, m]."""
+DELAY = 0.5
+"""From now to the start of a trajectory [s]."""
+RESULT_TIMEOUT = 10.0
+"""A server keeps a result for so long [s]; later it knows nothing of the goal."""
+MOMENT = 0.4
+"""After a trajectory's start, when it is cancelled or preempted [s]."""
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+INVALID_GOAL = -1
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Waypoints of one goal."""
+
+    controller: str
+    joints: list[str]
+    times: np.ndarray
+    """[point] s after the start"""
+    positions: np.ndarray
+    """[point, joint]"""
+    velocities: np.ndarray
+    """[point, joint]"""
+
+    def at(self, begin: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity [joint] of the cubic splines at a time [s] after the start, which is at ``begin``."""
+        times = np.r_[0.0, self.times]
+        places, speeds = np.vstack([begin, self.positions]), np.vstack([0.0 * begin, self.velocities])
+        i = int(np.clip(np.searchsorted(times, time) - 1, 0, len(self.times) - 1))
+        h = times[i + 1] - times[i]
+        s = (time - times[i]) / h
+        p0, p1, m0, m1 = places[i], places[i + 1], h * speeds[i], h * speeds[i + 1]
+        position = (2 * s**3 - 3 * s**2 + 1) * p0 + (s**3 - 2 * s**2 + s) * m0
+        position = position + (3 * s**2 - 2 * s**3) * p1 + (s**3 - s**2) * m1
+        velocity = (6 * s**2 - 6 * s) * (p0 - p1) + (3 * s**2 - 4 * s + 1) * m0 + (3 * s**2 - 2 * s) * m1
+        return position, velocity / h
+
+
+def plan(random: np.random.Generator, controller: str, joints: dict[str, Joint], start: np.ndarray) -> Plan:
+    """A random goal with one to three waypoints, from ``start`` [joint]; at its last waypoint it stands."""
+    own = list(joints.values())
+    count = int(random.integers(1, 4))
+    lower, upper = (np.array([getattr(one, side) for one in own]) for side in ("lower", "upper"))
+    positions = np.clip(
+        [one.home for one in own] + random.uniform(-REACH, REACH, (count, len(own))), lower + 0.02, upper - 0.02
+    )
+    steps = np.diff(np.vstack([start, positions]), axis=0)
+    spans = np.maximum((np.abs(steps) / [one.velocity for one in own]).max(1) / SPEED_SHARE * 1.5, 0.4)
+    times = np.cumsum(spans)
+    velocities = np.zeros_like(positions)
+    for i in range(count - 1):
+        velocities[i] = 0.5 * (steps[i] / spans[i] + steps[i + 1] / spans[i + 1])
+    return Plan(controller, list(joints), times, positions, velocities)
+
+
+@dataclasses.dataclass
+class Joint:
+    """What is known of a joint."""
+
+    lower: float
+    upper: float
+    velocity: float
+    home: float
+
+
+class GoalSender:
+    """The node: what the robot says, and its trajectory controllers."""
+
+    def __init__(self) -> None:
+        from control_msgs.action import FollowJointTrajectory
+
+        self.node = rclpy.create_node("goal_sender")
+        self.stamp = 0.0
+        """Time of the robot's world [s]."""
+        self.history: list[tuple[float, np.ndarray, np.ndarray]] = []
+        """Stamp [s], positions and velocities of all joints, since the last goal was sent."""
+        self.names: list[str] = []
+        self.urdf = ""
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.node.create_subscription(String, "/robot_description", self._take_description, latched)
+        self.node.create_subscription(JointState, "/joint_states", self._take, 100)
+        self.node.create_subscription(Clock, "/clock", self._take_time, 1)
+        self.until(lambda: self.urdf and self.history and self.stamp, "the robot")
+        self.joints = {name: self._joints(start) for name, start in CONTROLLERS.items()}
+        self.actions = {
+            name: ActionClient(self.node, FollowJointTrajectory, f"/{name}/follow_joint_trajectory")
+            for name in CONTROLLERS
+        }
+        for action in self.actions.values():
+            self.until(action.server_is_ready, "the controllers")
+        self.feedback: list[Any] = []
+
+    def _joints(self, start: str) -> dict[str, Joint]:
+        found = {}
+        for element in ElementTree.fromstring(self.urdf).iterfind("joint"):
+            name, limit = element.get("name", ""), element.find("limit")
+            if name.startswith(start) and name in self.names and limit is not None:
+                lower, upper, velocity = (float(limit.get(key, "0")) for key in ("lower", "upper", "velocity"))
+                found[name] = Joint(lower, upper, velocity, float(self.positions([name])[0]))
+        return found
+
+    def _take_description(self, message: String) -> None:
+        self.urdf = message.data
+
+    def _take(self, message: JointState) -> None:
+        stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+        self.names = list(message.name)
+        self.history.append((stamp, np.array(message.position), np.array(message.velocity)))
+
+    def _take_time(self, message: Clock) -> None:
+        self.stamp = message.clock.sec + 1e-9 * message.clock.nanosec
+
+    def positions(self, joints: list[str]) -> np.ndarray:
+        """[joint] The newest."""
+        return self.history[-1][1][[self.names.index(name) for name in joints]]
+
+    def until(self, done: Callable[[], object], what: str) -> None:
+        """Take messages until ``done()``; RuntimeError after :data:`TIMEOUT`."""
+        end = time.monotonic() + TIMEOUT
+        while not done():
+            rclpy.spin_once(self.node, timeout_sec=0.1)
+            if time.monotonic() > end:
+                raise RuntimeError(f"waited {TIMEOUT:.0f} s in vain for {what}")
+
+    def wait(self, seconds: float) -> None:
+        """Wait in the robot's time [s], until its joint states have come so far as well."""
+        end = self.now() + seconds
+        self.until(lambda: self.stamp >= end and self.history[-1][0] >= end, "the robot's time")
+
+    def now(self) -> float:
+        """Time of the robot's world [s], by a message of /clock that comes from now on."""
+        for _ in range(2):  # one may have waited
+            before = self.stamp
+            self.until(lambda before=before: self.stamp != before, "the robot's time")
+        return self.stamp
+
+    def send(self, one: Plan) -> tuple[Any, float]:
+        """Send a goal; its accepted handle, and the stamp of its start [s]."""
+        from control_msgs.action import FollowJointTrajectory
+        from control_msgs.msg import JointTolerance
+
+        begin = self.now() + DELAY
+        goal = FollowJointTrajectory.Goal(trajectory=JointTrajectory(joint_names=one.joints))
+        goal.trajectory.header.stamp.sec, goal.trajectory.header.stamp.nanosec = divmod(round(begin * 1e9), 10**9)
+        for t, position, velocity in zip(one.times, one.positions, one.velocities, strict=True):
+            point = JointTrajectoryPoint(positions=position.tolist(), velocities=velocity.tolist())
+            point.time_from_start.sec, point.time_from_start.nanosec = divmod(round(t * 1e9), 10**9)
+            goal.trajectory.points.append(point)
+        goal.goal_tolerance = [JointTolerance(name=name, position=TOLERANCE) for name in one.joints]
+        goal.goal_time_tolerance.sec = 2
+        self.feedback, self.history = [], self.history[-1:]
+        future = self.actions[one.controller].send_goal_async(goal, lambda m: self.feedback.append(m.feedback))
+        self.until(future.done, "an answer to a goal")
+        handle = future.result()
+        if handle is None or not handle.accepted:
+            raise RuntimeError(f"{one.controller} refused a goal")
+        return handle, begin
+
+    def result(self, handle: Any) -> tuple[int, int, str]:
+        """Status, error code and text of a goal that has ended."""
+        future = handle.get_result_async()
+        self.until(future.done, "a result")
+        answer = future.result()
+        return answer.status, answer.result.error_code, answer.result.error_string
+
+
+def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, int, str]) -> dict[str, Any]:
+    """Whether a goal that ran to its end did what it says."""
+    columns = [sender.names.index(name) for name in one.joints]
+    sender.wait(0.1)
+    wanted, measured = 0.0, 0.0
+    first = np.array(sender.feedback[0].desired.positions) if sender.feedback else one.positions[0]
+    for told in sender.feedback:
+        t = told.header.stamp.sec + 1e-9 * told.header.stamp.nanosec - begin
+        if 0.0 < t < one.times[-1]:
+            wanted = max(wanted, float(np.abs(one.at(first, t)[1] - told.desired.velocities).max()))
+    stamps = np.array([row[0] for row in sender.history]) - begin
+    speeds = np.array([row[2][columns] for row in sender.history])
+    for t, velocity in zip(one.times[:-1], one.velocities[:-1], strict=True):
+        found = [np.interp(t, stamps, speeds[:, i]) for i in range(len(columns))]
+        measured = max(measured, float(np.abs(found - velocity).max()))
+    off = float(np.abs(sender.positions(one.joints) - one.positions[-1]).max())
+    return {
+        "kind": "goal", "controller": one.controller, "waypoints": len(one.times), "text": status[2],
+        "right": status[:2] == (SUCCEEDED, 0), "off": off,
+        "wanted_velocity_off": wanted, "velocity_off": measured, "fastest": float(np.abs(speeds).max()),
+    }  # fmt: skip
+
+
+def cancel(sender: GoalSender, one: Plan) -> tuple[dict[str, Any], list[Any]]:
+    """Cancel a goal on its way; the joints stop."""
+    slow = dataclasses.replace(one, times=one.times * 3.0 / one.times[-1], velocities=0.0 * one.velocities)
+    handle, _ = sender.send(slow)
+    sender.wait(DELAY + MOMENT)
+    answer = handle.cancel_goal_async()
+    sender.until(answer.done, "the answer to a cancel")
+    accepted = len(answer.result().goals_canceling) == 1
+    status, _, text = sender.result(handle)
+    sender.wait(0.5)
+    stopped = sender.positions(one.joints)
+    sender.wait(0.5)
+    drift = float(np.abs(sender.positions(one.joints) - stopped).max())
+    right = accepted and status == CANCELED
+    return {"kind": "cancel", "controller": one.controller, "right": right, "drift": drift, "text": text}, [handle]
+
+
+def preempt(sender: GoalSender, one: Plan, newer: Plan) -> tuple[dict[str, Any], list[Any]]:
+    """Send a newer goal while one is on its way: the older is aborted, the newer reached."""
+    slow = dataclasses.replace(one, times=one.times * 3.0 / one.times[-1], velocities=0.0 * one.velocities)
+    first, _ = sender.send(slow)
+    sender.wait(DELAY + MOMENT)
+    second, begin = sender.send(newer)
+    older = sender.result(first)
+    row = judge_goal(sender, newer, begin, sender.result(second))
+    right = row["right"] and older[:2] == (ABORTED, INVALID_GOAL)
+    text = f"{older[2]}; {row['text']}".strip("; ")
+    return {"kind": "preempt", "controller": one.controller, "right": right, "off": row["off"], "text": text}, [
+        first, second,
+    ]  # fmt: skip
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Send the goals; 0 if all could be sent."""
+    parser = argparse.ArgumentParser(prog="python -m vinesim.bench.goal_sender", description="Send goals to a robot.")
+    for kind, count in (("goals", 50), ("cancels", 10), ("preempts", 10), ("seed", 1)):
+        parser.add_argument(f"--{kind}", type=int, default=count)
+    given = parser.parse_args(arguments)
+    middleware.clear_profile()
+    message_packages.ensure_importable(["control_msgs"])
+    rclpy.init(args=[])
+    sender, random = GoalSender(), np.random.default_rng(given.seed)
+    kinds = ["goal"] * given.goals + ["cancel"] * given.cancels + ["preempt"] * given.preempts
+    handles: list[Any] = []
+    for number, kind in enumerate(random.permutation(kinds)):
+        controller = list(CONTROLLERS)[number % len(CONTROLLERS)]
+        joints = sender.joints[controller]
+
+        def draw(controller: str = controller, joints: dict[str, Joint] = joints) -> Plan:
+            return plan(random, controller, joints, sender.positions(list(joints)))
+
+        if kind == "goal":
+            one = draw()
+            handle, begin = sender.send(one)
+            row, sent = judge_goal(sender, one, begin, sender.result(handle)), [handle]
+        elif kind == "cancel":
+            row, sent = cancel(sender, draw())
+        else:
+            row, sent = preempt(sender, draw(), draw())
+        handles += sent
+        _print(row)
+    sender.wait(RESULT_TIMEOUT + 1.0)
+    known = sum(sender.result(handle)[0] != 0 for handle in handles)
+    _print({"kind": "end", "sent": len(handles), "known": known})
+    sender.node.destroy_node()
+    rclpy.shutdown()
+    return 0
+
+
+def _print(row: dict[str, Any]) -> None:
+    sys.stdout.write(json.dumps(row) + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

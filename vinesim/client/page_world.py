@@ -1,0 +1,248 @@
+"""What pages are shown: the primitives of the cameras once, then the poses of what has moved."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.avatar.gestures import OPEN_HAND
+from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
+from vinesim.client.client import Client
+from vinesim.client.spectator import Spectator, follow_view
+from vinesim.physics.plants.sway import Sway
+from vinesim.scene.model import Model
+from vinesim.scene.values import Haptic, Snapshot
+from vinesim.sensors.scene import textures
+from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.scene.static_primitives import row_layout
+from vinesim.sensors.scheduler import load_kernels
+from vinesim.web import array_message
+from vinesim.web.page_input import PageInput, TrackedPerson
+from vinesim.web.page_server import PageServer
+
+GRASS = 25.0
+"""Tufts a square metre: a browser draws fewer than the cameras."""
+NEAR = 3.0
+"""An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
+MAX_PRIMITIVES = 400_000
+"""Of plants and ground that a page loads: 32 MB."""
+_TURN_STEPS = 32767
+"""Steps of a component of a quaternion from 0 to 1."""
+
+
+class PageWorld:
+    """The world of one client as its pages see it. The client's loop writes it, the server's thread reads it.
+
+    Nothing is laid out before the first page asks. A page knows the poses of all trees at rest. It is kept in which
+    tick each tree has last moved; a page is sent the trees that have moved since the last state that was sent to it.
+    """
+
+    def __init__(self, client: Client, person: TrackedHuman | None = None, most: int = MAX_PRIMITIVES) -> None:
+        """``person``: the source of the client's own human, whom the first page moves; ``most``: primitives of plants
+        and ground that a page loads, those nearest to where it looks from at first."""
+        self._client, self._person, self._most = client, person, most
+        self._at_rest = client.physics.snapshot().body_q.copy()
+        self._moved_at = np.full(len(client.model.tree_first), -1)
+        """[tree] tick"""
+        self._sway: Sway | None = None
+        self._primitives: Primitives | None = None
+        """None until a page asks."""
+        self._lock = threading.Lock()
+        self._snapshot: Snapshot | None = None
+        self._rigid_version, self._rigid = 0, b""
+        self._visuals: tuple[Any, ...] | None = None
+        self._driver: int | None = None
+        """The page that moves the spectator's eyes or the person: the first that sends anything."""
+        self._eyes: np.ndarray | None = None
+        self._haptics: dict[str, Haptic] = {}
+        """Strongest vibration of each hand since the last state."""
+
+    # ------------------------------------------------------------------ in the client's loop
+
+    def collect(self, server: PageServer) -> None:
+        """After a step: note what has moved, take a snapshot if a page looks, and lead a spectator's eyes there."""
+        physics = self._client.physics
+        self._moved_at[physics.plants.awake] = physics.tick
+        if self._eyes is not None and isinstance(self._client, Spectator):
+            self._client.pose = self._eyes
+        if self._person is not None:
+            for haptic in self._client.humans[self._client.name].haptics:
+                if (before := self._haptics.get(haptic.hand)) is None or before.amplitude < haptic.amplitude:
+                    self._haptics[haptic.hand] = haptic
+        if self._sway is None or not server.has_viewers:
+            return
+        snapshot = physics.snapshot()
+        swayed = self._sway.apply(snapshot, np.flatnonzero(self._moved_at == physics.tick))
+        self._moved_at[swayed.moved_trees] = physics.tick
+        with self._lock:
+            self._snapshot = swayed
+        server.notify()
+
+    # ------------------------------------------------------------------ in the server's thread
+
+    def scene(self) -> bytes:
+        """Everything that stands or grows, at rest; tables of leaves' outlines; light of the ground."""
+        if self._primitives is None:
+            load_kernels()
+            self._sway = Sway(self._client.model)
+            self._primitives = Primitives(self._client.model, grass=GRASS)
+        primitives, scene = self._primitives, self._client.scene
+        outline, hull = textures.leaf_outlines()
+        ground = primitives.materials
+        model = self._client.model
+        sun = scene.sun.direction(0.0)
+        return array_message.encode(
+            {
+                "scene": scene.name, "seed": scene.seed, "sun": list(sun), "rows": list(row_layout(model)),
+                "bodies": len(model.body_mass), "dt": self._client.physics.dt,
+                "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
+                "ground_columns": int(ground.ground_sky.shape[1]),
+                "person": None if self._person is None else self._client.name,
+                "gestures": {} if self._person is None else dict(self._person.gestures.poses),
+                "buttons": {} if self._person is None else dict(self._person.gestures.buttons),
+            },
+            _nearest(primitives, self._start_view()[:3], self._most)
+            | {
+                "poses": self._at_rest.astype(np.float32), "outline": outline, "hull": hull,
+                "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(self._start_view(), np.float32),
+            },
+        )  # fmt: skip
+
+    def rigid(self) -> bytes:
+        """Robots, people, boxes and picked bunches that there are now."""
+        return self._rigid
+
+    def state(self, since: int) -> tuple[int, bytes] | None:
+        """Bodies of the trees that have moved after the tick ``since``, all rigid bodies, and what was picked."""
+        with self._lock:
+            snapshot = self._snapshot
+        if snapshot is None or self._primitives is None or snapshot.tick <= since:
+            return None
+        if snapshot.visuals is not self._visuals:
+            self._lay_out_rigid(self._primitives, snapshot)
+        body = self._bodies(np.flatnonzero(self._moved_at > since))
+        pose, rigid = snapshot.body_q[body], np.asarray(snapshot.visual_q).reshape(-1, 7)
+        haptics, self._haptics = self._haptics, {}
+        state = array_message.encode(
+            {
+                "tick": snapshot.tick, "time": snapshot.time, "rigid": self._rigid_version,
+                "haptics": {hand: [one.amplitude, one.duration] for hand, one in haptics.items()},
+            },
+            {
+                "body": body.astype(np.uint32), "place": pose[:, :3].astype(np.float32), "turn": _turns(pose),
+                "rigid_place": rigid[:, :3].astype(np.float32), "rigid_turn": _turns(rigid),
+                "picked": np.flatnonzero(~snapshot.bunch_attached).astype(np.uint32),
+            },
+        )  # fmt: skip
+        return snapshot.tick, state
+
+    def _lay_out_rigid(self, primitives: Primitives, snapshot: Snapshot) -> None:
+        primitives.update(snapshot)
+        self._visuals, self._rigid_version = snapshot.visuals, self._rigid_version + 1
+        rows = slice(primitives.plant_count, primitives.count)
+        clusters = slice(len(primitives.cluster_first) - len(primitives.rigid_clusters), None)
+        self._rigid = array_message.encode(
+            {"version": self._rigid_version, "names": [visual.name for visual in snapshot.visuals]},
+            _columns(primitives, rows) | _clusters(primitives, clusters, primitives.plant_count),
+        )
+
+    def take(self, page: int, said: PageInput) -> None:
+        """Take over where a page looks from and what its person does; only the first page's."""
+        if self._driver is None:
+            self._driver = page
+        if page != self._driver:
+            return
+        self._eyes = np.array(said.view)
+        if self._person is not None and said.person is not None:
+            self._person.take(_tracked(said.person))
+
+    def leave(self, page: int) -> None:
+        """A page is gone: another one may move the person."""
+        if page == self._driver:
+            self._driver = None
+
+    def _bodies(self, trees: np.ndarray) -> np.ndarray:
+        """Bodies of some trees, one tree after the other."""
+        model = self._client.model
+        first, size = model.tree_first[trees], model.tree_size[trees]
+        return np.repeat(first - (np.cumsum(size) - size), size) + np.arange(size.sum())
+
+    def _start_view(self) -> np.ndarray:
+        """Where the page looks from at first: a spectator's eyes, else over the shoulder of the client's own actor."""
+        client = self._client
+        if isinstance(client, Spectator):
+            return client.pose
+        if self._person is not None:
+            return client.humans[client.name].pose.head
+        name = next(iter(client.robots), client.name)
+        root = client.physics.rigid.base_state(name)[0] if client.robots else client.humans[name].pose.root
+        return follow_view(_towards_plants(np.asarray(root, float), client.model))
+
+
+def _towards_plants(root: np.ndarray, model: Model) -> np.ndarray:
+    """A pose [7], turned to the nearest tree if that is far."""
+    ways = model.tree_pose[:, :2] - root[:2]
+    distances = np.linalg.norm(ways, axis=1)
+    if not len(distances) or distances.min() < NEAR:
+        return root
+    x, y = ways[np.argmin(distances)]
+    return frames.pose(root[:3], frames.from_yaw(np.arctan2(y, x)))
+
+
+def _tracked(person: TrackedPerson) -> TrackedPoints:
+    """A page's person as its avatar takes it."""
+    hands = person.left, person.right
+    left, right = (None if hand is None else np.array(hand.pose) for hand in hands)
+    return TrackedPoints(
+        np.array(person.head), left, right, (bool(hands[0] and hands[0].closed), bool(hands[1] and hands[1].closed)),
+        (OPEN_HAND if hands[0] is None else hands[0].fingers, OPEN_HAND if hands[1] is None else hands[1].fingers),
+    )  # fmt: skip
+
+
+def _turns(pose: np.ndarray) -> np.ndarray:
+    """Quaternions of poses [k, 7] in steps, [k, 4] int16."""
+    return np.round(pose[:, 3:] * _TURN_STEPS).astype(np.int16)
+
+
+def _columns(primitives: Primitives, rows: slice) -> dict[str, np.ndarray]:
+    """Values of primitives as a page needs them."""
+    columns = primitives.local_columns(rows)
+    shape = np.concatenate([columns[name] for name in "abcd"], 1).astype(np.float32)
+    colour = np.round(255.0 * np.clip(columns["tint"], 0.0, 1.0) ** (1.0 / 2.2))
+    light = np.round(255.0 * np.clip(columns["sky"], 0.0, 1.0))
+    surface = np.column_stack([colour, light]).astype(np.uint8)
+    return {
+        "shape": shape, "surface": surface, "material": columns["material"].astype(np.uint8),
+        "carrier": columns["carrier"].astype(np.uint32),
+    }  # fmt: skip
+
+
+def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> dict[str, np.ndarray]:
+    """Primitives of the clusters of plants and ground nearest to a ``place`` [3] m, at most ``most``; the clusters."""
+    count = len(primitives.cluster_first) - len(primitives.rigid_clusters)
+    clusters = _clusters(primitives, slice(0, count))
+    columns = _columns(primitives, slice(0, primitives.plant_count))
+    if primitives.plant_count <= most:
+        return columns | clusters
+    order = np.argsort(np.linalg.norm(clusters["ball"][:, :3] - place, axis=1), kind="stable")
+    kept = np.sort(order[np.cumsum(clusters["size"][order]) <= most])
+    clusters = {name: values[kept] for name, values in clusters.items()}
+    first, size = clusters["first"].astype(int), clusters["size"].astype(int)
+    start = np.cumsum(size) - size
+    rows = np.repeat(first - start, size) + np.arange(size.sum())
+    clusters["first"] = start.astype(np.uint32)
+    return {name: values[rows] for name, values in columns.items()} | clusters
+
+
+def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, np.ndarray]:
+    """Clusters as a page needs them: runs of primitives, counted from ``row``, and balls around them in the world."""
+    return {
+        "first": (primitives.cluster_first[which] - row).astype(np.uint32),
+        "size": primitives.cluster_size[which].astype(np.uint32),
+        "kind": primitives.cluster_kind[which].astype(np.uint8),
+        "bunch": primitives.cluster_bunch[which].astype(np.int32),
+        "ball": primitives.ball.numpy()[which].astype(np.float32),
+    }

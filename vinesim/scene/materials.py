@@ -1,0 +1,103 @@
+"""Materials of surfaces that touch: friction and contact stiffness by pair, read from ``data/materials``."""
+
+from __future__ import annotations
+
+import enum
+import functools
+
+import msgspec
+import numpy as np
+
+from vinesim.scene.data_files import find_data_file
+from vinesim.scene.ids import Organ
+from vinesim.scene.plant_parameters import Number
+from vinesim.scene.toml_loader import DataError, load_toml
+
+
+class Material(enum.IntEnum):
+    """What the surface of a body is made of, as far as contacts depend on it."""
+
+    UNKNOWN = 0
+    """Of no pair in the table."""
+    BARK = 1
+    """Canes, arms and trunks."""
+    SHOOT = 2
+    """Green shoots and stalks of bunches."""
+    BERRY = 3
+    """Skin of berries."""
+    HAND = 4
+    """Skin of people's hands."""
+    RUBBER = 5
+    PLASTIC = 6
+    STEEL = 7
+    """And other bare metal."""
+    SOIL = 8
+
+
+OF_ORGAN = {
+    Organ.GROUND: Material.SOIL,
+    Organ.WIRE: Material.STEEL,
+    Organ.TRUNK: Material.BARK,
+    Organ.ARM: Material.BARK,
+    Organ.CANE: Material.BARK,
+    Organ.PEDUNCLE: Material.SHOOT,
+    Organ.BUNCH: Material.BERRY,
+    Organ.BOX: Material.PLASTIC,
+}
+"""Materials of plants, trellis and crates; a pole is of no known material."""
+
+
+class _ContactFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Numbers by pair, written ``bark-steel``, in either order."""
+
+    friction: dict[str, Number] = {}
+    stiffness: dict[str, Number] = {}
+
+
+_UNITS = {"friction": "1", "stiffness": "N/m"}
+
+
+def materials_of_organs(organs: np.ndarray) -> np.ndarray:
+    """:class:`Material` of pieces of plants and trellis from their ``organs`` [k] (:class:`Organ`), int32."""
+    table = np.zeros(max(Organ) + 1, np.int32)
+    for organ, material in OF_ORGAN.items():
+        table[organ] = material
+    return table[organs]
+
+
+def pair_table(quantity: str, default: float, name: str = "contact") -> np.ndarray:
+    """``friction`` [1] or ``stiffness`` [N/m] of each two materials, symmetric [material, material].
+
+    ``default``: of pairs that the file does not list. ``name``: of a file in ``data/materials``, or a path. Raises
+    :class:`DataError` for a pair or a unit that it cannot be.
+    """
+    table = np.full((len(Material), len(Material)), float(default))
+    for (a, b), value in _listed(quantity, name).items():
+        table[a, b] = table[b, a] = value
+    return table
+
+
+def pair_numbers(name: str = "contact") -> dict[str, dict[str, Number]]:
+    """All numbers of the file with their sources, by quantity and pair as written."""
+    file = load_toml(find_data_file("materials", name, ".toml"), _ContactFile)
+    return {"friction": file.friction, "stiffness": file.stiffness}
+
+
+@functools.cache
+def _listed(quantity: str, name: str) -> dict[tuple[int, int], float]:
+    path = find_data_file("materials", name, ".toml")
+    known = {material.name.lower(): int(material) for material in Material if material}
+    pairs: dict[tuple[int, int], float] = {}
+    for text, number in pair_numbers(name)[quantity].items():
+        place, words = f"{path}: {quantity}.{text}", text.split("-")
+        if len(words) != 2 or not known.keys() >= set(words):
+            raise DataError(f"{place} is no pair of materials; give two of {', '.join(known)} with a hyphen between")
+        if number.unit != _UNITS[quantity]:
+            raise DataError(f"{place}.unit is {number.unit!r}; give the value in {_UNITS[quantity]!r}")
+        if not number.value > 0.0:
+            raise DataError(f"{place}.value is {number.value}; give a number above 0")
+        first, second = sorted(known[word] for word in words)
+        if (first, second) in pairs:
+            raise DataError(f"{place} is given twice; remove one of the two")
+        pairs[first, second] = number.value
+    return pairs

@@ -1,0 +1,1 @@
+"""The page on which people and spectators see the vineyard: its server, and its messages."""

@@ -1,0 +1,90 @@
+// Base meshes of each kind of primitive, coarse to fine; the vertex shaders bend them into place.
+
+/** Cone or cylinder with n sides; with ends or as an open tube. */
+function tube(sides, closed, flat) {
+  const points = [], faces = [];
+  const ring = (z) => {
+    const first = points.length / 3;
+    for (let k = 0; k < sides; ++k) points.push(Math.cos(k / sides * 2 * Math.PI), Math.sin(k / sides * 2 * Math.PI), z);
+    return first;
+  };
+  const low = ring(0), high = ring(1);
+  for (let k = 0; k < sides; ++k) {
+    const next = (k + 1) % sides;
+    faces.push(low + k, low + next, high + next, low + k, high + next, high + k);
+  }
+  if (closed) {
+    const rims = flat ? [ring(-1), ring(2)] : [low, high];
+    const poles = [points.length / 3, points.length / 3 + 1];
+    points.push(0, 0, -1, 0, 0, 2);
+    for (let k = 0; k < sides; ++k) {
+      const next = (k + 1) % sides;
+      faces.push(poles[0], rims[0] + next, rims[0] + k, poles[1], rims[1] + k, rims[1] + next);
+    }
+  }
+  return { points, faces };
+}
+
+/** Sphere of triangles: an octahedron whose edges were halved so many times. */
+function sphere(halvings) {
+  let points = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]];
+  let faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]];
+  for (let round = 0; round < halvings; ++round) {
+    const known = new Map();
+    const middle = (i, j) => {
+      const key = Math.min(i, j) * 1e6 + Math.max(i, j);
+      if (!known.has(key)) {
+        const sum = points[i].map((x, axis) => x + points[j][axis]), length = Math.hypot(...sum);
+        known.set(key, points.push(sum.map((x) => x / length)) - 1);
+      }
+      return known.get(key);
+    };
+    faces = faces.flatMap(([a, b, c]) => {
+      const ab = middle(a, b), bc = middle(b, c), ca = middle(c, a);
+      return [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]];
+    });
+  }
+  return { points: points.flat(), faces: faces.flat() };
+}
+
+/** Blade of so many strips on each side of the midrib and along it. */
+function blade(across, along) {
+  const points = [], faces = [], columns = 2 * across + 1;
+  for (let j = 0; j <= along; ++j)
+    for (let i = 0; i < columns; ++i) points.push(i / across - 1, j / along, 0);
+  for (let j = 0; j < along; ++j)
+    for (let i = 0; i < columns - 1; ++i) {
+      const k = j * columns + i;
+      faces.push(k, k + 1, k + columns + 1, k, k + columns + 1, k + columns);
+    }
+  return { points, faces };
+}
+
+/** Cube whose normals are told by doubled coordinates. */
+function cube() {
+  const points = [], faces = [];
+  for (let axis = 0; axis < 3; ++axis)
+    for (const side of [-1, 1]) {
+      const first = points.length / 3;
+      for (const [u, v] of [[-1, -1], [1, -1], [1, 1], [-1, 1]]) {
+        const corner = [0, 0, 0];
+        corner[axis] = 2 * side;
+        corner[(axis + 1) % 3] = u * side;
+        corner[(axis + 2) % 3] = v;
+        points.push(...corner);
+      }
+      faces.push(first, first + 1, first + 2, first, first + 2, first + 3);
+    }
+  return { points, faces };
+}
+
+/** By kind, in the order of its numbers (primitives.py); each from fine to coarse. */
+export const MESHES = [
+  { name: "cone", levels: [tube(7, true, false), tube(4, false, false), tube(3, false, false)] },
+  { name: "spheroid", levels: [sphere(2), sphere(1), sphere(0)] },
+  { name: "leaf", levels: [blade(2, 4), blade(1, 2), blade(1, 1)] },
+  { name: "box", levels: [cube()] },
+  { name: "ellipsoid", levels: [sphere(3)] },
+  { name: "cylinder", levels: [tube(16, true, true)] },
+  { name: "triangle", levels: [{ points: [0, 0, 0, 1, 0, 0, 2, 0, 0], faces: [0, 1, 2] }] },
+];

@@ -1,0 +1,109 @@
+// A person in a headset: WebXR poses of head and controllers, sticks to walk and turn, pulses for what the hands feel.
+
+import * as THREE from "three";
+
+const WALK = 1.4, TURN = Math.PI / 6, DEAD = 0.25; // m/s, rad, share of a stick's way
+const HALF = Math.SQRT1_2;
+/** From the browser's axes (y up) to the world's (z up). */
+const UPRIGHT = new THREE.Quaternion(HALF, 0, 0, HALF);
+/** From an eye or a pointing ray of WebXR (along -z, y up) to x forward, z up. */
+const FORWARD = new THREE.Quaternion(-0.5, 0.5, 0.5, 0.5);
+
+export class Headset {
+  /** `rig` carries camera and controllers: the floor that the person stands on. */
+  constructor(renderer, rig, camera, poses) {
+    this.poses = poses; // finger poses of the buttons a and b
+    this.renderer = renderer;
+    this.rig = rig;
+    this.turned = false;
+    this.viewer = new THREE.Matrix4(); // between the eyes, on the rig
+    renderer.xr.enabled = true;
+    renderer.xr.setReferenceSpaceType("local-floor");
+    rig.add(camera);
+    this.rays = [0, 1].map((k) => rig.add(renderer.xr.getController(k)) && renderer.xr.getController(k));
+    this.sources = [null, null];
+    this.rays.forEach((ray, k) => {
+      ray.addEventListener("connected", (event) => { this.sources[k] = event.data; });
+      ray.addEventListener("disconnected", () => { this.sources[k] = null; });
+    });
+  }
+
+  get isWorn() { return this.renderer.xr.isPresenting; }
+
+  /** Ask the browser for the headset; called by a click. */
+  async enter(place, yaw) {
+    const session = await navigator.xr.requestSession("immersive-vr",
+      { requiredFeatures: ["local-floor"], optionalFeatures: ["hand-tracking"] });
+    this.rig.position.set(place[0], 0, -place[1]);
+    this.rig.rotation.y = yaw - Math.PI / 2;
+    await this.renderer.xr.setSession(session);
+  }
+
+  /** Of one XRFrame: where the head is; sticks: left walks where the head looks, right turns by 30 degrees. */
+  update(frame, seconds) {
+    const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
+    if (viewer) this.viewer.fromArray(viewer.transform.matrix);
+    for (const source of this.sources) {
+      const [x, y] = source?.gamepad?.axes?.slice(-2) ?? [0, 0];
+      if (source?.handedness === "left" && Math.hypot(x, y) > DEAD) {
+        const [c, s] = this.heading();
+        this.rig.position.x += WALK * seconds * (-y * c + x * s);
+        this.rig.position.z -= WALK * seconds * (-y * s - x * c);
+      }
+      if (source?.handedness === "right") {
+        if (Math.abs(x) > 0.7 && !this.turned) this.turn(-Math.sign(x) * TURN);
+        this.turned = Math.abs(x) > 0.7 || (this.turned && Math.abs(x) > DEAD);
+      }
+    }
+  }
+
+  /** Cosine and sine of where the head looks, about the world's z. */
+  heading() {
+    const [, , , x, y, z, w] = this.head();
+    const yaw = Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
+    return [Math.cos(yaw), Math.sin(yaw)];
+  }
+
+  /** Turn the floor about the head. */
+  turn(angle) {
+    const head = new THREE.Vector3().setFromMatrixPosition(this.viewer).applyMatrix4(this.rig.matrixWorld);
+    this.rig.position.sub(head).applyAxisAngle(new THREE.Vector3(0, 1, 0), angle).add(head);
+    this.rig.rotation.y += angle;
+  }
+
+  /** Pose [7] m, 1 of the head in the world. */
+  head() {
+    this.rig.updateMatrixWorld();
+    return worldPose(new THREE.Matrix4().multiplyMatrices(this.rig.matrixWorld, this.viewer));
+  }
+
+  /** Tracked hands by side, for the page's message. */
+  hands() {
+    const hands = { left: null, right: null };
+    this.sources.forEach((source, k) => {
+      if (!source || !(source.handedness in hands)) return;
+      const buttons = source.gamepad?.buttons ?? [], trigger = buttons[0]?.value ?? 0, grip = buttons[1]?.value ?? 0;
+      const own = buttons[4]?.pressed ? this.poses.a : buttons[5]?.pressed ? this.poses.b : undefined;
+      const thumb = buttons.slice(3).some((button) => button.touched) || grip > 0.8 ? 1 : 0;
+      hands[source.handedness] = { pose: worldPose(this.rays[k].matrixWorld), closed: grip > 0.5 || trigger > 0.5,
+        fingers: own ?? [thumb, trigger, grip, grip, grip] };
+    });
+    return hands;
+  }
+
+  /** Let controllers vibrate: amplitude 0 to 1 and duration [s] by side. */
+  pulse(haptics) {
+    for (const source of this.sources) {
+      const [amplitude, duration] = haptics[source?.handedness] ?? [0, 0];
+      if (amplitude > 0) source.gamepad?.hapticActuators?.[0]?.pulse(amplitude, 1000 * duration);
+    }
+  }
+}
+
+/** Pose [7] in the world of something that looks along -z with y up in the browser's axes. */
+function worldPose(matrix) {
+  const place = new THREE.Vector3(), turn = new THREE.Quaternion(), scale = new THREE.Vector3();
+  matrix.decompose(place, turn, scale);
+  turn.premultiply(UPRIGHT).multiply(FORWARD);
+  return [place.x, -place.z, place.y, turn.x, turn.y, turn.z, turn.w];
+}

@@ -1,0 +1,201 @@
+// The page: loads the vineyard, follows its states; a spectator flies, a person walks, reaches and may wear a headset.
+
+import * as THREE from "three";
+import { decode, load } from "./arrays.js";
+import { FlyingEyes } from "./fly.js";
+import { Headset } from "./headset.js";
+import { DeskHand, WalkingEyes } from "./person.js";
+import { World } from "./world.js";
+
+const RETRY = 1000; // ms
+const SHADOW_PERIOD = 250; // ms
+const element = (id) => document.getElementById(id);
+
+/** What the page has done, for those who look at it from outside. */
+const page = (window.vinesim = { states: 0, drawn: 0, tick: -1, frames: 0, calls: 0, triangles: 0, haptics: {}, failure: null });
+
+class Viewer {
+  constructor(world, start) {
+    this.world = world;
+    this.renderer = new THREE.WebGLRenderer({ canvas: element("view"), antialias: true, powerPreference: "high-performance" });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.renderer.info.autoReset = false;
+    this.scene = new THREE.Scene();
+    this.scene.add(world.group);
+    this.camera = new THREE.PerspectiveCamera(60, 1, 0.03, 500);
+    this.isPerson = world.header.person !== null;
+    this.eyes = new (this.isPerson ? WalkingEyes : FlyingEyes)(this.renderer.domElement, start);
+    this.hand = this.isPerson ? new DeskHand(this.renderer.domElement, world.header.gestures) : null;
+    this.rig = new THREE.Group();
+    this.scene.add(this.rig);
+    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons);
+    this.offerHeadset();
+    this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
+    this.help.hidden = false;
+    this.newest = null;
+    this.followed = -1;
+    this.shadowAt = -1e9;
+    this.lastFrame = performance.now();
+    this.frame = 1 / 60; // time of a frame, smoothed [s]
+    this.labels = new Map();
+    addEventListener("resize", () => this.resize());
+    addEventListener("keydown", (event) => this.press(event.code));
+    this.resize();
+    this.connect();
+    this.renderer.setAnimationLoop((_, frame) => this.draw(frame));
+  }
+
+  async offerHeadset() {
+    const button = element("enter");
+    button.hidden = !await navigator.xr?.isSessionSupported("immersive-vr");
+    button.addEventListener("click", () => this.headset.enter(this.eyes.place, this.eyes.yaw).catch(fail));
+  }
+
+  connect() {
+    this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/state`);
+    this.socket.binaryType = "arraybuffer";
+    this.socket.onmessage = (event) => { ++page.states; this.take(decode(event.data)); };
+    this.socket.onclose = () => setTimeout(() => this.reconnect(), RETRY);
+  }
+
+  /** The client may have been started again, with another vineyard. */
+  async reconnect() {
+    element("state").textContent = "the client is gone; waiting for it ...";
+    try {
+      const header = await load("scene");
+      if (header.scene !== this.world.header.scene || header.seed !== this.world.header.seed) location.reload();
+      this.world.rigidVersion = 0;
+      this.connect();
+    } catch { setTimeout(() => this.reconnect(), RETRY); }
+  }
+
+  async take(state) {
+    // poses of trees come once: those of a state that is overtaken before it is drawn count, too
+    this.world.apply(state);
+    this.newest = state;
+    for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
+    this.headset.pulse(state.haptics);
+    if (state.rigid !== this.world.rigidVersion && !this.loading) {
+      this.loading = true;
+      try { this.world.setRigid(await load("rigid")); } finally { this.loading = false; }
+    }
+  }
+
+  press(code) {
+    if (code === "KeyF") {
+      const actors = this.actors();
+      this.followed = actors.length ? (this.followed + 2) % (actors.length + 1) - 1 : -1;
+    }
+    if (code === "KeyN") element("names").hidden = !element("names").hidden;
+    if (code === "KeyH") this.help.hidden = !this.help.hidden;
+  }
+
+  /** Robots and people: name, and the first body of each. */
+  actors() {
+    const first = new Map();
+    this.world.names.forEach((name, k) => {
+      const owner = name.split("/")[0];
+      if (name.includes("/") && owner !== "box" && owner !== "bunch" && !first.has(owner)) first.set(owner, k);
+    });
+    return [...first].map(([name, k]) => ({ name, carrier: this.world.bodies + 1 + k }));
+  }
+
+  draw(frame) {
+    const now = performance.now(), passed = (now - this.lastFrame) / 1000, seconds = Math.min(passed, 0.1);
+    this.lastFrame = now;
+    this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
+    const actors = this.actors();
+    if (this.eyes.update(seconds)) this.followed = -1;
+    if (this.followed >= 0 && this.followed < actors.length) {
+      const { carrier } = actors[this.followed];
+      this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
+    }
+    if (this.headset.isWorn) this.headset.update(frame, seconds);
+    else this.look(this.eyes.pose);
+    const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
+    const eye = new THREE.Vector3(...pose.slice(0, 3));
+    this.world.list(eye);
+    this.renderer.info.reset();
+    if (now - this.shadowAt > SHADOW_PERIOD) {
+      this.shadowAt = now;
+      this.world.renderShadow(this.renderer);
+      this.renderer.info.reset();
+    }
+    this.renderer.render(this.scene, this.camera);
+    Object.assign(page, { frames: page.frames + 1, calls: this.renderer.info.render.calls,
+      triangles: this.renderer.info.render.triangles });
+    this.label(actors);
+    if (this.newest !== null) {
+      page.drawn += 1;
+      page.tick = this.newest.tick;
+      const said = `${this.world.header.scene}  ${this.newest.time.toFixed(1)} s  ${(1 / this.frame).toFixed(0)} frames/s`;
+      element("state").textContent = said;
+      this.newest = null;
+      if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(this.message(pose)));
+    }
+  }
+
+  /** What the client is told: the state that was drawn, where the eyes are, and the person's head and hands. */
+  message(pose) {
+    const message = { drawn: page.tick, view: pose };
+    if (!this.isPerson) return message;
+    if (this.headset.isWorn) return { ...message, person: { head: pose, ...this.headset.hands() } };
+    const ray = new THREE.Vector3(...this.hand.cursor, 0.5).unproject(this.camera).sub(this.camera.position).normalize();
+    const now = performance.now(), seconds = Math.min((now - (this.toldAt ?? now)) / 1000, 0.1);
+    this.toldAt = now;
+    const right = this.hand.tracked(pose.slice(0, 3), [ray.x, -ray.z, ray.y], this.eyes.yaw, seconds);
+    return { ...message, person: { head: pose, left: null, right } };
+  }
+
+  /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
+  look(pose) {
+    const turn = new THREE.Quaternion(...pose.slice(3));
+    const ahead = new THREE.Vector3(1, 0, 0).applyQuaternion(turn).applyEuler(this.world.group.rotation);
+    this.rig.position.set(0, 0, 0);
+    this.rig.rotation.y = 0;
+    this.camera.position.set(pose[0], pose[1], pose[2]).applyEuler(this.world.group.rotation);
+    this.camera.lookAt(ahead.add(this.camera.position));
+    this.rig.updateMatrixWorld();
+  }
+
+  /** Names above the actors. */
+  label(actors) {
+    const names = element("names"), there = new Set();
+    if (!names.hidden)
+      for (const { name, carrier } of actors) {
+        const point = this.world.place(carrier);
+        point.z = Math.max(point.z, 0) + 1.9;
+        point.applyEuler(this.world.group.rotation).project(this.camera);
+        if (point.z > 1) continue;
+        there.add(name);
+        if (!this.labels.has(name)) {
+          this.labels.set(name, names.appendChild(document.createElement("div")));
+          this.labels.get(name).textContent = name;
+        }
+        const x = (point.x + 1) / 2 * innerWidth, y = (1 - point.y) / 2 * innerHeight;
+        this.labels.get(name).style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
+      }
+    for (const [name, label] of this.labels) if (!there.has(name)) { label.remove(); this.labels.delete(name); }
+  }
+
+  resize() {
+    this.renderer.setSize(innerWidth, innerHeight, false);
+    this.camera.aspect = innerWidth / innerHeight;
+    this.camera.updateProjectionMatrix();
+  }
+}
+
+function fail(failure) {
+  page.failure = String(failure?.message ?? failure);
+  element("failure").textContent = page.failure;
+  element("failure").hidden = false;
+}
+
+addEventListener("unhandledrejection", (event) => fail(event.reason));
+addEventListener("error", (event) => fail(event.message));
+
+const header = await load("scene");
+const world = new World(header);
+const budget = Number(new URLSearchParams(location.search).get("triangles"));
+if (budget > 0) world.budget = budget;
+page.viewer = new Viewer(world, [...header.arrays.start]);

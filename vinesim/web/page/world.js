@@ -1,0 +1,279 @@
+// The vineyard on the graphics card: primitives and poses in textures, one draw call for each kind and level of detail.
+
+import * as THREE from "three";
+import { MESHES } from "./geometry.js";
+import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
+
+const SHAPE_SHIFT = 10, SURFACE_SHIFT = 9, POSE_SHIFT = 9;
+/** Distances [m] from which the next coarser level is drawn, in units of a cluster's thickness. */
+const LEVEL_DISTANCE = [60, 190];
+/** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
+const VANISHING = 2600;
+const LEAF = 2, SPHEROID = 1;
+const TRIANGLE_BUDGET = 300_000;
+/** The lists of what is drawn are made anew when the eye has moved so far [m]. */
+const STRIDE = 0.25;
+const SUN_SIZE = 2048, SUN_REACH = 9;
+/** Rigid primitives for which there is room from the start. */
+const RIGID_ROOM = 16384;
+
+export class World {
+  constructor(header) {
+    const { arrays } = header;
+    this.header = header;
+    this.bodies = header.bodies;
+    this.plants = arrays.material.length;
+    this.group = new THREE.Group();
+    this.group.rotation.x = -Math.PI / 2; // the world's z is up, the browser's y
+    this.rows = this.plants + RIGID_ROOM;
+    this.carriers = this.bodies + 1 + 1024;
+    this.shapes = dataTexture(THREE.RGBAFormat, THREE.FloatType, Float32Array, 4, this.rows * 4, SHAPE_SHIFT);
+    this.surfaces = dataTexture(THREE.RGBAIntegerFormat, THREE.UnsignedIntType, Uint32Array, 4, this.rows, SURFACE_SHIFT);
+    this.poses = dataTexture(THREE.RGBAFormat, THREE.FloatType, Float32Array, 4, this.carriers * 2, POSE_SHIFT);
+    for (let k = 0; k < this.carriers; ++k) this.poses.image.data[8 * k + 7] = 1;
+    for (let k = 0; k < this.bodies; ++k) {
+      const pose = arrays.poses.subarray(7 * k, 7 * k + 7);
+      this.poses.image.data.set(pose.subarray(0, 3), 8 * k);
+      this.poses.image.data.set(pose.subarray(3), 8 * k + 4);
+    }
+    this.write(arrays, 0);
+    this.plantClusters = clusters(arrays);
+    this.rigidClusters = clusters({ first: [], size: [], kind: [], bunch: [], ball: [], shape: [], carrier: [] });
+    this.picked = new Set();
+    this.names = [];
+    this.hidden = new Set(); // carriers whose rigid primitives are not drawn
+    this.rigidVersion = 0;
+    this.eye = new THREE.Vector3();
+    this.listedAt = null;
+    this.coarser = 1;
+    this.triangles = 0;
+    this.budget = TRIANGLE_BUDGET;
+    this.makeMeshes(arrays);
+    this.poses.needsUpdate = this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
+  }
+
+  /** Rows of primitives into the textures, from a row on. */
+  write(arrays, row) {
+    this.shapes.image.data.set(arrays.shape, row * 16);
+    const surface = this.surfaces.image.data, colour = new Uint32Array(arrays.surface.slice().buffer);
+    for (let k = 0; k < arrays.material.length; ++k) {
+      surface[4 * (row + k)] = colour[k];
+      surface[4 * (row + k) + 1] = arrays.material[k];
+      surface[4 * (row + k) + 2] = arrays.carrier[k];
+    }
+  }
+
+  makeMeshes(arrays) {
+    const { header } = this;
+    const extent = new Float32Array(24);
+    for (let k = 0; k < 6; ++k) {
+      const hull = arrays.hull.subarray(16 * k, 16 * k + 16);
+      const at = (corner, axis) => hull[2 * corner + axis];
+      extent.set([Math.max(Math.abs(at(1, 0)), Math.abs(at(5, 0))), at(3, 1), at(7, 1), 0], 4 * k);
+    }
+    const outlines = new THREE.DataArrayTexture(Uint8Array.from(arrays.outline, (x) => x + 128), 256, 256, 6);
+    outlines.format = THREE.RedFormat;
+    outlines.minFilter = outlines.magFilter = THREE.LinearFilter;
+    outlines.needsUpdate = true;
+    this.sunTarget = new THREE.WebGLRenderTarget(SUN_SIZE, SUN_SIZE, {
+      depthTexture: new THREE.DepthTexture(SUN_SIZE, SUN_SIZE, THREE.UnsignedIntType),
+      minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter });
+    this.sunCamera = new THREE.OrthographicCamera(-SUN_REACH, SUN_REACH, SUN_REACH, -SUN_REACH, 1, 60);
+    const common = {
+      eye: { value: this.eye }, sun: { value: new THREE.Vector3(...header.sun) }, outlines: { value: outlines },
+      sunDepth: { value: this.sunTarget.depthTexture }, sunMatrix: { value: new THREE.Matrix4() },
+    };
+    this.common = common;
+    const uniforms = { ...common, poses: { value: this.poses }, shapes: { value: this.shapes },
+      surfaces: { value: this.surfaces }, leafExtent: { value: extent } };
+    this.shadowGroup = new THREE.Group();
+    this.shadowGroup.rotation.x = -Math.PI / 2;
+    this.draws = MESHES.map(({ name, levels }, kind) => {
+      const side = name === "leaf" ? THREE.DoubleSide : THREE.FrontSide;
+      const make = (fragmentShader) => new THREE.RawShaderMaterial({
+        glslVersion: THREE.GLSL3, vertexShader: VERTEX[name], fragmentShader, uniforms, side });
+      const seen = make(fragment(name)), cast = make(depthOnly(name));
+      cast.side = THREE.DoubleSide;
+      return levels.map((level) => {
+        const geometry = new THREE.InstancedBufferGeometry();
+        geometry.setAttribute("position", new THREE.Float32BufferAttribute(level.points, 3));
+        geometry.setIndex(level.faces);
+        geometry.instanceCount = 0;
+        for (const [group, material] of [[this.group, seen], [this.shadowGroup, cast]]) {
+          const mesh = new THREE.Mesh(geometry, material);
+          mesh.frustumCulled = false;
+          group.add(mesh);
+        }
+        return { geometry, kind, faces: level.faces.length / 3, list: new Uint32Array(1024), count: 0 };
+      });
+    });
+    this.group.add(this.makeGround(arrays, common), makeSky(common));
+  }
+
+  makeGround(arrays, common) {
+    const [x, y, cell] = this.header.ground;
+    const columns = this.header.ground_columns, share = (s) => 255 * Math.min(Math.max(s, 0), 1);
+    const sky = new THREE.DataTexture(Uint8Array.from(arrays.ground_sky, share), columns,
+      arrays.ground_sky.length / columns, THREE.RedFormat);
+    sky.unpackAlignment = 1;
+    sky.minFilter = sky.magFilter = THREE.LinearFilter;
+    sky.needsUpdate = true;
+    const material = new THREE.RawShaderMaterial({ glslVersion: THREE.GLSL3, vertexShader: GROUND_VERTEX,
+      fragmentShader: GROUND_FRAGMENT, uniforms: { ...common, groundSky: { value: sky },
+        ground: { value: new THREE.Vector3(x, y, cell) }, rows: { value: new THREE.Vector2(...this.header.rows) } } });
+    const mesh = new THREE.Mesh(new THREE.PlaneGeometry(600, 600, 1, 1), material);
+    mesh.frustumCulled = false;
+    return mesh;
+  }
+
+  /** Shapes of robots, people, boxes and picked bunches. */
+  setRigid(header) {
+    const { arrays } = header, count = arrays.material.length;
+    if (this.plants + count > this.rows) throw new Error(`${count} rigid primitives; there is room for ${RIGID_ROOM}`);
+    this.write(arrays, this.plants);
+    this.rigidClusters = clusters(arrays);
+    this.names = header.names;
+    const own = partsBeforeEyes(this.header);
+    this.hidden = new Set();
+    this.names.forEach((name, k) => { if (own.has(name)) this.hidden.add(this.bodies + 1 + k); });
+    this.rigidVersion = header.version;
+    this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
+    this.listedAt = null;
+  }
+
+  /** Poses of what has moved, and what was picked. */
+  apply(state) {
+    const { body, place, turn, rigid_place, rigid_turn, picked } = state.arrays;
+    for (let k = 0; k < body.length; ++k) this.pose(body[k], place, turn, k);
+    for (let k = 0; k < rigid_place.length / 3; ++k) this.pose(this.bodies + 1 + k, rigid_place, rigid_turn, k);
+    this.poses.needsUpdate = true;
+    if (picked.length !== this.picked.size || picked.some((bunch) => !this.picked.has(bunch))) {
+      this.picked = new Set(picked);
+      this.listedAt = null;
+    }
+  }
+
+  pose(carrier, place, turn, k) {
+    const data = this.poses.image.data;
+    for (let axis = 0; axis < 3; ++axis) data[8 * carrier + axis] = place[3 * k + axis];
+    for (let axis = 0; axis < 4; ++axis) data[8 * carrier + 4 + axis] = turn[4 * k + axis] / 32767;
+  }
+
+  /** Place [3] of a carrier, in the world. */
+  place(carrier) {
+    return new THREE.Vector3().fromArray(this.poses.image.data, 8 * carrier);
+  }
+
+  /** Heading of a carrier about the vertical [rad]. */
+  heading(carrier) {
+    const [x, y, z, w] = this.poses.image.data.subarray(8 * carrier + 4, 8 * carrier + 8);
+    return Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
+  }
+
+  /** Choose what is drawn, and how finely, for the eye [3] in the world. */
+  list(eye) {
+    this.eye.copy(eye);
+    if (this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE) return;
+    this.listedAt = eye.clone();
+    for (;;) {
+      for (const level of this.draws.flat()) level.count = 0;
+      this.choose(this.plantClusters, 0, true);
+      this.choose(this.rigidClusters, this.plants, false);
+      this.triangles = this.draws.flat().reduce((sum, level) => sum + level.count * level.faces, 0);
+      if (this.triangles <= this.budget || this.coarser > 100) break;
+      this.coarser *= 1.2;
+    }
+    if (this.triangles < 0.6 * this.budget) this.coarser = Math.max(1, this.coarser / 1.2);
+    for (const level of this.draws.flat()) {
+      let rows = level.geometry.getAttribute("row");
+      if (!rows || rows.array !== level.list) {
+        rows = new THREE.InstancedBufferAttribute(level.list, 1);
+        rows.gpuType = THREE.IntType;
+        level.geometry.setAttribute("row", rows);
+      }
+      rows.needsUpdate = true;
+      level.geometry.instanceCount = level.count;
+    }
+  }
+
+  choose(set, start, fades) {
+    const { x, y, z } = this.eye;
+    for (let k = 0; k < set.first.length; ++k) {
+      if (set.bunch[k] >= 0 && this.picked.has(set.bunch[k])) continue;
+      if (this.hidden.has(set.carrier[k])) continue;
+      const kind = set.kind[k], levels = this.draws[kind];
+      let level = 0;
+      if (fades) {
+        const away = Math.hypot(set.ball[4 * k] - x, set.ball[4 * k + 1] - y, set.ball[4 * k + 2] - z);
+        const ratio = Math.max(away - set.ball[4 * k + 3], 0.05) * this.coarser / set.thickness[k];
+        if (ratio > VANISHING) continue;
+        while (level < levels.length - 1 && ratio > LEVEL_DISTANCE[level] * (kind === LEAF ? 0.35 : 1)) ++level;
+      }
+      const into = levels[level], end = into.count + set.size[k];
+      if (end > into.list.length) {
+        const longer = new Uint32Array(2 * end);
+        longer.set(into.list);
+        into.list = longer;
+      }
+      for (let i = 0; i < set.size[k]; ++i) into.list[into.count + i] = start + set.first[k] + i;
+      into.count = end;
+    }
+  }
+
+  /** What the sun sees around the eye, into the depth texture that the shaders read. */
+  renderShadow(renderer) {
+    const sun = this.common.sun.value, camera = this.sunCamera;
+    if (sun.z < 0.03) return;
+    const step = 2 * SUN_REACH / SUN_SIZE * 64; // whole texels, so that edges of shadows do not crawl
+    const centre = new THREE.Vector3(Math.round(this.eye.x / step) * step, Math.round(this.eye.y / step) * step, 1);
+    camera.position.copy(centre).addScaledVector(sun, 30).applyMatrix4(this.shadowGroup.matrixWorld);
+    camera.up.set(0, 1, 0);
+    camera.lookAt(centre.clone().applyMatrix4(this.shadowGroup.matrixWorld));
+    camera.updateMatrixWorld();
+    this.shadowGroup.updateMatrixWorld();
+    const vr = renderer.xr.enabled;
+    renderer.xr.enabled = false;
+    renderer.setRenderTarget(this.sunTarget);
+    renderer.clear();
+    renderer.render(this.shadowGroup, camera);
+    renderer.setRenderTarget(null);
+    renderer.xr.enabled = vr;
+    this.common.sunMatrix.value.copy(camera.projectionMatrix).multiply(camera.matrixWorldInverse)
+      .multiply(this.shadowGroup.matrixWorld);
+  }
+}
+
+/** Parts of the page's own person that would be before its eyes. */
+function partsBeforeEyes({ person }) {
+  return new Set(person === null ? [] : ["head", "neck"].map((part) => `${person}/${part}`));
+}
+
+function makeSky(common) {
+  const material = new THREE.RawShaderMaterial({ glslVersion: THREE.GLSL3, vertexShader: SKY_VERTEX,
+    fragmentShader: SKY_FRAGMENT, uniforms: common, side: THREE.BackSide, depthWrite: false, depthFunc: THREE.LessEqualDepth });
+  const mesh = new THREE.Mesh(new THREE.SphereGeometry(1, 24, 12), material);
+  mesh.frustumCulled = false;
+  mesh.renderOrder = 1;
+  return mesh;
+}
+
+function dataTexture(format, type, Kind, channels, texels, shift) {
+  const width = 1 << shift, height = Math.max(Math.ceil(texels / width), 1);
+  const texture = new THREE.DataTexture(new Kind(width * height * channels), width, height, format, type);
+  if (format === THREE.RGBAIntegerFormat) texture.internalFormat = "RGBA32UI";
+  texture.minFilter = texture.magFilter = THREE.NearestFilter;
+  return texture;
+}
+
+/** Runs of primitives, with the mean thickness of their parts [m]. */
+function clusters(arrays) {
+  const { first, size, kind, bunch, ball, shape } = arrays, count = first.length;
+  const thickness = new Float32Array(count);
+  for (let k = 0; k < count; ++k) {
+    let sum = 0;
+    for (let i = 0; i < size[k]; ++i) sum += Math.abs(shape[16 * (first[k] + i) + 3]);
+    thickness[k] = kind[k] === 6 ? 1 : Math.max(sum / size[k], 1e-4) * (kind[k] === LEAF ? 0.6 : kind[k] === SPHEROID ? 0.8 : 1);
+  }
+  const carrier = Array.from(first, (row) => arrays.carrier[row]);
+  return { first, size, kind, bunch, ball, thickness, carrier };
+}

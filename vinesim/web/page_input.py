@@ -1,0 +1,60 @@
+"""What a page sends: which state it has drawn, where it looks from, and where its person's head and hands are."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+_Coordinate = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
+_Component = Annotated[float, msgspec.Meta(ge=-1.01, le=1.01)]
+_Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+
+Pose = tuple[_Coordinate, _Coordinate, _Coordinate, _Component, _Component, _Component, _Component]
+"""[7] m, 1 in the world: x forward, z up."""
+
+
+class TrackedHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One hand of a person."""
+
+    pose: Pose
+    """Middle of the palm: x along the fingers, z out of the back of the hand."""
+    closed: bool = False
+    fingers: tuple[_Share, _Share, _Share, _Share, _Share] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """How far thumb, index, middle, ring and little finger are bent."""
+
+
+class TrackedPerson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a headset, or a desktop with mouse and keys, knows of a person. A hand that is None hangs down."""
+
+    head: Pose
+    left: TrackedHand | None = None
+    right: TrackedHand | None = None
+
+
+class PageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One message of a page."""
+
+    drawn: Annotated[int, msgspec.Meta(ge=-1)]
+    """Tick of the newest state that the page has drawn."""
+    view: Pose
+    person: TrackedPerson | None = None
+
+    def poses(self) -> list[Pose]:
+        """All poses in it."""
+        person = self.person
+        hands = () if person is None else (person.left, person.right)
+        return [self.view, *(() if person is None else (person.head,)), *(hand.pose for hand in hands if hand)]
+
+
+_decoder = msgspec.json.Decoder(PageInput)
+
+
+def decode_input(text: str) -> PageInput | None:
+    """A page's message; None if it is none, or a rotation in it is not of unit length within 1 %."""
+    try:
+        found = _decoder.decode(text)
+    except (msgspec.MsgspecError, RecursionError, UnicodeError):
+        return None
+    squares = (sum(value * value for value in pose[3:]) for pose in found.poses())
+    return found if all(abs(square - 1.0) < 0.02 for square in squares) else None
