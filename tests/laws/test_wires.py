@@ -96,7 +96,7 @@ def test_a_wire_gives_by_the_string_law(at: float) -> None:
     push(physics, 0, np.array([0.0, 0.0, 2.0]))
     for _ in range(500):
         physics.step()
-    tip, deflection = tips(physics)[0], physics.wires.deflection[0]
+    tip, deflection = tips(physics)[0], physics.elastic_supports.deflection[0]
     held = 2000.0 * (tip[2] - deflection[2])
     assert deflection[2] == pytest.approx(held * at * (LENGTH - at) / (TENSION * LENGTH), rel=1e-4)
     assert held + SPRING / ARM**2 * tip[2] == pytest.approx(2.0, rel=2e-3)
@@ -119,7 +119,7 @@ def test_shoots_of_one_wire_move_each_other_as_a_dense_solve_says() -> None:
     push(physics, 1, np.array([1.5, 0.0, 0.0]))
     for _ in range(600):
         physics.step()
-    assert abs(physics.wires.deflection).max() < 1e-6
+    assert abs(physics.elastic_supports.deflection).max() < 1e-6
     assert tips(physics)[1, 0] == pytest.approx(1.5 / (2000.0 + SPRING / ARM**2), rel=2e-3)
 
 
@@ -168,14 +168,14 @@ def test_a_slow_mode_is_right_within_two_percent() -> None:
 )
 def test_shoots_on_a_wire_gain_no_energy(tie: float, tension: float, phi: float) -> None:
     """Undamped, at 100 Hz, with ties and wires of any stiffness: energy, with that of the mass that the scheme adds
-    (see :mod:`vinesim.kernels.articulation.wires`), is kept for phi 1/2 and falls beyond."""
+    (see :mod:`vinesim.kernels.articulation.elastic_supports`), is kept for phi 1/2 and falls beyond."""
     physics = world(row_of_shoots(tie=tie, tension=tension, beta=0.0), phi=phi)
     set_turning(physics, [0.25, -0.15, 0.05, 0.2])
     added = (phi * physics.dt) ** 2 * (tie * np.eye(4) - stiffness_of_ties(ALONG, tie, tension))
     seen = []
     for step in range(1000):
         physics.update_kinematics()
-        physics.wires.update()
+        physics.elastic_supports.update()
         if step % 5 == 0:
             tip = ARM * physics.state.joint_qd[:, 1].astype(float)
             seen.append(energy(physics.plants, 0.0).total + 0.5 * tip @ added @ tip)
@@ -207,7 +207,7 @@ def test_a_push_wakes_those_whose_ties_the_wire_moves_and_no_others() -> None:
         for _ in range(1000):
             physics.step()
         assert len(physics.plants.awake) == 0
-        assert len(physics.wires.active) == 0
+        assert len(physics.elastic_supports.active) == 0
         assert abs(tips(physics)).max() < 5e-5
 
 
@@ -227,7 +227,7 @@ def test_a_shoot_that_another_client_lays_aside_moves_the_wire_here() -> None:
     physics = world(row_of_shoots(), sleep=True)
     physics.apply_remote_rest([1], [frames.exp(np.array([[0.0, -0.02, 0.0]]))])
     physics.step()
-    assert physics.wires.deflection[1, 2] > 1e-3
+    assert physics.elastic_supports.deflection[1, 2] > 1e-3
     assert physics.plants.awake.tolist() == [0, 2, 3]
 
 

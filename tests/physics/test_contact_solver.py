@@ -277,7 +277,8 @@ def test_rigid_islands_join_bodies_coupled_by_a_constraint():
 def test_a_step_is_a_list_of_stages_and_trees_fall_asleep():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
-        "wind", "grasps", "rigid", "contacts", "detail", "wires", "plants", "contacts", "plants", "rigid", "faults",
+        "wind", "grasps", "rigid", "contacts", "detail", "elastic supports", "plants", "contacts", "plants",
+            "rigid", "faults",
         "detachment",
         "grasps", "sleep",
     ]  # fmt: skip

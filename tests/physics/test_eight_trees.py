@@ -51,6 +51,7 @@ def run(model: Model, trees: np.ndarray, steps: int = 12) -> dict[int, list[byte
     plants.state.joint_qd[:] = rng.normal(scale=2.0, size=plants.state.joint_qd.shape)
     plants.body_load[:, :3] = rng.normal(scale=0.1, size=(len(model.body_mass), 3))
     plants.tree_air[:] = rng.normal(scale=3.0, size=(COUNT, 3))
+    plants.root_rests.turn[:], plants.root_rests.rate[:] = rng.normal(scale=[[[0.1]], [[1.0]]], size=(2, COUNT, 3))
     plants.phi[:] = np.resize([0.55, 0.6, 1.0, 0.55], COUNT)
     seen: dict[int, list[bytes]] = {int(tree): [] for tree in trees}
     for tick in range(steps):

@@ -37,9 +37,21 @@ def test_another_row_changes_no_tree_of_the_others(vineyard):
     scene, model = vineyard
     more = generate(with_layout(scene, rows=scene.layout.rows + 1))
     for name, dim in model.array_fields().items():
-        if dim.shape[0] in ("tree", "body", "bunch", "leaf"):
+        if dim.shape[0] in ("tree", "body", "bunch", "leaf") and name != "tree_piece":
             before = getattr(model, name)
             assert np.array_equal(before, getattr(more, name)[: len(before)]), name
+    on = more.tree_piece[: len(model.tree_piece)]  # the same piece has another number there
+    assert np.array_equal(model.fixed_start[model.tree_piece], more.fixed_start[on])
+
+
+def test_every_shoot_stands_in_the_middle_of_its_piece_of_an_arm(vineyard):
+    _scene, model = vineyard
+    piece, foot = model.tree_piece, model.tree_pose[:, :3].astype(float)
+    start, way = model.fixed_start[piece].astype(float), (model.fixed_end - model.fixed_start)[piece].astype(float)
+    share = ((foot - start) * way).sum(1) / (way * way).sum(1)
+    assert model.is_on_arm().all()
+    assert ((share > -1e-5) & (share < 1.0 + 1e-5)).all()
+    np.testing.assert_allclose(start + share[:, None] * way, foot, atol=1e-5)
 
 
 def test_a_longer_row_does_not_change_its_first_vine(vineyard):

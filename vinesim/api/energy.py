@@ -41,7 +41,7 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
 
     Kinetic: sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic: k theta^2 / 2 about each joint axis, where
     theta is the rotation vector of the joint, and k d^2 / 2 of each tie; k d (d + u) / 2 with its share of the wire
-    that it deflects by u.
+    that it deflects by u; of a root on an arm that is twisted by u, less k u (theta - theta as drawn) / 2.
     """
     model, state = plants.model, plants.state
     bodies = _moving_bodies(plants, trees)
@@ -49,6 +49,10 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     kinetic = 0.5 * float(mass @ (velocity**2).sum(1) + np.einsum("bi,bij,bj->", omega, inertia, omega))
     turned = frames.log(state.joint_q[bodies].astype(float))
     elastic = 0.5 * float((plants.joint_stiffness[bodies] * turned**2).sum())
+    roots = model.body_parent[bodies] < 0
+    since = turned[roots] - frames.log(model.joint_settled[bodies[roots]].astype(float))
+    arm_turn = plants.root_rests.turn[model.body_tree[bodies[roots]]]
+    elastic -= 0.5 * float((plants.joint_stiffness[bodies[roots]] * arm_turn * since).sum())
     ties = np.flatnonzero(np.isin(model.tie_body, bodies))
     pose = state.body_q[model.tie_body[ties]].astype(float)
     point = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[ties].astype(float))

@@ -15,12 +15,12 @@ from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.detachment import Blade, DetachmentMonitor
+from vinesim.physics.plants.elastic_supports import ElasticSupports
 from vinesim.physics.plants.fault_guard import FaultGuard
 from vinesim.physics.plants.level_of_detail import LevelOfDetail
 from vinesim.physics.plants.sleep import SleepMonitor
 from vinesim.physics.plants.validation import warn_of_raised_damping
 from vinesim.physics.plants.wind import WindOnPlants
-from vinesim.physics.plants.wires import Wires
 from vinesim.physics.rigid.dormant_bunches import DormantBunches
 from vinesim.physics.rigid.hand_grasp import GraspManager
 from vinesim.physics.rigid.rigid_world import RigidWorld
@@ -73,7 +73,7 @@ class Physics:
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
         self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
-        self.wires = Wires(self.plants, p)
+        self.elastic_supports = ElasticSupports(self.plants, p)
         self.level_of_detail = LevelOfDetail(self.plants, p)
         self.sleep_monitor = SleepMonitor(self.plants, p)
         self.fault_guard = FaultGuard(self.plants)
@@ -103,7 +103,7 @@ class Physics:
             ("rigid: predict velocities without plant contacts", self.rigid.predict),
             ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
             ("detail: refine bunches near actors", self._refine_bunches),
-            ("wires: bring to balance with awake trees, wake trees that they move", self._update_wires),
+            ("elastic supports: balance wires and arms with awake trees, wake others", self._update_elastic_supports),
             ("plants: predict velocities without contacts", self.plants.predict),
             ("contacts: wake trees that others touch, solve all together", self.contact_solver.solve),
             ("plants: integrate with contact wrenches", self._integrate_plants),
@@ -145,9 +145,9 @@ class Physics:
         if len(coarsened):  # those that sleep collide with other shapes now
             self.contact_solver.update_tree_bounds(coarsened)
 
-    def _update_wires(self) -> None:
+    def _update_elastic_supports(self) -> None:
         self.update_kinematics()
-        self.wires.update()
+        self.elastic_supports.update()
 
     def _integrate_plants(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
@@ -171,7 +171,7 @@ class Physics:
             keep_awake = self.contact_solver.remote_trees.copy()
             keep_awake[self.contact_solver.near_trees] = True
             keep_awake[self.model.body_tree[self.plants.held_bodies]] = True
-            self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs, self.wires.is_coupled)
+            self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs, self.elastic_supports.is_coupled)
 
     # ------------------------------------------------------------------ results of a step
 
@@ -302,7 +302,7 @@ class Physics:
         resting = np.unique(trees).astype(np.int32)
         self.plants.put_to_sleep(resting)
         self.contact_solver.update_tree_bounds(resting)
-        self.wires.place(resting)
+        self.elastic_supports.place(resting)
         self.remotely_posed = np.union1d(self.remotely_posed, trees).astype(np.int32)
         self._body_q = None
 

@@ -335,6 +335,11 @@ def _check_fields(body: int, fields: dict[str, Any]) -> None:
             raise ValueError(f"body {body}: {name} is {given}; give numbers of 0 or more")
 
 
+def shear_modulus(modulus: Any) -> Any:
+    """Shear modulus [...] Pa of wood with Young's modulus [...] Pa: that of Poisson's ratio 0.3."""
+    return modulus / 2.6
+
+
 def segment_properties(
     length: np.ndarray | float,
     start: np.ndarray | float,
@@ -365,7 +370,7 @@ def segment_properties(
     for radius in (start, end):
         area_moment = np.pi * radius**4 / 2.0 / length
         bend = modulus * area_moment
-        twist = (modulus / 2.6 if shear is None else shear) * 2.0 * area_moment
+        twist = (shear_modulus(modulus) if shear is None else shear) * 2.0 * area_moment
         halves.append(np.stack([twist, bend, bend], -1))
     return mass, inertia, halves[0], halves[1]
 

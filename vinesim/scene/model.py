@@ -36,6 +36,8 @@ class Model(StructOfArrays):
     tree_pose: np.ndarray = array("tree", 7, unit="m, 1", fill=_UNIT_POSE)
     """Pose in the world of the frame on which the root's joint sits."""
     tree_vine: np.ndarray = array("tree", unit="1", dtype=np.int32, fill=-1)
+    tree_piece: np.ndarray = array("tree", unit="1", dtype=np.int32, fill=-1)
+    """The piece of wood that the root's joint sits on, an index of ``fixed_start``; -1: on nothing that moves."""
     tree_core: np.ndarray = array("tree", unit="1", dtype=np.int32)
     """How many of its bodies move while no actor is close; the rest are the berry clusters of its bunches, which are
     then fused to their bunch as one *compound*. A tree without clusters is all core."""
@@ -121,6 +123,10 @@ class Model(StructOfArrays):
     fixed_tension: np.ndarray = array("fixed", unit="N")
     """With which a piece of wire is taut between its ends; 0: it does not give."""
 
+    fixed_shear_modulus: np.ndarray = array("fixed", unit="Pa")
+    """Of the wood of an arm, which its shoots twist; 0: it does not give. An arm is the pieces of organ ARM with one
+    ``fixed_index``, in their order; its start is clamped, its end free."""
+
     # picking boxes: open crates, dynamic
     box_pose: np.ndarray = array("box", 7, unit="m, 1", fill=_UNIT_POSE)
     """Start pose of the centre of the crate's bottom (x along the length)."""
@@ -166,6 +172,14 @@ class Model(StructOfArrays):
             owner[body] = bunch
             body = self.body_parent[body]
         return owner
+
+    def is_on_arm(self) -> np.ndarray:
+        """Trees whose root sits on a piece of arm that gives [tree] bool."""
+        return np.append(self.arm_gives(), False)[self.tree_piece]
+
+    def arm_gives(self) -> np.ndarray:
+        """Pieces of arms that shoots twist [fixed] bool."""
+        return (self.fixed_organ == int(Organ.ARM)) & (self.fixed_shear_modulus > 0.0)
 
     def depth(self) -> np.ndarray:
         """Number of bodies between each body and its root [body].

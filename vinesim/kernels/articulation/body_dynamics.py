@@ -9,6 +9,8 @@ import warp as wp
 
 from vinesim.kernels.articulation.forces import (
     drag_coefficient,
+    in_middle_axes,
+    middle_axes_scale,
     residual_damping,
     spring_torque,
     tension_stiffness,
@@ -141,6 +143,28 @@ def joint_terms(
     # the metric acts on the rate as the joint frame sees it, hence turning x omega = turning x (joint rate)
     drive = metric * wp.cross(turning, omega) - frame * spring
     return metric, drive, frame * torque
+
+
+@wp.func
+def turned_rest_moment(
+    dt: float,
+    phi: float,
+    axes: wp.quat,
+    q: wp.quat,
+    stiffness: wp.vec3,
+    damping: wp.vec3,
+    turn: wp.vec3,
+    turn_rate: wp.vec3,
+):
+    """Moment [N m], world axes, on a root because the rest of its spring is turned by ``turn`` [rad] and turns on.
+
+    Spring and damper of :func:`joint_terms` end there: of theta - turn instead of theta. axes: [xyzw] of the joint in the
+    world; stiffness, damping, turn, turn_rate: in joint axes.
+    """
+    residual = wp.max(damping - (2.0 * phi - 1.0) * dt * stiffness, wp.vec3())
+    moment = wp.cw_mul(stiffness, turn) + wp.cw_mul(phi * dt * stiffness + residual, turn_rate)
+    s, excess, v = middle_axes_scale(q)
+    return wp.quat_rotate(axes * half_rotation(q), in_middle_axes(s, excess, v, moment))
 
 
 @wp.func

@@ -99,6 +99,8 @@ def contiguous_forces(s: AppliedForces):
     """The same forces, its arrays contiguous."""
     return AppliedForces(
         dense_vec3(s.tree_air),
+        dense_vec3(s.root_turn),
+        dense_vec3(s.root_turn_rate),
         dense_vec3(s.tie_anchor),
         dense_vec3(s.tie_anchor_velocity),
         dense_spatial(s.body_load),

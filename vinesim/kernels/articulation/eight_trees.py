@@ -293,7 +293,7 @@ def walk_eight(
     air = record(records_out, (size + 1) * STRIDE)
     lane = wp.int32(0)  # no "for", which Warp would unroll
     while lane < LANES:
-        load_tree(lane, trees[lane], model, joints, forces, records_out)
+        load_tree(p.dt, phis[lane], lane, trees[lane], model, joints, forces, records_out)
         put_vec3(air, lane, forces.tree_air[trees[lane]])
         lane += 1
     i = wp.int32(0)

@@ -29,13 +29,11 @@ def shear_stiffness(lever: wp.vec3, force: wp.vec3):
 
 
 @wp.func
-def spring_torque(stiffness: wp.vec3, q: wp.quat):
-    """Torque [N m] that a spring holds against a rotation q, in the joint's middle axes.
+def middle_axes_scale(q: wp.quat):
+    """How rates in the middle axes of a rotation q change its rotation vector theta: by s w + (1 - s) n n^T w, with n
+    along theta and s the ratio of |theta| / 2 to its sine.
 
-    The gradient of theta^T K theta / 2 by a turn of the joint, theta being the rotation vector of q. The middle axes are
-    turned from the joint's by half of q; in them it is s K theta + (1 - s) n n^T K theta, with n along theta and s the
-    ratio of |theta| / 2 to its sine. K theta itself is no gradient unless K is isotropic: it does work around a cycle of
-    bending and twist.
+    Returns s, (s - 1) / v^2, and v = theta / (2 s); see :func:`in_middle_axes`.
     """
     v = wp.vec3(q[0], q[1], q[2])
     v = wp.where(q[3] < 0.0, -1.0, 1.0) * v
@@ -47,10 +45,27 @@ def spring_torque(stiffness: wp.vec3, q: wp.quat):
     series = -0.050192467868328094 + u * 0.08603843301534653
     series = 0.02518542669713497 + u * (0.04930693283677101 + u * series)
     series = 0.16666674613952637 + u * (0.07498478889465332 + u * (0.04510609060525894 + u * series))
-    excess = (series + 1.0 / (1.0 + cosine)) / (4.0 * cosine * cosine * cosine)  # (s - 1) / square
-    s = 1.0 + excess * square
-    torque = wp.cw_mul(stiffness, 2.0 * s * v)
-    return s * torque - excess * wp.dot(v, torque) * v
+    excess = (series + 1.0 / (1.0 + cosine)) / (4.0 * cosine * cosine * cosine)
+    return 1.0 + excess * square, excess, v
+
+
+@wp.func
+def in_middle_axes(s: float, excess: float, v: wp.vec3, a: wp.vec3):
+    """s a + (1 - s) n n^T a: of a rate in the middle axes that of theta, of a gradient by theta that by a turn."""
+    return s * a - excess * wp.dot(v, a) * v
+
+
+@wp.func
+def spring_torque(stiffness: wp.vec3, q: wp.quat):
+    """Torque [N m] that a spring holds against a rotation q, in the joint's middle axes.
+
+    The gradient of theta^T K theta / 2 by a turn of the joint, theta being the rotation vector of q. The middle axes are
+    turned from the joint's by half of q; in them it is s K theta + (1 - s) n n^T K theta, with n along theta and s the
+    ratio of |theta| / 2 to its sine. K theta itself is no gradient unless K is isotropic: it does work around a cycle of
+    bending and twist.
+    """
+    s, excess, v = middle_axes_scale(q)
+    return in_middle_axes(s, excess, v, wp.cw_mul(stiffness, 2.0 * s * v))
 
 
 @wp.func

@@ -6,6 +6,7 @@ afterwards; see :mod:`vinesim.kernels.articulation.eight_trees`.
 
 import warp as wp
 
+from vinesim.kernels.articulation.body_dynamics import turned_rest_moment
 from vinesim.kernels.articulation.structs import (
     AppliedForces,
     ArticulationModel,
@@ -123,7 +124,14 @@ def parent_record(model: ArticulationModel, k: int, first: int, records: Floats)
 
 @wp.func
 def load_tree(
-    lane: int, tree: int, model: ArticulationModel, joints: JointState, forces: AppliedForces, records_out: Floats
+    dt: float,
+    phi: float,
+    lane: int,
+    tree: int,
+    model: ArticulationModel,
+    joints: JointState,
+    forces: AppliedForces,
+    records_out: Floats,
 ):
     """Copy what the walk needs of one tree into its lane; record 0 is what roots stand on."""
     pose = model.tree_pose[tree]
@@ -143,7 +151,16 @@ def load_tree(
         put_vec3(own, INERTIA, model.body_inertia[k])
         put_vec3(own, PRODUCT, model.body_product[k])
         own[DRAG] = model.body_drag[k]
-        put_spatial(own, LOAD, forces.body_load[k])
+        load = forces.body_load[k]
+        if model.body_parent[k] < 0:
+            load = load + wp.spatial_vector(
+                wp.vec3(),
+                turned_rest_moment(
+                    dt, phi, wp.transform_get_rotation(pose) * model.body_rest[k], joints.joint_q[k],
+                    model.joint_stiffness[k], model.joint_damping[k], forces.root_turn[tree], forces.root_turn_rate[tree],
+                ),
+            )  # fmt: skip
+        put_spatial(own, LOAD, load)
         put_vec3(own, CONTACT, wp.spatial_top(forces.body_wrench[k]))
         put_vec3(own, STIFFNESS, model.joint_stiffness[k])
         put_vec3(own, DAMPING, model.joint_damping[k])

@@ -14,6 +14,7 @@ from vinesim.kernels.articulation.body_dynamics import (
     own_terms,
     terms_left,
     tie_terms,
+    turned_rest_moment,
 )
 from vinesim.kernels.articulation.contiguous import (
     contiguous_bodies,
@@ -94,8 +95,17 @@ def assemble_bodies(
             falls = 1.0
             fall = joints.joint_xd[model.body_root[k]]
         contact = wp.spatial_top(forces.body_wrench[k])
+        load = forces.body_load[k]
+        if model.body_parent[k] < 0:
+            load = load + wp.spatial_vector(
+                wp.vec3(),
+                turned_rest_moment(
+                    p.dt, phi, axes, joints.joint_q[k], model.joint_stiffness[k], model.joint_damping[k],
+                    forces.root_turn[tree], forces.root_turn_rate[tree],
+                ),
+            )  # fmt: skip
         J, H, M, bias, tension, steady_force = own_terms(
-            p, phi, motion, model.body_mass[k], com, inertia, forces.body_load[k], contact, falls, fall
+            p, phi, motion, model.body_mass[k], com, inertia, load, contact, falls, fall
         )
         scratch_out.J[k] = J
         scratch_out.H[k] = H

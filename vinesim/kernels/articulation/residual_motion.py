@@ -3,15 +3,17 @@
 The displacement to that pose follows from one step of the articulated-body algorithm that starts at zero velocity, has no
 damping and is so long that springs outweigh inertia: it solves (M + (T/2)^2 K) a = u for the generalized force u that
 is not in balance, and (T/2)^2 a is K^-1 u, the quasi-static displacement. K is the tangent stiffness at the present
-pose, loads and ties included; a tie to a wire is as soft as it is when the wire's awake trees all move as one: no
-tree of the wire is then further from rest than it would be alone. Where K is not positive definite the pose is no stable equilibrium, and the tree no nearer
+pose, loads and ties included; a tie to a wire, and a root's spring on an arm, is as soft as it is when the awake trees
+of the wire or arm all move as one: none of them is then further from rest than it would be alone. Where K is not positive definite the pose is no stable equilibrium, and the tree no nearer
 to rest than anywhere else.
 """
 
 import warp as wp
 
+from vinesim.kernels.articulation.forces import in_middle_axes, middle_axes_scale
 from vinesim.kernels.articulation.kinematics import body_kinematics, parent_kinematics
 from vinesim.kernels.articulation.prediction import accelerate_bodies, assemble_bodies, eliminate_joints
+from vinesim.kernels.articulation.spatial import half_rotation
 from vinesim.kernels.articulation.structs import (
     AppliedForces,
     ArticulationModel,
@@ -64,6 +66,16 @@ def soften_tie(k: int, point: wp.vec3, axis: wp.vec3, mass: float, scratch_out: 
     scratch_out.M[k] = scratch_out.M[k] - across
 
 
+@wp.func
+def soften_root(k: int, axes: wp.quat, q: wp.quat, softening: wp.vec3, mass: float, scratch_out: Scratch):
+    """Take ``mass`` times the square of ``softening``, in joint axes, off the inertia of root k, since the arm gives. (What
+    a root stands on has no acceleration, so this is as good as less stiffness.)
+    """
+    s, excess, v = middle_axes_scale(q)
+    gradient = wp.quat_rotate(axes * half_rotation(q), in_middle_axes(s, excess, v, softening))
+    scratch_out.J[k] = scratch_out.J[k] - mass * wp.outer(gradient, gradient)
+
+
 @wp.kernel
 def residual_motion(
     # model
@@ -73,6 +85,7 @@ def residual_motion(
     tie_axis: wp.array(dtype=wp.vec3),
     # in
     tie_softening: wp.array(dtype=float),
+    root_softening: wp.array(dtype=wp.vec3),
     trees: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     joints: JointState,
@@ -94,7 +107,7 @@ def residual_motion(
     its speed, not in its distance: it may rest anywhere.
 
     p: with :data:`REST_STEP` as its step. model: without joint damping. body_length: [body] m. tie_axis, tie_softening:
-    [tie] see :class:`vinesim.physics.plants.ties.TieTable`. trees: [thread] which tree. forces: with the contact wrenches of the last step. joints: at its end; joints_still: the same without
+    [tie] see :class:`vinesim.physics.plants.ties.TieTable`. root_softening: [tree] (N m/rad)^(1/2), see :class:`vinesim.physics.plants.ties.RootRests`. trees: [thread] which tree. forces: with the contact wrenches of the last step. joints: at its end; joints_still: the same without
     rates. forces_static: with ``static_load_out`` as the load and no contact wrenches. prediction_out: its
     ``joint_qd_free`` times T / 4 is the displacement of each joint. speed_out, distance_out: [tree] m/s, m.
     is_free_out: [tree] whether nothing touches it and none of it floats, so that all of its displacement is known. All
@@ -127,6 +140,10 @@ def residual_motion(
             if tie_softening[t] > 0.0:
                 point = wp.quat_rotate(wp.transform_get_rotation(bodies_out.body_q[k]), model.tie_point[t])
                 soften_tie(k, point, tie_axis[t], 0.25 * p.dt * p.dt * tie_softening[t], scratch_out)
+        if model.body_parent[k] < 0:
+            soften_root(
+                k, factors_out.axes[k], joints.joint_q[k], root_softening[tree], 0.25 * p.dt * p.dt, scratch_out
+            )
     eliminate_joints(p, model, joints_still, bodies_out, tree, 0.5, factors_out, scratch_out)
     accelerate_bodies(p.dt, model, joints_still, bodies_out, factors_out, scratch_out, tree, prediction_out)
     distance = float(0.0)

@@ -93,6 +93,8 @@ class AppliedForces:
     """What acts on bodies from outside."""
 
     tree_air: wp.array(dtype=wp.vec3)  # [m/s] velocity of the air
+    root_turn: wp.array(dtype=wp.vec3)  # [tree] rad by which the arm turns the rest of the root's spring, joint axes
+    root_turn_rate: wp.array(dtype=wp.vec3)  # [tree] rad/s
     tie_anchor: wp.array(dtype=wp.vec3)  # [m] where ties are held
     tie_anchor_velocity: wp.array(dtype=wp.vec3)  # [m/s] how fast that place moves
     body_load: wp.array(dtype=wp.spatial_vector)  # [N, N m] lasting, at the origin

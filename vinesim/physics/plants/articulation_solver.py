@@ -31,7 +31,7 @@ from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
 from vinesim.physics.plants.remote_pose import blend_towards
 from vinesim.physics.plants.step_runner import StepRunner
-from vinesim.physics.plants.ties import TieTable
+from vinesim.physics.plants.ties import RootRests, TieTable
 from vinesim.physics.plants.topology import Topologies
 from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
@@ -52,18 +52,16 @@ class ArticulationSolver:
         model: constants; :class:`ValueError` in words if a tree cannot be simulated.
         state: its arrays are read and written in place.
         parameters: numbers of the scheme; those that follow replace single ones and may be infinite.
-        dt: step [s].
-        phi: 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
+        dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
         threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
-        fast_rate, max_rate: [rad/s] see ``fast_joint_rate`` and ``max_joint_rate`` of ``PhysicsParameters``.
-        fault_rate: [rad/s] see ``PhysicsParameters.fault_joint_rate`` and :mod:`vinesim.physics.plants.fault_guard`.
+        fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
+            ``PhysicsParameters``, and :mod:`vinesim.physics.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
             it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
         substeps: divide the step of trees whose first mode is too fast for it; off only to compare with other solvers.
-        buffers: where arrays live, instead of what ``device`` says.
-    """
+        buffers: where arrays live, instead of what ``device`` says."""
 
     def __init__(
         self,
@@ -98,7 +96,7 @@ class ArticulationSolver:
         """Where arrays live, for NumPy and for kernels."""
         self.tick = 0
         """Integrations so far."""
-        self.ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
+        self.ties, self.root_rests = TieTable(model, p.max_held_bodies, p.max_hands_per_body), RootRests(model)
         self._allocate(phi)
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
@@ -114,7 +112,8 @@ class ArticulationSolver:
             tree_budget=self.tree_budget if geometric_stiffness else None,
             tree_rate=self.tree_rate, stepping=self._stepping, groups=self._groups, floating=self._floating,
             topologies=Topologies(model, state.body_cut, self.tree_moving), thread_pool=self.thread_pool,
-            whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]]),
+            whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
+            | model.is_on_arm(),
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -175,14 +174,14 @@ class ArticulationSolver:
 
     def _pin_arrays(self) -> None:
         """Move the arrays of solver, ties and state to where the device can reach them."""
-        for owner in (self, self.ties, self.state):
+        for owner in (self, self.ties, self.root_rests, self.state):
             for name, value in vars(owner).items():
                 if isinstance(value, np.ndarray):
                     setattr(owner, name, self.buffers.pinned(value))
 
     def kernel_arrays(self) -> dict[Any, dict[str, np.ndarray]]:
         """All arrays that kernels read or write, by element type and name."""
-        model, state, ties = self.model, self.state, self.ties
+        model, state, ties, rests = self.model, self.state, self.ties, self.root_rests
         return {
             wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
                        "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
@@ -198,6 +197,7 @@ class ArticulationSolver:
                       "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
                       "joint_damping": self.joint_damping, "tie_point": ties.point, "tie_anchor": ties.anchor,
                       "tie_anchor_velocity": ties.anchor_velocity, "tie_axis": ties.axis, "tree_air": self.tree_air,
+                      "root_turn": rests.turn, "root_turn_rate": rests.rate, "root_softening": rests.softening,
                       "joint_x": state.joint_x, "joint_xd": state.joint_xd, "joint_qd": state.joint_qd,
                       "joint_xd_free": self.joint_xd_free, "joint_qd_free": self.joint_qd_free},
             wp.quat: {"body_rest": self._rest, "joint_q": state.joint_q},

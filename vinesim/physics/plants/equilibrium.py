@@ -33,6 +33,7 @@ class EquilibriumFinder:
         wrench: Any = wp.spatial_vector
         for name, dtype in (("no_rate", wp.vec3), ("no_wrench", wrench)):
             buffers.arrays[name] = wp.zeros(slots, dtype=dtype, device=device)
+        buffers.arrays["no_turn_rate"] = wp.zeros(trees, dtype=wp.vec3, device=device)
         for name, dtype in (("rest_q", wp.transform), ("rest_qd", wrench), ("static_load", wrench)):
             buffers.add_scratch(name, dtype)
         self._upload = buffers.row_copier(_INPUTS, "subset")
@@ -46,9 +47,11 @@ class EquilibriumFinder:
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         self._measure = launches.record(
             residual_motion, fill(s.SolverParameters, **(numbers | {"dt": REST_STEP})),
-            fill(s.ArticulationModel, joint_damping="no_rate"), "body_length", "tie_axis", "tie_softening", "subset",
+            fill(s.ArticulationModel, joint_damping="no_rate"), "body_length", "tie_axis", "tie_softening",
+            "root_softening", "subset",
             fill(s.AppliedForces), fill(s.JointState), fill(s.JointState, joint_xd="no_rate", joint_qd="no_rate"),
-            fill(s.AppliedForces, body_load="static_load", body_wrench="no_wrench"), "static_load",
+            fill(s.AppliedForces, body_load="static_load", body_wrench="no_wrench", root_turn_rate="no_turn_rate"),
+            "static_load",
             fill(s.BodyState, body_q="rest_q", body_qd="rest_qd"), fill(s.Factors), fill(s.Scratch), prediction,
             "rest_speed", "rest_distance", "is_free",
         )  # fmt: skip

@@ -20,9 +20,9 @@ from vinesim.kernels.articulation.forces import AIR_DENSITY
 from vinesim.kernels.articulation.residual_motion import REST_STEP
 from vinesim.kernels.articulation.sway import sway_trees
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.elastic_supports import ElasticSupports
 from vinesim.physics.plants.equilibrium import EquilibriumFinder
 from vinesim.physics.plants.shelter import TreeDrag
-from vinesim.physics.plants.wires import Wires
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import Snapshot, WindState
@@ -133,7 +133,7 @@ class _Table:
         code = [
             here,
             here.with_name("shelter.py"),
-            here.with_name("wires.py"),
+            here.with_name("elastic_supports.py"),
             here.parents[2] / "kernels" / "articulation",
         ]
         numbers = [wind.mean, wind.wave_number, wind.wave_phase, wind.wave_amplitude]
@@ -193,7 +193,7 @@ class _Response:
         self.steady = drag.air_share(wind.mean)[:, None] * wind.mean
         self.share = drag.air_share(wind.mean)
         self.plants = ArticulationSolver(model, self.state)
-        self._finder, self._wires = EquilibriumFinder(self.plants), Wires(self.plants)
+        self._finder, self._supports = EquilibriumFinder(self.plants), ElasticSupports(self.plants)
         self.plants.wake(np.arange(len(model.tree_first)))
         number, tree = np.arange(len(model.body_mass)), model.body_tree
         self._core = number - model.tree_first[tree] < model.tree_core[tree]
@@ -242,18 +242,19 @@ class _Response:
     def _move_to_equilibrium(self, trees: np.ndarray) -> np.ndarray:
         """Move trees to where the steady wind holds them; whether each is there [tree] bool.
 
-        Newton's method for each tree, its wires held, then the wires to where the trees hold them, and again: it comes
-        nearer to where all rest from one side only. With ties as soft as wires make them it would overshoot.
+        Newton's method for each tree, its supports held, then these to where the trees hold them, and again: it comes
+        nearer to where all rest from one side only. With springs as soft as supports make them it would overshoot.
         """
         good = np.ones(len(trees), bool)
         for step in range(_LOAD_STEPS + _NEWTON_STEPS):
             self._load(min((step + 1) / _LOAD_STEPS, 1.0) * self._pressure(self.steady))
             self.plants.ties.softening[:] = 0.0
+            self.plants.root_rests.softening[:] = 0.0
             _, distance, _ = self._finder.residual_motion(trees)
             good &= distance < 1e6
             self._finder.move_to_rest(trees[good])
             self.plants.forward_kinematics(trees)
-            self._wires.update()
+            self._supports.update()
             if step >= _LOAD_STEPS and np.mean(distance[good] < 0.45 * _CONVERGED) > _ENOUGH:
                 break
         return good & (distance < _CONVERGED)

@@ -1,4 +1,4 @@
-"""Ties: springs and dampers that hold bodies at points of the world, the model's and those of hands.
+"""Ties: springs and dampers that hold bodies at points of the world, the model's and those of hands; rests of roots.
 
 The ties of a body are adjacent in the arrays of the kernels. So behind the model's ties there are equal spans for
 bodies
@@ -109,3 +109,19 @@ class TieTable:
             values[start : start + self._span_size] = 0.0
             values[here] = values[own]
         self.span[body] = start, start + self._span_size
+
+
+class RootRests:
+    """How arms turn the rests of the springs of roots, on which trees stand; see
+    :mod:`vinesim.physics.plants.elastic_supports`."""
+
+    def __init__(self, model: Model) -> None:
+        trees = len(model.tree_first)
+        self.turn = np.zeros((trees, 3), np.float32)
+        """[tree, 3] rad, joint axes."""
+        self.rate = np.zeros((trees, 3), np.float32)
+        """[tree, 3] rad/s, joint axes."""
+        self.softening = np.zeros((trees, 3), np.float32)
+        """The outer product of this [tree, 3] (N m/rad)^(1/2), joint axes, with itself is by what spring and arm are
+        less stiff than the spring alone, when all awake trees of the arm move as one. Only the sleep of trees asks for
+        it."""

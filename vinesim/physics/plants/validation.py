@@ -140,6 +140,15 @@ def _validate_ties(model: Model) -> None:
         (wire < -1) | (wire >= pieces),
         f"wire of {pieces} fixed pieces, counted from 0; give one of them, or -1 for none",
     )
+    if (bad := (model.tree_piece < -1) | (model.tree_piece >= pieces)).any():
+        tree = int(np.argmax(bad))
+        raise ValueError(
+            f"tree {tree}: piece {model.tree_piece[tree]} of {pieces} fixed pieces, counted from 0; give one of them, "
+            "or -1 for none"
+        )
+    if (bad := ~(model.fixed_shear_modulus >= 0.0)).any():
+        piece = int(np.argmax(bad))
+        raise ValueError(f"fixed piece {piece}: shear modulus {model.fixed_shear_modulus[piece]} Pa; give 0 or more")
     if (bad := ~((model.fixed_tension >= 0.0) & np.isfinite(model.fixed_tension))).any():
         piece = int(np.argmax(bad))
         raise ValueError(f"fixed piece {piece}: tension {model.fixed_tension[piece]} N; give 0 or more")

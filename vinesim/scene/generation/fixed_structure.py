@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from vinesim.scene import builder
 from vinesim.scene.generation.shoot_slots import ARM_SEGMENTS, TRUNK_SEGMENTS
 from vinesim.scene.ids import Organ
 from vinesim.scene.plant_parameters import VineParameters
@@ -63,7 +64,10 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
     radius = 0.5 * parameters.trellis.pole_diameter.value
     pieces = [
         _cone_chains(trunk, thick, Organ.TRUNK, np.arange(count)),
-        _cone_chains(arms.reshape(-1, ARM_SEGMENTS + 1, 3), thin, Organ.ARM, np.arange(count * arm_count)),
+        _cone_chains(
+            arms.reshape(-1, ARM_SEGMENTS + 1, 3), thin, Organ.ARM, np.arange(count * arm_count),
+            shear_modulus=builder.shear_modulus(parameters.cane.woody_modulus.value),
+        ),
         _cone_chains(
             foot[:, None] + np.array([[0, 0, -0.3], [0, 0, layout.height + (0.1 if tendone else 1.15)]]),
             np.array([radius, radius]), Organ.POLE, np.arange(count),
@@ -75,7 +79,12 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
 
 
 def _cone_chains(
-    points: np.ndarray, radius: np.ndarray, organ: Organ, index: np.ndarray, tension: float = 0.0
+    points: np.ndarray,
+    radius: np.ndarray,
+    organ: Organ,
+    index: np.ndarray,
+    tension: float = 0.0,
+    shear_modulus: float = 0.0,
 ) -> dict[str, np.ndarray]:
     """Round cones along polylines [chain, point, 3]."""
     pieces = points.shape[1] - 1
@@ -87,6 +96,7 @@ def _cone_chains(
         "fixed_organ": np.full(len(points) * pieces, int(organ)),
         "fixed_index": np.repeat(index, pieces),
         "fixed_tension": np.full(len(points) * pieces, tension),
+        "fixed_shear_modulus": np.full(len(points) * pieces, shear_modulus),
     }
 
 

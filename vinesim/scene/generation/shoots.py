@@ -26,6 +26,8 @@ class Shoots:
     """What is drawn of each shoot, first axis: shoot."""
 
     vine: np.ndarray
+    piece: np.ndarray
+    """[shoot] piece of an arm that it springs from, counted over all arms"""
     up: np.ndarray
     """[shoot, 3] direction that a body's z axis leans to."""
     points: np.ndarray
@@ -114,7 +116,8 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     leaf_normal = np.moveaxis(normal(MAX_NODES + LATERAL_NODES, 8), -1, 0)
     leaf_uniform = np.moveaxis(uniform(MAX_NODES + LATERAL_NODES, 4), -1, 0)
     return Shoots(
-        vine=owner, up=up, points=points, length=length, base=base, has_lateral=has_lateral, lateral_at=lateral_at,
+        vine=owner, piece=np.repeat(np.arange(vines * arm_count), each) * ARM_SEGMENTS + piece, up=up,
+        points=points, length=length, base=base, has_lateral=has_lateral, lateral_at=lateral_at,
         lateral_points=lateral_points, has_bunch=chosen, bunch_at=at, peduncle=peduncle, bunch_axis=bunch_axis,
         bunch_up=bunch_up, fruit=fruit,
         nodes=nodes, leaf_normal=leaf_normal, leaf_uniform=leaf_uniform,

@@ -22,6 +22,7 @@ from vinesim.scene.generation.plant_bodies import Bodies, build_bodies
 from vinesim.scene.generation.shoot_slots import CORE_SLOTS, MAX_BUNCHES, cluster_slots, peduncle_slots
 from vinesim.scene.generation.shoots import Shoots, sample_shoots
 from vinesim.scene.generation.ties import find_ties
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_parameters import VineParameters
@@ -94,6 +95,7 @@ def _assemble_model(
         fixed=len(structure.fixed["fixed_start"]), tie=len(ties["slot"]), box=len(scene.boxes),
     )  # fmt: skip
     model.tree_first[:], model.tree_size[:], model.tree_vine[:] = first, size, shoots.vine
+    model.tree_piece[:] = np.flatnonzero(structure.fixed["fixed_organ"] == int(Organ.ARM))[shoots.piece]
     model.tree_core[:] = bodies.present[:, :CORE_SLOTS].sum(1)
     model.tree_pose[:] = frames.pose(bodies.origin[:, 0], bodies.turn[:, 0])
 
