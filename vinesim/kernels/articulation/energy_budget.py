@@ -131,9 +131,7 @@ def choose_budget(
     for k in range(first, first + size * model.pitch, model.pitch):
         place_relaxed(model, k, scratch_out)
         mass = model.body_mass[k]
-        scratch_out.bias[k] = wp.spatial_vector(
-            mass * (scratch_out.J[k] * model.body_com[k]), wp.vec3(mass, 0.0, 0.0)
-        )
+        scratch_out.bias[k] = wp.spatial_vector(mass * (scratch_out.J[k] * model.body_com[k]), wp.vec3(mass, 0.0, 0.0))
         floats = floats or model.body_root[k] >= 0
     for i in range(size):
         k = first + (size - 1 - i) * model.pitch
@@ -313,7 +311,7 @@ def lead_back(
     """Stop a tree and halve the way that its joints went in the step until its energy, returned, is at most ``goal``."""
     first = model.tree_first[tree]
     energy = wp.vec4(0.0, wp.float32(NO_LIMIT), 0.0, 0.0)
-    halved = int(0)
+    halved = 0
     while energy[1] > goal and halved < BACKTRACKS:
         for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
             joints_out.joint_q[k] = wp.normalize(start_q[k] + joints_out.joint_q[k])
@@ -344,9 +342,7 @@ def take_energy(
 
     Returns its kinetic and potential energy.
     """
-    filter_rates(
-        p, FILTER * dt * dt, model, joints_out, tree, bodies_out, factors_out, scratch_out, prediction_out
-    )
+    filter_rates(p, FILTER * dt * dt, model, joints_out, tree, bodies_out, factors_out, scratch_out, prediction_out)
     first = model.tree_first[tree]
     end = first + model.tree_moving[tree] * model.pitch
     for k in range(first, end, model.pitch):

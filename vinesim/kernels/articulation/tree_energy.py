@@ -49,9 +49,9 @@ def body_energy(
     spin = wp.quat_rotate_inv(turn, omega)
     crossed = wp.vec3(spin[1] * spin[2], spin[2] * spin[0], spin[0] * spin[1])
     mass = model.body_mass[k]
-    kinetic = 0.5 * (
-        mass * wp.dot(velocity, velocity) + wp.dot(model.body_inertia[k], wp.cw_mul(spin, spin))
-    ) + wp.dot(model.body_product[k], crossed)
+    kinetic = 0.5 * (mass * wp.dot(velocity, velocity) + wp.dot(model.body_inertia[k], wp.cw_mul(spin, spin))) + wp.dot(
+        model.body_product[k], crossed
+    )
     place = wp.transform_get_translation(pose)
     weight = mass * wp.dot(p.gravity, place + arm)
     elastic = spring_energy(model.joint_stiffness[k], joint_q)

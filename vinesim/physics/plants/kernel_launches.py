@@ -218,9 +218,7 @@ class KernelLaunches:
             index_list="roots",
         )  # fmt: skip
 
-        self.choose_budget = record(
-            choose_budget, parameters, self._model, "stepping", scratch, "tree_budget"
-        )
+        self.choose_budget = record(choose_budget, parameters, self._model, "stepping", scratch, "tree_budget")
         self.count_substeps = record(
             first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
             scratch, fill(s.WrenchScratch), "tree_substeps",
