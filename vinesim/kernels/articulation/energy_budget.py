@@ -311,7 +311,7 @@ def lead_back(
     """Stop a tree and halve the way that its joints went in the step until its energy, returned, is at most ``goal``."""
     first = model.tree_first[tree]
     energy = wp.vec4(0.0, wp.float32(NO_LIMIT), 0.0, 0.0)
-    halved = 0
+    halved = wp.int32(0)
     while energy[1] > goal and halved < BACKTRACKS:
         for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
             joints_out.joint_q[k] = wp.normalize(start_q[k] + joints_out.joint_q[k])

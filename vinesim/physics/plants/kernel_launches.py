@@ -193,8 +193,8 @@ class KernelLaunches:
         """Predicts groups of trees, on a CPU."""
         apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
         begin = record(
-            begin_budget, parameters, self._model, "stepping", "tree_budget", "tree_phi", self._forces, joints, self.budget,
-            apart, **partitioned,
+            begin_budget, parameters, self._model, "stepping", "tree_budget", "tree_phi", self._forces, joints,
+            self.budget, apart, **partitioned,
         )  # fmt: skip
         move = record(
             integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
