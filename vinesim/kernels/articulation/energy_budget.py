@@ -121,7 +121,7 @@ def choose_budget(
     """One thread chooses how the energy of one tree is watched: closely if it is limp or hardly damped.
 
     trees: [thread] which tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or :data:`NO_BUDGET` with
-    a floating root. scratch_out holds nothing that is needed later.
+    a floating root or without geometric stiffness. scratch_out holds nothing that is needed later.
     """
     tree = trees[wp.tid()]
     first = model.tree_first[tree]
@@ -157,7 +157,7 @@ def choose_budget(
             scratch_out.Du[k] = scratch_out.Du[k] + scratch_out.Du[parent]
         if scratch_out.Du[k][0] > MAX_SAG:
             budget = CLOSELY
-    if floats:
+    if floats or p.geometric_stiffness == 0.0:
         budget = NO_BUDGET
     tree_budget_out[tree] = budget
 

@@ -46,7 +46,7 @@ class StepRunner:
         tree_size: [tree] bodies, by which trees are dealt out.
         tree_substeps: [tree] into how many substeps each tree's step is to be divided.
         tree_steps: [tree] into how many it is divided now, which the kernels read.
-        tree_budget: [tree] how each tree's energy is watched; None if no tree is to have a budget.
+        tree_budget: [tree] how each tree's energy is watched.
         whole: [tree] bool, trees on wires, whose steps are never divided.
         tree_rate: [tree] what the kernels write of each tree's speed.
         stepping: [tree] int32, the list that the kernels read.
@@ -64,7 +64,7 @@ class StepRunner:
         tree_size: np.ndarray,
         tree_substeps: np.ndarray,
         tree_steps: np.ndarray,
-        tree_budget: np.ndarray | None,
+        tree_budget: np.ndarray,
         whole: np.ndarray,
         tree_rate: np.ndarray,
         stepping: np.ndarray,
@@ -116,12 +116,10 @@ class StepRunner:
         self.stepped = trees
         self._list[: len(trees)] = trees
         self._launches.count_substeps(len(trees))
-        if self._budget_kind is not None:
-            self._launches.choose_budget(len(trees))
+        self._launches.choose_budget(len(trees))
         self._buffers.synchronize()
-        if self._budget_kind is not None:
-            self._budget_kind[trees[self._is_whole[trees]]] = NO_BUDGET  # a wire that moves does work on them
-            self._launches.list_budgets(trees[self._budget_kind[trees] != NO_BUDGET])
+        self._budget_kind[trees[self._is_whole[trees]]] = NO_BUDGET  # a wire that moves does work on them
+        self._launches.list_budgets(trees[self._budget_kind[trees] != NO_BUDGET])
         self.fast = trees[(self._substeps[trees] > 1) & ~self._is_whole[trees]]
         self._steps_of[trees] = 1
         self._divided = np.ones(len(self.fast), np.int32)
