@@ -110,9 +110,9 @@ class ArticulationSolver:
         self._runner = StepRunner(
             buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
             tree_rate=self.tree_rate, tree_budget=self.tree_budget, stepping=self._stepping, groups=self._groups,
-            floating=self._floating, topologies=Topologies(model, state.body_cut, self.tree_moving), thread_pool=self.thread_pool,
+            floating=self._floating, topologies=Topologies(model, state.body_cut, self.tree_moving),
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
-            | model.is_on_arm(),
+            | model.is_on_arm(), thread_pool=self.thread_pool,
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -343,14 +343,9 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, touched, count, changed = (
-            self.launches,
-            _NO_TREES,
-            len(self._runner.stepped),
-            len(self._loaded_bodies),
-        )
-        self._wrench[self._loaded_bodies] = 0.0
-        self._loaded_bodies = _NO_TREES
+        launches, touched, loaded = self.launches, _NO_TREES, self._loaded_bodies
+        count = len(self._runner.stepped)
+        self._wrench[loaded], self._loaded_bodies = 0.0, _NO_TREES
         if bodies is not None and len(bodies):
             self._require_stepped(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
@@ -362,7 +357,7 @@ class ArticulationSolver:
             begun = touched[self._last_contact[touched] < self.tick - 1]
             self._euler_steps[begun] = np.maximum(self._euler_steps[begun], self._onset_steps + 1)  # this step counts
             self._last_contact[touched] = self.tick
-        elif changed > 0:
+        elif len(loaded):
             launches.upload_wrenches(count)
         self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)
