@@ -107,7 +107,7 @@ class TwoHands:
         return sum(client.replicator.counters.force.bytes_out for client in self.clients.values())
 
 
-@pytest.mark.parametrize(("delay", "jitter", "loss"), [(0.0, 0.0, 0.0), (0.05, 0.02, 0.02), (0.1, 0.0, 0.0)])
+@pytest.mark.parametrize(("delay", "jitter", "loss"), [(0.0, 0.0, 0.0), (0.05, 0.02, 0.02), (0.1, 0.04, 0.04)])
 def test_two_equal_pulls_leave_the_bunch_in_the_middle_on_both_clients(delay, jitter, loss):
     """F69, F93: both pull with 10 N. Each client alone would show the bunch 5 cm off to its own side."""
     world = TwoHands(delay, jitter=jitter, loss=loss)
@@ -121,6 +121,8 @@ def test_two_equal_pulls_leave_the_bunch_in_the_middle_on_both_clients(delay, ji
     first, second = (world.force(name)[1] for name in world.hands)
     assert first == pytest.approx(-0.1 * HAND_STIFFNESS, rel=0.02)
     assert second == pytest.approx(-first, rel=0.01), "the second feels what the first pulls"
+    if loss:
+        assert np.abs(world.run(8.0) - way[-1]).max() < 5e-4, "no pull ends because messages of it were lost"
     owners = {client.replicator.owner(0) for client in world.clients.values()}
     assert len(owners) == 1
     assert owners < set(world.hands)
@@ -162,12 +164,12 @@ def test_one_hand_sends_no_force_and_the_last_of_two_ends_the_messages():
 
 
 def test_the_other_pull_ends_when_its_client_falls_silent():
-    """A client that crashes while it pulls lets go within a tenth of a second."""
+    """A client that crashes while it pulls lets go within a fifth of a second."""
     world = TwoHands(0.02)
     world.grasp()
     world.pull_apart(0.1, 0.1)
     world.run(1.0)
     owner = next(name for name in world.hands if world.clients[name].replicator.owner(0) == name)
     world.clients = {owner: world.clients[owner]}
-    world.run(0.2)
+    world.run(0.25)
     assert world.clients[owner].couplings.trees == set()

@@ -13,8 +13,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.couplings import MAX_COUPLINGS, CouplingMessage, decode_couplings, encode_couplings
 from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.counters import Counters
-from vinesim.net.replication.couplings import ARM_REACH, CouplingSync
-from vinesim.net.replication.hand_forces import MAX_AGE
+from vinesim.net.replication.couplings import ARM_REACH, MAX_AGE, CouplingSync
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.values import Coupling, RobotUpdate
 
