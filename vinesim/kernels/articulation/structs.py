@@ -136,6 +136,20 @@ class Prediction:
 
 
 @wp.struct
+class EnergyBudget:
+    """What energy each tree may have [tree] unless said otherwise; see :mod:`vinesim.kernels.articulation.energy_budget`."""
+
+    limit: wp.array(dtype=float)  # [J] least energy since something did work on the tree from outside
+    last: wp.array(dtype=float)  # [J] energy that the last check left
+    scale: wp.array(dtype=float)  # [J] largest kinetic energy of the last checks
+    mark: wp.array(dtype=wp.int32)  # checksum of the state that the last step left
+    held: wp.array(dtype=float)  # checksum of where its ties are held
+    watch: wp.array(dtype=wp.int32)  # steps that are all checked, or minus the steps since the last check
+    filtered: wp.array(dtype=wp.int32)  # steps so far at whose end energy was taken
+    start_q: wp.array(dtype=wp.quat)  # [body] rotations of joints at the start of the step, of trees watched closely
+
+
+@wp.struct
 class ResponseColumns:
     """Velocities of the bodies on a path by unit impulses [slot * stride + body]; a matrix holds three impulses."""
 

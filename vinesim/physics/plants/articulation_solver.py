@@ -109,10 +109,10 @@ class ArticulationSolver:
         """Kernels on these arrays."""
         self._runner = StepRunner(
             buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
-            tree_rate=self.tree_rate, stepping=self._stepping, groups=self._groups, floating=self._floating,
-            topologies=Topologies(model, state.body_cut, self.tree_moving), thread_pool=self.thread_pool,
+            tree_rate=self.tree_rate, tree_budget=self.tree_budget, stepping=self._stepping, groups=self._groups,
+            floating=self._floating, topologies=Topologies(model, state.body_cut, self.tree_moving),
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
-            | model.is_on_arm(),
+            | model.is_on_arm(), thread_pool=self.thread_pool,
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -126,8 +126,7 @@ class ArticulationSolver:
 
     def _allocate(self, phi: float) -> None:
         """Arrays of the solver beside model and state."""
-        model, state = self.model, self.state
-        trees, bodies = len(model.tree_first), len(model.body_mass)
+        model, state, trees, bodies = self.model, self.state, len(self.model.tree_first), len(self.model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
         """phi asked for each tree [tree]; set it as you like. 1 where a tie is stiff (``stiff_tie_mass``)."""
         self.phi_used = np.zeros(trees, np.float32)
@@ -136,6 +135,8 @@ class ArticulationSolver:
         """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
         self.tree_substeps = np.ones(trees, np.int32)
         """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
+        self.tree_budget = np.zeros(trees, np.int32)
+        """How the energy of each awake tree is watched [tree]: :mod:`vinesim.kernels.articulation.energy_budget`."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.physics.plants.wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
@@ -182,8 +183,8 @@ class ArticulationSolver:
         return {
             wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
                        "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
-                       "tree_euler_steps": self._euler_steps, "tree_steps": self._steps,
-                       "tree_substeps": self.tree_substeps, "floating": self._floating},
+                       "tree_euler_steps": self._euler_steps, "tree_steps": self._steps, "floating": self._floating,
+                       "tree_substeps": self.tree_substeps, "tree_budget": self.tree_budget},
             float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
                     "tie_damping": ties.damping, "tie_softening": ties.softening, "tree_phi": self.phi,
                     "phi_used": self.phi_used, "tree_rate": self.tree_rate},
@@ -342,10 +343,9 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, touched, changed = self.launches, _NO_TREES, len(self._loaded_bodies) > 0
+        launches, touched, loaded = self.launches, _NO_TREES, self._loaded_bodies
         count = len(self._runner.stepped)
-        self._wrench[self._loaded_bodies] = 0.0
-        self._loaded_bodies = _NO_TREES
+        self._wrench[loaded], self._loaded_bodies = 0.0, _NO_TREES
         if bodies is not None and len(bodies):
             self._require_stepped(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
@@ -357,7 +357,7 @@ class ArticulationSolver:
             begun = touched[self._last_contact[touched] < self.tick - 1]
             self._euler_steps[begun] = np.maximum(self._euler_steps[begun], self._onset_steps + 1)  # this step counts
             self._last_contact[touched] = self.tick
-        elif changed:
+        elif len(loaded):
             launches.upload_wrenches(count)
         self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)

@@ -11,6 +11,14 @@ import warp as wp
 
 from vinesim.kernels.articulation import first_mode, structs
 from vinesim.kernels.articulation.eight_trees import predict_groups
+from vinesim.kernels.articulation.energy_budget import (
+    CLOSELY,
+    MIN_PHI,
+    NO_LIMIT,
+    begin_budget,
+    choose_budget,
+    keep_budget,
+)
 from vinesim.kernels.articulation.floating_components import correct_floating_momentum
 from vinesim.kernels.articulation.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.articulation.integration import integrate
@@ -25,6 +33,7 @@ if TYPE_CHECKING:
     from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
 Launch = Callable[..., None]
+
 
 STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
 """Rows that are carried to the device before every prediction."""
@@ -55,6 +64,9 @@ def kernel_parameters(
     }  # fmt: skip
 
 
+BUDGET_PERIOD = 8
+"""Steps in one of which energy is looked at while no tree is watched."""
+
 MIN_CAPACITY = 16
 """Bodies that a list holds at least."""
 
@@ -77,6 +89,8 @@ class KernelLaunches:
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
         self.substeps_due = False
         """Whether they have changed since the substeps of trees were counted."""
+        self._budgeted = np.zeros(0, np.int32)
+        self._keeps_budgets, self._watches_closely, self._budget_phase = False, False, -1
         self._seldom: list[str] = []
         self._register_arrays(solver)
         self._record_transfers()
@@ -105,12 +119,21 @@ class KernelLaunches:
             for name in names:
                 buffers.add_scratch(name, dtype)
         trees = len(model.tree_first)
+        self.budget = structs.EnergyBudget()
+        for name, field in structs.fields(structs.EnergyBudget).items():
+            count = buffers.slot_count if name == "start_q" else trees
+            setattr(self.budget, name, wp.zeros(count, dtype=field.type.dtype, device=buffers.device))
+        self.budget.limit.fill_(NO_LIMIT)
+        rows = (self.budget.limit, self.budget.watch)
+        self._budget_rows = [array.numpy() for array in rows] if buffers.device.is_cpu else []
         buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
 
     def upload_changed(self) -> None:
         """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
         if self.changed:
             self.buffers.upload(self._seldom)
+            self.budget.limit.fill_(NO_LIMIT)
+            self._budget_phase = -1
             self.changed, self.substeps_due = False, True
 
     def fill(self, struct: Any, **values: Any) -> Any:
@@ -168,10 +191,22 @@ class KernelLaunches:
             None if self.buffers.has_copies else self._record_groups(parameters, joints, scratch, prediction)
         )
         """Predicts groups of trees, on a CPU."""
-        self.integrate = record(
+        apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
+        begin = record(
+            begin_budget, parameters, self._model, "stepping", "tree_budget", "tree_phi", self._forces, joints,
+            self.budget, apart, **partitioned,
+        )  # fmt: skip
+        move = record(
             integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
             "tree_rate", "tree_euler_steps", joints, **partitioned,
         )  # fmt: skip
+        keep = record(
+            keep_budget, parameters, self._model, "stepping", "tree_budget", "tree_phi", "tree_steps", "tree_rate",
+            self._forces, self.budget,
+            "tree_euler_steps", joints, apart, self._factors, scratch,
+            fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"), **partitioned,
+        )  # fmt: skip
+        self.integrate = self._keeping_budgets(begin, move, keep)
         self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
         self.apply_wrenches = record(
             apply_wrenches, parameters.dt, self._model, "subset", "body_wrench", self._factors, fill(s.WrenchScratch),
@@ -183,10 +218,43 @@ class KernelLaunches:
             index_list="roots",
         )  # fmt: skip
 
+        self.choose_budget = record(choose_budget, parameters, self._model, "stepping", scratch, "tree_budget")
         self.count_substeps = record(
             first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
             scratch, fill(s.WrenchScratch), "tree_substeps",
         )  # fmt: skip
+
+    def list_budgets(self, trees: np.ndarray) -> None:
+        """These trees [k] have energy budgets (:mod:`vinesim.kernels.articulation.energy_budget`), no others."""
+        self._budgeted, self._budget_phase = trees, -1
+        kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
+        self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
+
+    def look_for_budgets(self, steps: int = 1) -> None:
+        """Once before the integrations of a step or of so many: decide whether they keep energy budgets.
+
+        Always on a GPU and in many steps. Otherwise in one step of eight, and in the seven that follow if a tree is
+        watched closely after it.
+        """
+        self._budget_phase = (self._budget_phase + 1) % BUDGET_PERIOD if steps == 1 else 0
+        if self._budget_phase == 0 or self.buffers.device.is_cuda:
+            self._keeps_budgets = len(self._budgeted) > 0
+        elif self._budget_phase == 1 and self._keeps_budgets:
+            limit, watch = (row[self._budgeted].max() for row in self._budget_rows)
+            self._keeps_budgets = self._watches_closely or bool(watch > 0 or limit >= NO_LIMIT)
+
+    def _keeping_budgets(self, begin: Launch, move: Launch, keep: Launch) -> Launch:
+        """An integration, with what keeps the energy budgets around it in steps that do."""
+
+        def launch(*which: int) -> None:
+            if not self._keeps_budgets:
+                move(*which)
+                return
+            begin(*which)
+            move(*which)
+            keep(*which)
+
+        return launch
 
     def _record_groups(self, parameters: Any, joints: Any, scratch: Any, prediction: Any) -> Launch:
         """The prediction of up to eight trees at once, each thread with memory of its own."""

@@ -8,6 +8,7 @@ loss is yours, in NumPy, PyTorch or by hand: :meth:`Rollout.run` gives poses and
 takes the loss's derivatives by them. docs/gradients.md shows it at work.
 
 A rollout takes whole steps, where the solver divides those of trees that swing above 5 Hz: give those a shorter ``dt``.
+It keeps no energy budget (:mod:`vinesim.kernels.articulation.energy_budget`).
 
 The gradient is of the scheme as it steps, so it is exact where the scheme is smooth. It is not at the tick in which a
 joint passes ``fast_rate`` (phi becomes 1), and damping below ``(2 phi - 1) dt`` times stiffness has none: the scheme

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
+from vinesim.kernels.articulation.energy_budget import NO_BUDGET
 from vinesim.kernels.articulation.lane_records import LANES
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.plants.device_buffers import DeviceBuffers
@@ -45,7 +46,8 @@ class StepRunner:
         tree_size: [tree] bodies, by which trees are dealt out.
         tree_substeps: [tree] into how many substeps each tree's step is to be divided.
         tree_steps: [tree] into how many it is divided now, which the kernels read.
-        whole: [tree] bool, trees whose steps are never divided.
+        tree_budget: [tree] how each tree's energy is watched.
+        whole: [tree] bool, trees on wires, whose steps are never divided.
         tree_rate: [tree] what the kernels write of each tree's speed.
         stepping: [tree] int32, the list that the kernels read.
         groups: [tree, 2] int32, groups that the kernels read: first place in the list, number of trees.
@@ -62,6 +64,7 @@ class StepRunner:
         tree_size: np.ndarray,
         tree_substeps: np.ndarray,
         tree_steps: np.ndarray,
+        tree_budget: np.ndarray,
         whole: np.ndarray,
         tree_rate: np.ndarray,
         stepping: np.ndarray,
@@ -72,7 +75,7 @@ class StepRunner:
     ) -> None:
         self._buffers, self._launches, self._tree_size, self._list = buffers, launches, tree_size, stepping
         self._substeps, self._steps_of, self._rate, self._floating = tree_substeps, tree_steps, tree_rate, floating
-        self._is_whole = whole
+        self._is_whole, self._budget_kind = whole, tree_budget
         self._pool, self._threads = thread_pool, 1 if thread_pool is None else thread_pool.size
         self.stepped = np.zeros(0, np.int32)
         """The trees of this step [k], sorted."""
@@ -113,7 +116,10 @@ class StepRunner:
         self.stepped = trees
         self._list[: len(trees)] = trees
         self._launches.count_substeps(len(trees))
+        self._launches.choose_budget(len(trees))
         self._buffers.synchronize()
+        self._budget_kind[trees[self._is_whole[trees]]] = NO_BUDGET  # a wire that moves does work on them
+        self._launches.list_budgets(trees[self._budget_kind[trees] != NO_BUDGET])
         self.fast = trees[(self._substeps[trees] > 1) & ~self._is_whole[trees]]
         self._steps_of[trees] = 1
         self._divided = np.ones(len(self.fast), np.int32)
@@ -174,6 +180,7 @@ class StepRunner:
         """
         self._divide(touched)
         self._list_roots(roots, root_trees)
+        self._launches.look_for_budgets()
         self._launch(self._launches.integrate, self._whole, MIN_INTEGRATED_TREES_PER_THREAD)
         self._launches.correct_floating_momentum(self._roots)
         self._take_substeps(self._levels, self._whole, 0, self._root_levels)
@@ -201,6 +208,7 @@ class StepRunner:
         count = len(self.stepped)
         if count == 0:
             return
+        self._launches.look_for_budgets(steps)
         if not self._buffers.device.is_cpu:
             what = (self._whole, self._levels, self._roots, self._root_levels)
             if self._graph is None or self._graph_of != what:
