@@ -53,7 +53,7 @@ def orthogonalize_rows(first: int, end: int, n: int, scratch_out: IkScratch):
     """Rotate rows ``first`` to ``end`` of basis, and with them the residual, until they are orthogonal."""
     one, two = wp.float64(1.0), wp.float64(2.0)
     for _ in range(MAX_SWEEPS):
-        rotations = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+        rotations = int(0)
         for i in range(first, end):
             for j in range(i + 1, end):
                 alpha = row_dot(scratch_out.basis, i, i, n)
@@ -168,12 +168,12 @@ def solve_prioritized_ik(
     for _ in range(n + 1):
         for k in range(n):
             scratch_out.solution[k] = zero
-        first = int(0)  # noqa: RUF046
+        first = int(0)
         for t in range(tasks):
             solve_task(first, task_end[t], min_singular_value, jacobian, velocity, scratch_out)
             first = task_end[t]
         add_posture(first, posture_rates, scratch_out)
-        worst = int(0)  # noqa: RUF046
+        worst = int(0)
         excess = wp.float64(0.0)
         for k in range(n):
             rates_out[k] = scratch_out.fixed[k] + scratch_out.weights[k] * scratch_out.solution[k]

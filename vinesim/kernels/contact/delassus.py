@@ -130,7 +130,7 @@ def inverse_mass_times_jacobian(
     for k in range(6 * (touched.tree_end[slot] - start)):
         rows_out.plant_response[row, k] = wp.float64(0.0)
     respond_within_tree(row, 0, slot, touched, rows_out.plant_jacobian, body_response, rows_out.plant_response)
-    last_dof = int(-1)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    last_dof = int(-1)
     if contacts.other[c] < 0:
         other = contacts.other_slot[c]
         if touched.tree_start[other] == start:

@@ -156,7 +156,7 @@ def interval_along_hull(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d, close
     steep = wp.abs(wp.dot(normal, along)) > wp.float64(0.5) * length
     if length < wp.float64(2.0) * tolerance or steep:
         return single
-    face = int(-1)  # noqa: RUF046
+    face = int(-1)
     most = MIN_COPLANAR_COSINE
     for k in range(hulls.first_plane[hull], hulls.first_plane[hull + 1]):
         plane = hulls.plane[k]

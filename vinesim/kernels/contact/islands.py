@@ -39,10 +39,10 @@ def compact_candidates(
 ):
     """One thread in all: list the candidates of all trees; what exceeds the capacity is only counted."""
     slots = candidates.feature.shape[1]
-    count = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
-    overflow = int(0)  # noqa: RUF046
-    impacted = int(0)  # noqa: RUF046
-    skipped = int(0)  # noqa: RUF046
+    count = int(0)
+    overflow = int(0)
+    impacted = int(0)
+    skipped = int(0)
     for row in range(counters_out[AWAKE_TREES]):
         kept = wp.min(candidates.count[row], slots)
         overflow = overflow + candidates.count[row] - kept
@@ -71,7 +71,7 @@ def island_root(label: wp.array(dtype=wp.int32), contact: int):
 @wp.func
 def rigid_island(other: int, geoms: Geoms, rigid: RigidBodies):
     """Label of the rigid bodies that feel a force on one of them; -1 for another plant or a static geom."""
-    label = int(-1)  # noqa: RUF046
+    label = int(-1)
     if other >= 0 and geoms.dof[wp.max(other, 0)] >= 0:
         label = rigid.tree_island[rigid.dof_tree[geoms.dof[other]]]
     return label
@@ -95,7 +95,7 @@ def insert_sorted(body: int, count: int, bodies_out: wp.array(dtype=wp.int32)):
 @wp.func
 def slot_of(body: int, count: int, sorted_bodies: wp.array(dtype=wp.int32)):
     """Place of a body in a sorted list of ``count`` that contains it; 0 for none (negative)."""
-    low = int(0)  # noqa: RUF046
+    low = int(0)
     high = int(count) - 1
     while low < high:
         middle = (low + high) // 2
@@ -163,8 +163,8 @@ def number_sets(
     contact_count: int, counters_out: wp.array(dtype=wp.int32), contacts_out: Contacts, islands_out: Islands
 ):
     """Number islands and blocks in the order of the list, and place the blocks' matrices one after the other."""
-    islands = int(-1)  # noqa: RUF046
-    blocks = int(-1)  # noqa: RUF046
+    islands = int(-1)
+    blocks = int(-1)
     for place in range(contact_count):
         c = islands_out.contact[place]
         previous = islands_out.contact[wp.max(place - 1, 0)]
@@ -181,7 +181,7 @@ def number_sets(
     islands_out.start[islands + 1] = contact_count
     islands_out.first_block[islands + 1] = blocks + 1
     islands_out.block_start[blocks + 1] = contact_count
-    entries = int(0)  # noqa: RUF046
+    entries = int(0)
     for b in range(blocks + 1):
         islands_out.matrix_start[b] = entries
         rows = 3 * (islands_out.block_start[b + 1] - islands_out.block_start[b])
@@ -195,7 +195,7 @@ def number_sets(
 def island_of_dof(dof: int, rigid: RigidBodies, contacts: Contacts, islands: Islands):
     """Island of a degree of freedom; -1 if it has no contact."""
     contact = islands.rigid_last_contact[rigid.tree_island[rigid.dof_tree[dof]]]
-    island = int(-1)  # noqa: RUF046
+    island = int(-1)
     if contact >= 0:
         island = contacts.island[contact]
     return island
@@ -210,7 +210,7 @@ def list_dofs(island_count: int, rigid: RigidBodies, contacts: Contacts, islands
         island = island_of_dof(dof, rigid, contacts, islands_out)
         if island >= 0:
             islands_out.first_dof[island] = islands_out.first_dof[island] + 1
-    listed = int(0)  # noqa: RUF046
+    listed = int(0)
     for i in range(island_count):
         size = islands_out.first_dof[i]
         islands_out.first_dof[i] = listed
@@ -243,7 +243,7 @@ def build_islands(
     """One thread in all: number the plant bodies in contact, sorted, each once; part the contacts into islands."""
     contact_count = counters_out[CONTACTS]
     slots = candidates.feature.shape[1]
-    body_count = int(0)  # noqa: RUF046
+    body_count = int(0)
     for c in range(contact_count):
         row = contacts_out.source[c] // slots
         slot = contacts_out.source[c] % slots

@@ -97,7 +97,7 @@ def write_bias(
     t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
     count = warm_start.count[0]
-    looked = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    looked = int(0)
     while looked < count:  # a contact that lasts is near the same place in the list
         k = (c + looked) % count
         looked = looked + 1
@@ -145,7 +145,7 @@ def write_contact_rows(
     material = capsules.material[contacts_out.feature[c] // 2]
     other = contacts_out.other_body[c]
     other_lever = lever
-    last_dof = int(-1)  # noqa: RUF046
+    last_dof = int(-1)
     arm = lever
     if g >= 0:
         write_material_numbers(c, material, geoms.material[g], pairs, contacts_out)

@@ -70,7 +70,7 @@ def list_near_geoms(
     near_geoms_out: wp.array2d(dtype=wp.int32),
 ):
     """List the geoms whose boxes overlap that of a tree, at most ``most`` static ones; returns the number of all."""
-    count = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    count = int(0)
     movable = geoms.count[0]
     for g in range(movable):
         counts = is_remote or not geoms.is_remote[g]
@@ -310,7 +310,7 @@ def find_rigid_contacts(
     candidates_out.skipped_geoms[row] = wp.max(near_count - room, 0)
     near_count = wp.min(near_count, room)
     is_impact = bool(False)
-    count = int(0)  # noqa: RUF046
+    count = int(0)
     last = capsules.tree_start[tree + wp.where(near_count > 0, 1, 0)]
     for s in range(capsules.tree_start[tree], last):
         if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):

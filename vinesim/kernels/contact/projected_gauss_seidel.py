@@ -69,7 +69,7 @@ def relax_contact(
 @wp.func
 def largest_block(island: int, islands: Islands):
     """Contacts of the largest block of an island."""
-    largest = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    largest = int(0)
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         largest = wp.max(largest, islands.block_start[block + 1] - islands.block_start[block])
     return largest
@@ -115,7 +115,7 @@ def solve_islands(
     if largest_block(island, islands_out) > max_newton_contacts:
         newton_end = 0
     update_rigid_velocity(island, contacts, islands_out, rows_out)
-    sweeps = int(0)  # noqa: RUF046 (Warp's way to declare a variable that changes)
+    sweeps = int(0)
     gradient = wp.float64(0.0)
     busy = bool(True)
     while busy and sweeps < max_sweeps:
