@@ -184,10 +184,12 @@ class GoalSender:
         begin = self.now() + DELAY
         goal = FollowJointTrajectory.Goal(trajectory=JointTrajectory(joint_names=one.joints))
         goal.trajectory.header.stamp.sec, goal.trajectory.header.stamp.nanosec = divmod(round(begin * 1e9), 10**9)
+        points = []
         for t, position, velocity in zip(one.times, one.positions, one.velocities, strict=True):
             point = JointTrajectoryPoint(positions=position.tolist(), velocities=velocity.tolist())
             point.time_from_start.sec, point.time_from_start.nanosec = divmod(round(t * 1e9), 10**9)
-            goal.trajectory.points.append(point)
+            points.append(point)
+        goal.trajectory.points = points
         goal.goal_tolerance = [JointTolerance(name=name, position=TOLERANCE) for name in one.joints]
         goal.goal_time_tolerance.sec = 2
         self.feedback, self.history = [], self.history[-1:]
