@@ -163,3 +163,19 @@ def test_of_a_large_vineyard_a_page_loads_what_is_nearest(shown):
     same = np.flatnonzero((whole["ball"].reshape(-1, 4) == part["ball"].reshape(-1, 4)[cluster]).all(1))[0]
     rows = [slice(int(a["first"][k]), int(a["first"][k] + a["size"][k])) for a, k in ((part, cluster), (whole, same))]
     np.testing.assert_array_equal(part["shape"].reshape(-1, 16)[rows[0]], whole["shape"].reshape(-1, 16)[rows[1]])
+
+
+def test_after_a_reset_a_page_is_told_of_all_trees_that_had_moved(shown):
+    client, world = shown
+    world.scene()
+    swing(client, 3)
+    client.physics.pick(4)
+    client.tick()
+    tick, _ = world.state(-1)
+    client.reset()
+    client.tick()
+    arrays = decode(world.state(tick)[1])[1]
+    bodies = client.model.bodies_of(3)
+    assert set(range(bodies.start, bodies.stop)) <= set(arrays["body"].tolist())
+    np.testing.assert_allclose(arrays["place"], client.physics.state.body_q[arrays["body"], :3], atol=1e-6)
+    assert arrays["picked"].tolist() == []

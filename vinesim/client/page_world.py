@@ -54,6 +54,7 @@ class PageWorld:
         self._snapshot: Snapshot | None = None
         self._rigid_version, self._rigid = 0, b""
         self._visuals: tuple[Any, ...] | None = None
+        client.after_reset.append(self._follow_reset)
         self._driver: int | None = None
         """The page that moves the spectator's eyes or the person: the first that sends anything."""
         self._eyes: np.ndarray | None = None
@@ -80,6 +81,12 @@ class PageWorld:
         with self._lock:
             self._snapshot = swayed
         server.notify()
+
+    def _follow_reset(self) -> None:
+        """All trees are at rest again: pages are told of those that had moved."""
+        self._moved_at[self._moved_at >= 0] = self._client.physics.tick + 1
+        if self._sway is not None:
+            self._sway = Sway(self._client.model)
 
     # ------------------------------------------------------------------ in the server's thread
 
