@@ -17,6 +17,7 @@ from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
+from vinesim.scene.values import INTENTIONS
 from vinesim.web.page_server import WINDOW, PageServer
 
 MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
@@ -133,6 +134,8 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
         pitch = np.arctan2(way[2], np.hypot(*way[:2]))
         page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
         page.run(f"vinesim.viewer.hand.distance = {np.linalg.norm(way) + 0.02}")
+        page.run("document.querySelector('#intentions button').click()")
+        wait(lambda: live.client.humans["viewer"].intention == INTENTIONS[1], "the person indicates what comes")
         page.key("KeyR", down=True)
         page.key("KeyR", down=False)
         wait(lambda: physics.hand("viewer", "right").touching, "the hand reaches the bunch")

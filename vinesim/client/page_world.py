@@ -14,7 +14,7 @@ from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator, follow_view
 from vinesim.physics.plants.sway import Sway
 from vinesim.scene.model import Model
-from vinesim.scene.values import Haptic, Snapshot
+from vinesim.scene.values import INTENTIONS, Haptic, Snapshot
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.static_primitives import row_layout
@@ -58,6 +58,7 @@ class PageWorld:
         self._driver: int | None = None
         """The page that moves the spectator's eyes or the person: the first that sends anything."""
         self._eyes: np.ndarray | None = None
+        self._intention = ""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
 
@@ -70,7 +71,10 @@ class PageWorld:
         if self._eyes is not None and isinstance(self._client, Spectator):
             self._client.pose = self._eyes
         if self._person is not None:
-            for haptic in self._client.humans[self._client.name].haptics:
+            human = self._client.humans[self._client.name]
+            if human.intention != self._intention:
+                human.indicate(self._intention)
+            for haptic in human.haptics:
                 if (before := self._haptics.get(haptic.hand)) is None or before.amplitude < haptic.amplitude:
                     self._haptics[haptic.hand] = haptic
         if self._sway is None or not server.has_viewers:
@@ -108,6 +112,7 @@ class PageWorld:
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
                 "person": None if self._person is None else self._client.name,
+                "intentions": [] if self._person is None else list(INTENTIONS[1:]),
                 "gestures": {} if self._person is None else dict(self._person.gestures.poses),
                 "buttons": {} if self._person is None else dict(self._person.gestures.buttons),
             },
@@ -165,6 +170,8 @@ class PageWorld:
         self._eyes = np.array(said.view)
         if self._person is not None and said.person is not None:
             self._person.take(_tracked(said.person))
+            if said.person.intention in INTENTIONS:
+                self._intention = said.person.intention
 
     def leave(self, page: int) -> None:
         """A page is gone: another one may move the person."""

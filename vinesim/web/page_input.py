@@ -30,6 +30,8 @@ class TrackedPerson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     head: Pose
     left: TrackedHand | None = None
     right: TrackedHand | None = None
+    intention: Annotated[str, msgspec.Meta(max_length=32)] = ""
+    """What the person indicates to do; empty: nothing."""
 
 
 class PageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -32,6 +32,8 @@ class Viewer {
     this.offerHeadset();
     this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
     this.help.hidden = false;
+    this.intention = "";
+    this.offerIntentions(world.header.intentions);
     this.newest = null;
     this.followed = -1;
     this.shadowAt = -1e9;
@@ -43,6 +45,22 @@ class Viewer {
     this.resize();
     this.connect();
     this.renderer.setAnimationLoop((_, frame) => this.draw(frame));
+  }
+
+  /** One button for each thing that a person may indicate to do; a second click ends it. */
+  offerIntentions(intentions) {
+    const panel = element("intentions");
+    panel.hidden = intentions.length === 0;
+    for (const intention of intentions) {
+      const button = panel.appendChild(document.createElement("button"));
+      button.textContent = intention;
+      button.addEventListener("click", () => {
+        this.intention = this.intention === intention ? "" : intention;
+        for (const other of panel.querySelectorAll("button"))
+          other.classList.toggle("on", other.textContent === this.intention);
+        button.blur(); // keys go on to move
+      });
+    }
   }
 
   async offerHeadset() {
@@ -139,12 +157,12 @@ class Viewer {
   message(pose) {
     const message = { drawn: page.tick, view: pose };
     if (!this.isPerson) return message;
-    if (this.headset.isWorn) return { ...message, person: { head: pose, ...this.headset.hands() } };
+    if (this.headset.isWorn) return { ...message, person: { head: pose, ...this.headset.hands(), intention: this.intention } };
     const ray = new THREE.Vector3(...this.hand.cursor, 0.5).unproject(this.camera).sub(this.camera.position).normalize();
     const now = performance.now(), seconds = Math.min((now - (this.toldAt ?? now)) / 1000, 0.1);
     this.toldAt = now;
     const right = this.hand.tracked(pose.slice(0, 3), [ray.x, -ray.z, ray.y], this.eyes.yaw, seconds);
-    return { ...message, person: { head: pose, left: null, right } };
+    return { ...message, person: { head: pose, left: null, right, intention: this.intention } };
   }
 
   /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
