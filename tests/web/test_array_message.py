@@ -18,7 +18,12 @@ arrays = st.dictionaries(
 )
 
 
-@given(st.dictionaries(st.text(max_size=8).filter(lambda key: key != "arrays"), st.floats(allow_nan=False)), arrays)
+@given(
+    st.dictionaries(
+        st.text(max_size=8).filter(lambda key: key != "arrays"), st.floats(allow_nan=False, allow_subnormal=False)
+    ),
+    arrays,
+)
 def test_values_and_arrays_come_out_as_they_went_in(values, given_arrays):
     message = encode(values, given_arrays)
     header, found = decode(message)
