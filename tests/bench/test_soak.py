@@ -13,7 +13,7 @@ import pytest
 
 from vinesim.bench import soak
 from vinesim.bench.process_memory import ProcessHistory, ProcessSample, ProcessSampler, sample_process
-from vinesim.bench.soak import Cast, _Run, measurements, run_soak
+from vinesim.bench.soak import Cast, SoakResult, _Run, measurements, run_soak, settle
 from vinesim.client.processes.child_process import Process, ProcessFailed
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/smaps_rollup"), reason="needs /proc of Linux")
@@ -39,6 +39,17 @@ def test_handles_that_pile_up_are_seen() -> None:
     """A process that opens a file now and then has more of them in the second half; one that closes them has not."""
     assert history([1.0] * 6, handles=[5, 5, 6, 6, 7, 7]).change("handles") == 1
     assert history([1.0] * 6, handles=[5, 6, 5, 6, 5, 6]).change("handles") == 0
+
+
+def test_processes_that_end_or_get_another_name_while_memory_settles_are_no_error() -> None:
+    """An hour's figures are not lost for a process that was there for its first minutes only."""
+    steady, brief = history([50.0] * 30), history([50.0] * 3)
+    found, ended = settle(
+        {("client", 1): steady, ("python", 2): brief, ("standby", 2): steady, ("helper", 3): brief}, 700.0, 1840.0
+    )
+    assert list(found) == [("client", 1), ("standby", 2)]
+    assert ended == {"helper 3 ended": 1}
+    assert len(list(measurements(SoakResult(found, ended, 100.0)))) == 10
 
 
 def test_samples_follow_what_a_process_takes() -> None:

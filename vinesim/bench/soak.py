@@ -120,9 +120,23 @@ def run_soak(cast: Cast, minutes: float, announce: Callable[[str], None]) -> Soa
                 said = now
                 announce(f"{(now - start) / 60.0:.0f} of {minutes:g} minutes; {run.progress()}")
             time.sleep(POLL_PERIOD)
-        histories = {key: history.since(settled) for key, history in run.sampler.histories.items()}
-        lost = {f"{kind} {pid} ended": 1 for (kind, pid), one in histories.items() if one.times[-1] < end - 60.0}
-        return SoakResult(histories, run.end() | lost, run.least_rate())
+        histories, ended = settle(run.sampler.histories, settled, end)
+        return SoakResult(histories, run.end() | ended, run.least_rate())
+
+
+def settle(
+    histories: dict[tuple[str, int], ProcessHistory], settled: float, end: float
+) -> tuple[dict[tuple[str, int], ProcessHistory], dict[str, int]]:
+    """Histories from the time ``settled`` [s] on, and which processes had ended a minute before the ``end`` [s].
+
+    A process that has got another name meanwhile, as one that stood by, is there under both, and has not ended.
+    """
+    last: dict[int, float] = {}
+    for (_, pid), history in histories.items():
+        last[pid] = max(last.get(pid, -np.inf), history.times[-1])
+    ended = {f"{kind} {pid} ended": 1 for kind, pid in histories if last[pid] < end - 60.0}
+    later = {key: history.since(settled) for key, history in histories.items()}
+    return {key: history for key, history in later.items() if history.times}, ended
 
 
 class _Run:
