@@ -32,7 +32,7 @@ from vinesim.sensors.export.images import look_at
     ],
 )  # fmt: skip
 def test_flashes_are_those_of_iec_60073(pattern, band):
-    """Slow or normal, half of the time lit, and the same for whoever looks at the same time."""
+    """Slow or normal, half of the time lit; equal for equal times of the world, and so the same on all clients."""
     lights = Lights(pattern, (1, 2, 3))
     shown = [lights.shown(time) for time in np.arange(0.0, 50.0, 0.01) + 1e-6]
     assert set(shown) == {UNLIT, (1, 2, 3)}

@@ -1,4 +1,4 @@
-"""``vinesim bench page``: how soon a page is told what its own person did, and how much it is told.
+"""``vinesim bench page``: latency from an input on a page to the state message that contains it, and message sizes.
 
 A person's client as its users start it; this process stands for the page: it acknowledges each state at once, as a page
 that draws without delay, and moves the person's head to and fro. What a browser needs to draw is not in the figures.

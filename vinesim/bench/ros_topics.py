@@ -1,4 +1,4 @@
-"""``vinesim bench ros``: what another process hears of a real robot client, and what its actions do.
+"""``vinesim bench ros``: topics of a real robot client as a subscriber in another process receives them, and its actions.
 
 A client as its users start it, physics and renderer included; a stock node in a second process that subscribes to the
 topics of every step; and a third that reads them too, pictures and clouds besides, until it is stopped with SIGSTOP.
