@@ -146,7 +146,7 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
         page.key("Space", down=False)
         wait(
             lambda: page.run("vinesim.haptics.right?.[0] > 0"),
-            "a vibration command of the right hand arrives at the page",
+            "a vibration of the right hand arrives",
         )
         wait(lambda: np.linalg.norm(physics.state.body_q[body, :3] - here) > 2e-3, "the bunch gives way")
         wait(lambda: physics.hand("viewer", "right").held is not None, "the hand holds the bunch")

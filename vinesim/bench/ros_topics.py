@@ -1,4 +1,4 @@
-"""``vinesim bench ros``: topics of a real robot client as a subscriber in another process receives them, and its actions.
+"""``vinesim bench ros``: topics of a real robot client as another process receives them, and its actions.
 
 A client as its users start it, physics and renderer included; a stock node in a second process that subscribes to the
 topics of every step; and a third that reads them too, pictures and clouds besides, until it is stopped with SIGSTOP.
