@@ -7,8 +7,6 @@ of either direction; from client to client all of that is twice as much. One tou
 from __future__ import annotations
 
 import pathlib
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -56,12 +54,7 @@ def run_poor_link(protocol: str, seconds: float) -> tuple[int, int, float]:
             for name in ("ada", "bob"):
                 create(certificates, name)
         options = ["--tls", str(certificates)] if secured else ["--insecure"]
-        server = net.start(
-            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--status", "none", *options],
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert server.stdout is not None
-        server.stdout.readline()
+        net.start_server(*options)
 
         def start_process(name: str, x: float) -> FakeClientProcess:
             return FakeClientProcess(

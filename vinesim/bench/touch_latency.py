@@ -7,7 +7,6 @@ visitor watches the same bunch in its own simulation; both trace it by the clock
 from __future__ import annotations
 
 import pathlib
-import subprocess
 import sys
 import tempfile
 import time
@@ -82,12 +81,7 @@ def run_clients(line: Link) -> tuple[Rows, Rows]:
     client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
     roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}
     with tempfile.TemporaryDirectory() as folder, NetworkEmulator(dict.fromkeys(roles, line)) as net:
-        server = net.start(
-            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--insecure", "--status", "none"],
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert server.stdout is not None
-        server.stdout.readline()
+        net.start_server("--insecure")
         processes = []
         for name, role in roles.items():
             place = ["--connect", f"tcp/{net.hub(name)}:7447", "--name", name, "--out", f"{folder}/{name}"]
@@ -106,12 +100,7 @@ def measure_notification(line: Link, touches: int = TOUCHES) -> list[float]:
     Their steps are kept even on a busy machine, so this is the share of the network, and the wait for two steps.
     """
     with NetworkEmulator({"ada": line, "bob": line}) as net:
-        server = net.start(
-            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--insecure", "--status", "none"],
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert server.stdout is not None
-        server.stdout.readline()
+        net.start_server("--insecure")
 
         def start_process(name: str, x: float) -> FakeClientProcess:
             fake_clients = [{"name": name, "place": [x, 0.0]}]

@@ -148,12 +148,7 @@ def run_client(connect: str, name: str, seconds: float, out: str) -> None:
 def run_two_pullers(seconds: float = SECONDS, protocol: str = "tcp") -> tuple[float, dict[str, Seen]]:
     """When both began [s, clock of the host], and what each saw; RuntimeError if one ends early."""
     with tempfile.TemporaryDirectory() as folder, NetworkEmulator(dict.fromkeys(SIDES, POOR)) as net:
-        server = net.start(
-            "hub", [sys.executable, "-m", "vinesim.cli", "server", "--insecure", "--status", "none"],
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
-        assert server.stdout is not None
-        server.stdout.readline()
+        net.start_server("--insecure")
         files = {name: pathlib.Path(folder) / f"{name}.npz" for name in SIDES}
         people: list[subprocess.Popen] = []
         for name, file in files.items():

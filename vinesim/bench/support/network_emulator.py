@@ -150,6 +150,13 @@ class NetworkEmulator:
         self._started.append(process)
         return process
 
+    def start_server(self, *options: str) -> None:
+        """Start ``vinesim server`` in the hub with some ``options``, and wait until it listens."""
+        command = [sys.executable, "-m", "vinesim.cli", "server", "--status", "none", *options]
+        server = self.start("hub", command, stdout=subprocess.PIPE, text=True)
+        assert server.stdout is not None
+        server.stdout.readline()
+
     def shape(self, end: str, line: Link) -> None:
         """Change the link of ``end`` from now on."""
         self._request({"shape": end, "line": _to_json(line)})

@@ -76,9 +76,7 @@ from vinesim.kernels.articulation.structs import (
     SolverParameters,
     substep_parameters,
 )
-
-INLINE_ALL = (wp.config.cpu_compiler_flags or "").replace("-inline-threshold=9000", "-inline-threshold=100000")
-"""Warp's flags for its CPU compiler, but functions of any size are inlined: a loop with a call is not vectorised."""
+from vinesim.kernels.compiler_flags import INLINE_ALL
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 

@@ -53,9 +53,7 @@ from vinesim.kernels.articulation.structs import (
     SolverParameters,
 )
 from vinesim.kernels.articulation.tree_energy import is_pushed, state_mark, tree_energy
-
-INLINE_ALL = (wp.config.cpu_compiler_flags or "").replace("-inline-threshold=9000", "-inline-threshold=100000")
-"""Warp's flags for its CPU compiler, but functions of any size are inlined: with a call, all structs are copied first."""
+from vinesim.kernels.compiler_flags import INLINE_ALL
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 

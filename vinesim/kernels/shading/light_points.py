@@ -7,14 +7,12 @@ loop over a list has no branch, so that LLVM takes eight points at a time (docs/
 
 import warp as wp
 
+from vinesim.kernels.compiler_flags import INLINE_ALL
 from vinesim.kernels.raster.pinhole import BATCH, FloatBatch, Pinhole
 from vinesim.kernels.raster.primitives import LEAF, SPHEROID, Shapes
 from vinesim.kernels.shading.deferred import Light, fast_atan2, surface_light
 from vinesim.kernels.shading.materials import BERRY, Materials, mix
 from vinesim.kernels.shading.shadow_maps import SUN_DISTANCE, ShadowMap
-
-INLINE_ALL = (wp.config.cpu_compiler_flags or "").replace("-inline-threshold=9000", "-inline-threshold=100000")
-"""Warp's flags for its CPU compiler, but functions of any size are inlined: a loop with a call takes no eight points."""
 
 wp.set_module_options({"enable_backward": False, "fast_math": True, "cpu_compiler_flags": INLINE_ALL})
 
