@@ -53,9 +53,9 @@ def wait_until_ready(
 
 
 def _newest_progress(clients: Mapping[str, Process]) -> str:
-    """What a client that is not ready says of its progress, such as the kernel that it compiles."""
-    lines = [f"; {name}: {process.stderr_tail[-1]}" for name, process in clients.items() if process.stderr_tail]
-    return lines[0] if lines else ""
+    """What each client that is not ready says of its progress, such as the kernel that it compiles, or waits for."""
+    lines = (f"; {name}: {process.stderr_tail[-1]}" for name, process in clients.items() if process.stderr_tail)
+    return "".join(lines)
 
 
 @contextlib.contextmanager
