@@ -22,6 +22,7 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import String
 
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.ros.messages import message_packages
@@ -170,6 +171,22 @@ def test_a_parameter_file_counts_from_the_start(tmp_path):
     with pytest.raises(ValueError, match=r"parameters\.yaml is no ROS 2 parameter file") as refused:
         RobotNode("r", "<robot name='r'/>", params_file=file)
     assert "\n" not in str(refused.value)
+
+
+def test_a_node_that_is_refused_leaves_the_graph(tmp_path):
+    """Nobody hears the description of a robot that did not start, while its error is kept."""
+    message_packages.ensure_importable(["tf2_msgs"])
+    file = tmp_path / "parameters.yaml"
+    file.write_text("/**: {ros__parameters: {publish_truth: 3}}\n")
+    heard: list[str] = []
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    with StockNode() as peer:
+        with pytest.raises(ValueError, match="publish_truth") as kept:
+            RobotNode("r", "<robot name='refused'/>", params_file=file)
+        peer.node.create_subscription(String, "robot_description", lambda m: heard.append(m.data), latched)
+        with RobotNode("s", "<robot name='started'/>"):
+            wait_until(lambda: "<robot name='started'/>" in heard, peer.spin, "a description")
+    assert heard == ["<robot name='started'/>"], kept
 
 
 def test_depth_labels_and_rates_of_sensors():

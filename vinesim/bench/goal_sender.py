@@ -122,8 +122,8 @@ class GoalSender:
         self.node.create_subscription(String, "/robot_description", self._take_description, latched)
         self.node.create_subscription(JointState, "/joint_states", self._take, 100)
         self.node.create_subscription(Clock, "/clock", self._take_time, 1)
-        self.until(lambda: self.urdf and self.history and self.stamp, "the robot")
-        self.joints = {name: self._joints(start) for name, start in CONTROLLERS.items()}
+        self.joints: dict[str, dict[str, Joint]] = {}
+        self.until(lambda: self.urdf and self.history and self.stamp and self._found_joints(), "the robot's joints")
         self.actions = {
             name: ActionClient(self.node, FollowJointTrajectory, f"/{name}/follow_joint_trajectory")
             for name in CONTROLLERS
@@ -131,6 +131,11 @@ class GoalSender:
         for action in self.actions.values():
             self.until(action.server_is_ready, "the controllers")
         self.feedback: list[Any] = []
+
+    def _found_joints(self) -> bool:
+        """Whether each controller has joints; the description of another robot has none of them."""
+        self.joints = {name: self._joints(start) for name, start in CONTROLLERS.items()}
+        return all(self.joints.values())
 
     def _joints(self, start: str) -> dict[str, Joint]:
         found = {}

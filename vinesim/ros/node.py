@@ -63,9 +63,14 @@ class Node:
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         try:
             self._node = self._create(name, namespace, params_file)
-            self._parameters = Parameters(self._node, parameters)
-            self._open()
-            self._parameters.apply()
+            try:
+                self._parameters = Parameters(self._node, parameters)
+                self._open()
+                self._parameters.apply()
+            except BaseException:
+                # An end of the context alone leaves its publishers in the graph, for as long as the error is kept.
+                self._node.destroy_node()
+                raise
         except BaseException:
             self._context.shutdown()
             raise
