@@ -32,13 +32,14 @@ from vinesim.scene.values.sensors import (
     LevelLaser,
     LidarScan,
 )
-from vinesim.scene.values.signals import INTENTIONS, Intention, LightPattern, Lights
+from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
 __all__ = [
     "FORWARD_KINDS",
     "INTENTIONS",
+    "TONE_LEVEL",
     "MIN_BERRY_PIXELS",
     "POINT_NAMES",
     "Box",
