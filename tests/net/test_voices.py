@@ -58,7 +58,9 @@ def test_a_frame_goes_in_one_datagram_and_comes_out_as_it_went_in():
         assert decode_voice(payload) == frame
 
 
-@pytest.mark.parametrize("codec, data", [(1, b""), (1, bytes(2000)), (1, b"\xff" * 9), (2, b"\0"), (0, TONE), (9, TONE)])
+@pytest.mark.parametrize(
+    "codec, data", [(1, b""), (1, bytes(2000)), (1, b"\xff" * 9), (2, b"\0"), (0, TONE), (9, TONE)]
+)
 def test_what_is_no_frame_is_refused(codec, data):
     payload = bytearray(encode_voice(VoiceFrame(0, 1.0, Codec.PCM16, TONE)))
     with pytest.raises(MessageError):

@@ -36,7 +36,7 @@ class OpusDecoder:
         self._before = np.zeros(_TAPS - 1, np.float32)
         self._codec = self._new()
 
-    def _new(self):  # noqa: ANN202 - PyAV has no public name for it
+    def _new(self):
         codec = self._av.CodecContext.create("libopus", "r")
         codec.sample_rate, codec.layout = OPUS_RATE, "mono"
         return codec

@@ -39,9 +39,9 @@ from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 __all__ = [
     "FORWARD_KINDS",
     "INTENTIONS",
-    "TONE_LEVEL",
     "MIN_BERRY_PIXELS",
     "POINT_NAMES",
+    "TONE_LEVEL",
     "Box",
     "BunchTruth",
     "CameraFrame",

@@ -58,7 +58,6 @@ class Lights:
             return None
         return self.color if time * FREQUENCY[self.pattern] % 1.0 < 0.5 else UNLIT
 
-
     def tone(self, time: float) -> float:
         """Frequency of the tone that is heard at a time of the world [s] [Hz]; 0: none."""
         return TONE.get(self.pattern, 0.0) if self.has_sound and self.shown(time) != UNLIT else 0.0
