@@ -1,4 +1,4 @@
-"""A microphone records the sum of what is near it, by the law of loudness, also when frames are lost, late or no sound."""
+"""A microphone records the sum of what is near it, by the law of loudness, also when frames are lost or late."""
 
 import base64
 import itertools

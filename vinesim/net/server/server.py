@@ -75,7 +75,8 @@ class Server:
 
         ``connect``: routers or servers to link to. A linked server only routes; of linked servers the one that connects
         to none admits and retains. ``state_folder``: folder of the journals; without one the state lives as long as the
-        server. ``scene``: the only one allowed. ``max_actors``: at a time. ``spectators_speak_to``: who hears them. ``certificates``: folder of a server, see
+        server. ``scene``: the only one allowed. ``max_actors``: at a time. ``spectators_speak_to``:
+        who hears them. ``certificates``: folder of a server, see
         :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate. It is read
         again when its files change.
 

@@ -2,8 +2,8 @@
 
 Every actor has a certificate with its name as common name. It may subscribe to its whole world, query, and publish only
 under keys that end with its own name. A robot also offers its meshes to the server, under its own name. A spectator
-publishes only its presence, its hello, its viewpoint and its voice. The rules are applied by the router, so a foreign key ends
-there.
+publishes only its presence, its hello, its viewpoint and its voice. The rules are applied by the router, so a foreign
+key ends there.
 """
 
 from __future__ import annotations
