@@ -12,7 +12,7 @@ MAX_QUEUED = 30.0
 """[s] Sound that waits to be played; more is refused."""
 
 PREPARATION = 0.06
-"""[s] Sound that must wait, or time that must pass, before it begins: messages shorter than a frame join without gaps."""
+"""[s] Sound that must wait, or time that must pass, before it begins: so messages join without gaps."""
 
 _FRAME_BYTES = 2 * FRAME_SAMPLES
 

@@ -1,7 +1,8 @@
 """What a microphone records: the sum of all voices and tones near it, each by its loudness there, in blocks of 20 ms.
 
 Frames of sound are stamped with the network time at which they began. A block is recorded :attr:`Microphone.delay`
-after its end, so that frames that are under way still reach it; one that comes too late is counted, and the delay grows.
+after its end, so that frames that are under way still reach it; one that comes too late is counted, and the delay
+grows.
 """
 
 from __future__ import annotations

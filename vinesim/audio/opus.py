@@ -17,7 +17,7 @@ _HALF = (_TAPS - 1) / 2.0
 _TIME = (np.arange(_TAPS) - _HALF) / _FACTOR
 _LOW_PASS = (0.9 * np.sinc(0.9 * _TIME) * np.hamming(_TAPS)).astype(np.float32)
 _LOW_PASS /= _LOW_PASS.sum()
-"""Windowed sinc with its cut-off at 7.2 kHz: what is above half of :data:`SAMPLE_RATE` would be heard as other tones."""
+"""Windowed sinc with its cut-off at 7.2 kHz: what is above half of :data:`SAMPLE_RATE` would become other tones."""
 
 
 def is_available() -> bool:

@@ -1,7 +1,7 @@
 """All sound that leaves and reaches the actors of one client; once a step, between threads and the network.
 
-Pages and ROS give sound in their own threads, which is stored until the step; what arrives is handed to listeners, which
-only store or send it on. Nothing is decoded or mixed here.
+Pages and ROS give sound in their own threads, which is stored until the step; what arrives is handed to listeners,
+which only store or send it on. Nothing is decoded or mixed here.
 """
 
 from __future__ import annotations
@@ -199,7 +199,7 @@ class SoundExchange:
         return tones
 
     def place_of(self, actor: str) -> np.ndarray:
-        """Where a local actor speaks and hears [3] m: a person's head, a spectator's eyes, 1.2 m above a robot's base."""
+        """Where a local actor speaks and hears [3] m: a person's head, a spectator's eyes, above a robot's base."""
         client = self._client
         if actor in client.humans:
             return client.humans[actor].pose.head[:3]

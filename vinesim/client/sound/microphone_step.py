@@ -30,12 +30,12 @@ def at_place(step: SoundStep, place: np.ndarray) -> MicrophoneStep:
     def loudness(source: np.ndarray) -> float:
         return gain(float(np.linalg.norm(source - place)))
 
-    heard = ((spoken, loudness(spoken.place)) for spoken in step.frames)
+    heard = ((spoken.speaker, spoken.frame, loudness(spoken.place)) for spoken in step.frames)
     return MicrophoneStep(
         step.now, step.to_world,
         tuple(
-            HeardFrame(spoken.speaker, spoken.frame.number, spoken.frame.time, spoken.frame.codec, spoken.frame.data, level)
-            for spoken, level in heard
+            HeardFrame(speaker, frame.number, frame.time, frame.codec, frame.data, level)
+            for speaker, frame, level in heard
             if level > 0.0
         ),
         tuple(

@@ -1,4 +1,4 @@
-"""Wire format of a frame of sound: header with the speaker's count of frames and the time it began, codec, the sound."""
+"""Wire format of a frame of sound: header with the speaker's count of frames and the time it began, codec, sound."""
 
 from __future__ import annotations
 

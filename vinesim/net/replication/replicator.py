@@ -7,8 +7,8 @@ is near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong
 
 Keys: ``a/<actor>`` poses, ``tree/<x>/<y>/<actor>`` and ``near/<x>/<y>/<actor>`` states of trees that move in a cell,
 ``c/<x>/<y>/<actor>`` those of boxes and bunches, ``own/<x>/<y>/<actor>`` claims and
-states at rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, ``voice/<actor>`` frames of
-sound, and the queries
+states at rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, ``voice/<actor>``
+frames of sound, and the queries
 ``snap/<x>/<y>`` (records of a cell), ``hello/<actor>`` and ``clock``.
 """
 

@@ -111,8 +111,8 @@ class VoiceSync:
         return may_hear(self._hello.kind, "human", self._bus.spectators_speak_to)
 
     def say(self, time: float, codec: Codec, data: bytes, *, is_main: bool = True) -> None:
-        """Send a frame that began at network ``time`` [s]. PCM16 goes to those without Opus; ``is_main``: to the others,
-        too."""
+        """Send a frame that began at network ``time`` [s]. PCM16 goes to those without Opus;
+        ``is_main``: to the others, too."""
         if not self.may_speak:
             return
         for which, applies in enumerate((is_main, codec is Codec.PCM16)):
