@@ -11,7 +11,6 @@ import time
 
 import pytest
 
-from vinesim import disk_cache
 from vinesim.cli.doctor import command, machine, software
 from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding
 from vinesim.ros import dead_segments
@@ -208,4 +207,3 @@ def test_the_folder_of_kernels_is_that_of_warp():
 
     assert vinesim.kernels
     assert pathlib.Path(wp.config.kernel_cache_dir).is_relative_to(software.kernel_folder())
-    assert disk_cache.user_folder() in (software.kernel_folder().parent, disk_cache.user_folder())

@@ -3,7 +3,8 @@
 ``commands`` holds the options of all commands and nothing else; a command imports its implementation when it runs, so
 that ``vinesim --help`` opens at once.
 
-Exit codes: 0 done; 1 ``doctor`` has found an error, or a defect; 2 wrong use or bad input; 3 a part is missing on this machine; 4 the network or the server;
+Exit codes: 0 done; 1 ``doctor`` has found an error, or a defect of vinesim; 2 wrong use or bad input; 3 a part is
+missing on this machine; 4 the network or the server;
 5 a job was not done, or its files could not be written; 130 stopped by Ctrl-C or SIGTERM where stopping is not the
 ordinary end.
 """

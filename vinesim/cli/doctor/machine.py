@@ -43,7 +43,7 @@ def cpu(description: pathlib.Path = pathlib.Path("/proc/cpuinfo"), cgroup: pathl
             "cpu",
             WARNING,
             found,
-            f"a client with cameras needs {CORES}: fewer steps and pictures a second are possible",
+            f"a client with cameras needs {CORES}: else fewer steps and pictures a second",
         )
     if platform.machine() in ("x86_64", "AMD64") and flags and "avx2" not in flags:
         return Finding("cpu", WARNING, found, "without avx2 plants and pictures take several times as long")
@@ -82,7 +82,7 @@ def gpu(driver: pathlib.Path = pathlib.Path("/proc/driver/nvidia/version")) -> F
         if driver.exists() or shutil.which("nvidia-smi"):
             return Finding(
                 "gpu", WARNING, "an NVIDIA driver is installed, but Warp finds no GPU",
-                "see 'nvidia-smi'; a container needs '--gpus all', an old driver an update; until then use --device cpu",
+                "see 'nvidia-smi'; a container needs '--gpus all'; an old driver needs an update",
             )  # fmt: skip
         return Finding("gpu", OK, "none of NVIDIA; everything runs on the CPU")
     names = [f"cuda:{number}" for number in range(count)]
@@ -138,7 +138,7 @@ def ports(port: int = PORT) -> Finding:
     if busy:
         return Finding(
             "ports", WARNING, f"{port} is used: {', '.join(busy)}",
-            f"if that is a server, join it: --connect tcp/127.0.0.1:{port}; start another with --listen tcp/127.0.0.1:0",
+            f"if that is a server, join it: --connect tcp/127.0.0.1:{port}; else --listen tcp/127.0.0.1:0",
         )  # fmt: skip
     return Finding("ports", OK, f"{port} is free for a server (tcp and udp)")
 
@@ -148,9 +148,7 @@ def clock() -> Finding:
     resolution = time.get_clock_info("monotonic").resolution
     found = f"monotonic to {resolution * 1e9:.0f} ns"
     if resolution > RESOLUTION:
-        return Finding(
-            "clock", WARNING, found, "steps of 10 ms cannot be paced; use another clock source of the system"
-        )
+        return Finding("clock", WARNING, found, "steps of 10 ms cannot be paced; choose another clock source")
     status = _clock_status()
     if status is None:
         return Finding("clock", OK, f"{found}; whether NTP runs cannot be told here")

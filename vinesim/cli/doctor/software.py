@@ -18,8 +18,8 @@ from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding, amount, size
 FREE_SPACE = 1 << 30
 """[B] Compiled kernels and tables take up to this."""
 EXTRAS = {
-    "ros": "ROS 2", "web": "the page in a browser", "tls": "certificates", "tune": "fits", "tiago": "the robot tiago_pro",
-    "perception": "point clouds from depth", "voice": "voices",
+    "ros": "ROS 2", "web": "the page in a browser", "tls": "certificates", "tune": "fits",
+    "tiago": "the robot tiago_pro", "perception": "point clouds from depth", "voice": "voices",
 }  # fmt: skip
 """Extras of the package that users install, and what for."""
 
