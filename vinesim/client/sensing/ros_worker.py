@@ -92,8 +92,12 @@ class RosChannel:
             context,
         )  # fmt: skip
         self.wanted = SharedArrays(
-            {"steps": ((len(config.step_topics),), "?"), "truth_period": ((1,), "f8"), "goals": ((1,), "?"),
-             "sound": ((1,), "?")}
+            {
+                "steps": ((len(config.step_topics),), "?"),
+                "truth_period": ((1,), "f8"),
+                "goals": ((1,), "?"),
+                "sound": ((1,), "?"),
+            }
         )
         """Whether topics have subscribers, and actions goals, and how often true poses are wanted [s], 0 for never;
         written by the process."""

@@ -26,7 +26,6 @@ from vinesim.ros.commands.types import (
 from vinesim.ros.messages.convert import seconds
 from vinesim.scene.values import LightPattern
 
-
 MAX_SOUND = 960_000
 """Bytes of sound in one message: half a minute."""
 
