@@ -23,7 +23,7 @@ def picture(seed: int) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     simulation = vinesim.Simulation(vinesim.load_scene("demo", seed=seed))
     eye = np.array([rng.uniform(0.5, 2.5), -1.0, rng.uniform(1.2, 1.5)])
-    frame = camera.render(simulation, vinesim.look_at(eye, eye + (0.0, 1.5, rng.uniform(0.1, 0.4))))
+    frame = camera.render(simulation, vinesim.look_at(eye, eye + np.array([0.0, 1.5, rng.uniform(0.1, 0.4)])))
     mask = np.where(frame.organs == vinesim.Organ.BUNCH, frame.instances + 1, 0)
     boxes = []
     for bunch in np.unique(mask)[1:]:
@@ -64,7 +64,6 @@ for file in files:
             assert inside == (data["mask"] == bunch).sum()
         if file.parent.name == "test":
             assert all(np.array_equal(data[name], again[name]) for name in again)
-assert not {file.name for file in files if file.parent.name == "train"} & {
-    file.name for file in (FOLDER / "test").iterdir()
-}
+names = [{file.name for file in (FOLDER / split).iterdir()} for split in SEEDS]
+assert not names[0] & names[1]
 print(f"{len(files)} pictures, reproducible to the bit")

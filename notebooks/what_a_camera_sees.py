@@ -5,6 +5,8 @@
 # pixel shows.
 
 # %%
+import itertools
+
 import matplotlib.pyplot as plt
 import numpy as np
 
@@ -38,7 +40,7 @@ distance = frame.exact_depth[measured]
 error = frame.depth[measured] - distance
 bounds = np.quantile(distance, np.linspace(0.0, 1.0, 9))
 middles, spreads = [], []
-for low, high in zip(bounds[:-1], bounds[1:], strict=True):
+for low, high in itertools.pairwise(bounds):
     inside = (distance >= low) & (distance < high)
     middles.append(np.median(distance[inside]))
     spreads.append(0.5 * np.subtract(*np.quantile(error[inside], (0.75, 0.25))))
