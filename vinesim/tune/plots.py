@@ -21,7 +21,7 @@ def plot_fit(fit: Fit, path: str | pathlib.Path) -> None:
     """Draw track, residuals and posterior into a file."""
     matplotlib.use("Agg")
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=[1.3, 1.0])
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.3, 1.0])[0]
     above, below = left.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.0])
     draw_track(fit, above)
     draw_residuals(fit, below)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -208,9 +209,10 @@ class Problem:
             rows = np.array([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
             return np.where(soft, rows, np.array([z, np.ones_like(z), np.zeros_like(z)]))
 
+        options: Any = {"jac": jacobian, "loss": loss}  # scipy's stubs know names only
         found = least_squares(
-            residuals, theta, jacobian, method="trf", x_scale=self._scales(), loss=loss, f_scale=SOFT,
-            max_nfev=most, ftol=tolerance, xtol=1e-6, gtol=1e-8,
+            residuals, theta, method="trf", x_scale=self._scales(), f_scale=SOFT, max_nfev=most, ftol=tolerance,
+            xtol=1e-6, gtol=1e-8, **options,
         )  # fmt: skip
         return found.x, at(found.x)
 

@@ -62,7 +62,7 @@ class Trajectory:
     @property
     def tracked(self) -> np.ndarray:
         """[marker, 3] bool: which axes were tracked."""
-        return np.isfinite(self.position).any(0)
+        return np.any(np.isfinite(self.position), axis=0)
 
     @property
     def rate(self) -> float:
