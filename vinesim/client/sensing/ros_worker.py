@@ -6,6 +6,7 @@ the rate of the topics of every step whatever the sensors do.
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import pathlib
@@ -22,7 +23,7 @@ from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import report_ready, serve
-from vinesim.ros.commands.types import SimulationRequest
+from vinesim.ros.commands.types import GoalResult, SimulationRequest
 from vinesim.ros.names import ros_name
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import ControllerKind, ControllerSpec, RigidVisual
@@ -133,6 +134,8 @@ class RosWorker:
         self._truth_names: tuple[str, ...] = ()
         self._named: tuple[int, bytes] = 0, b""
         """Version of the list of rigid bodies, and attached bunches, that :attr:`_truth_names` belong to."""
+        self._ends: collections.deque[tuple[int, GoalResult]] = collections.deque()
+        """Goals that have ended, each after how many records of steps."""
         self._next_statistics = 0.0
         self._reported_parameters = self.node.set_parameters
 
@@ -146,6 +149,8 @@ class RosWorker:
                     self.node.publish_clock(float(record["time"]))
                     if record["has_state"]:
                         self.node.publish_robot_state(self.config.records.read(record))
+                while self._ends and self._ends[0][0] <= self.channel.steps.taken_count:
+                    self.node.finish_goal(self._ends.popleft()[1])
                 if self.channel.truth.wait(0.0):
                     self._publish_truth()
                 while not self._requests.empty():
@@ -168,7 +173,7 @@ class RosWorker:
             elif kind == "truth":
                 self._rigid.take(value)
             elif kind == "finish":
-                self.node.finish_goal(value)
+                self._ends.append(value)
             elif kind == "simulated" and self.simulation is not None:
                 self.simulation.answer(value)
         return True
