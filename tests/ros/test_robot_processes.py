@@ -30,8 +30,8 @@ from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.sensing.robot_processes import RobotProcesses
 from vinesim.client.sensing import ros_worker
+from vinesim.client.sensing.robot_processes import RobotProcesses
 from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, RosWorker
 from vinesim.client.sensing.step_record import MAX_CONTACTS, StepRecords
 from vinesim.client.status import Status
