@@ -44,8 +44,11 @@ TOLERANCE = 0.01
 DELAY = 0.8
 """From now to the start of a trajectory [s]."""
 FORGOTTEN = 60.0
-"""[s] A goal that a server still knows so long after its end is kept for good. A server keeps a result for 10 s and, like
-any of rcl_action, forgets it within 20: whenever a goal ends, the timer starts anew with the period that it had before."""
+"""[s] A goal that a server still knows so long after its end is kept for good.
+
+A server keeps a result for 10 s and, like any of rcl_action, forgets it within 20: whenever a goal ends, the timer
+starts anew with the period that it had before.
+"""
 MOMENT = 0.4
 """After a trajectory's start, when it is cancelled or preempted [s]."""
 UNKNOWN, SUCCEEDED, CANCELED, ABORTED = 0, 4, 5, 6
