@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from vinesim import frames
+from vinesim.audio import opus
 from vinesim.client.client import Client
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
@@ -20,6 +21,8 @@ from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import Run, WorkerProcess
 from vinesim.client.signals import IntentionLog
+from vinesim.client.sound.exchange import SoundStep
+from vinesim.client.sound.microphone_step import at_place
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.simulation_control import SimulationControl
 from vinesim.robot.description.description import RobotDescription
@@ -97,7 +100,11 @@ class RosProcess:
         self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
-        self.handler = RosCommandHandler(self.robot, self._take_commands, self._finish, client.world_time)
+        self.handler = RosCommandHandler(
+            self.robot, self._take_commands, self._finish, client.world_time,
+            lambda pcm: client.sound.play(self.robot.name, pcm),
+        )  # fmt: skip
+        client.sound.listen(self.robot.name, _Microphone(self))
         client.pre_step.insert(0, self._control)
         client.after_reset.append(self._begin_anew)
         if self._leads:
@@ -183,6 +190,10 @@ class RosProcess:
             truth["version"][0] = self._truth_list.version
             self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
 
+    def hear(self, step: SoundStep) -> None:
+        """Pass what is heard at the robot to the process."""
+        self.worker.send("sound", at_place(step, self.client.sound.place_of(self.robot.name)))
+
     def _wake(self) -> None:
         channel = self.worker.current().shared
         channel.steps.wake()
@@ -235,3 +246,19 @@ class RosProcess:
 
     def __exit__(self, *_: types.TracebackType | type[BaseException] | BaseException | None) -> None:
         self.close()
+
+
+class _Microphone:
+    """Listens for a robot while its topics of sound have subscribers."""
+
+    decodes_opus = opus.is_available()
+
+    def __init__(self, process: RosProcess) -> None:
+        self._process = process
+
+    @property
+    def is_open(self) -> bool:
+        return bool(self._process.worker.current().shared.wanted["sound"][0])
+
+    def hear(self, step: SoundStep) -> None:
+        self._process.hear(step)

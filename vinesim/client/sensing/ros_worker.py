@@ -18,11 +18,14 @@ from typing import Any
 
 import numpy as np
 
+from vinesim.audio.frame import to_pcm
+from vinesim.audio.microphone import Microphone
 from vinesim.client.sensing.rigid_visual_list import VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import report_ready, serve
+from vinesim.client.sound.microphone_step import MicrophoneStep
 from vinesim.ros.commands.types import GoalResult, SimulationRequest
 from vinesim.ros.names import ros_name
 from vinesim.scene.ids import Organ
@@ -31,6 +34,7 @@ from vinesim.scene.values import ControllerKind, ControllerSpec, RigidVisual
 STATE_TOPICS = ("joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "vine/markers")
 """Topics that need a robot's state after a step, whatever robot it is."""
 TRUTH_TOPIC = "tf_environment"
+SOUND_TOPICS = ("audio", "audio_stamped")
 NICENESS = 5
 """Behind the client's loop, before the renderer."""
 QUEUE_CAPACITY = 100
@@ -89,7 +93,12 @@ class RosChannel:
             context,
         )  # fmt: skip
         self.wanted = SharedArrays(
-            {"steps": ((len(config.step_topics),), "?"), "truth_period": ((1,), "f8"), "goals": ((1,), "?")}
+            {
+                "steps": ((len(config.step_topics),), "?"),
+                "truth_period": ((1,), "f8"),
+                "goals": ((1,), "?"),
+                "sound": ((1,), "?"),
+            }
         )
         """Whether topics have subscribers, and actions goals, and how often true poses are wanted [s], 0 for never;
         written by the process."""
@@ -136,6 +145,7 @@ class RosWorker:
         """Version of the list of rigid bodies, and attached bunches, that :attr:`_truth_names` belong to."""
         self._ends: collections.deque[tuple[int, GoalResult]] = collections.deque()
         """Goals that have ended, each after how many records of steps."""
+        self._microphone = Microphone()
         self._next_statistics = 0.0
         self._reported_parameters = self.node.set_parameters
 
@@ -168,6 +178,8 @@ class RosWorker:
                 return False
             if kind == "diagnose":
                 self.node.publish_diagnostics(*value)
+            elif kind == "sound":
+                self._record(value)
             elif kind == "intentions":
                 self.node.publish_intentions(value)
             elif kind == "truth":
@@ -177,6 +189,15 @@ class RosWorker:
             elif kind == "simulated" and self.simulation is not None:
                 self.simulation.answer(value)
         return True
+
+    def _record(self, step: MicrophoneStep) -> None:
+        """Mix what the robot hears, and publish what is complete."""
+        for frame in step.frames:
+            self._microphone.hear(frame)
+        for source, frequency, level in step.tones:
+            self._microphone.sound(source, frequency, level, step.now)
+        for block in self._microphone.blocks(step.now):
+            self.node.publish_sound(block.time + step.to_world, to_pcm(block.samples))
 
     def _publish_truth(self) -> None:
         """True poses of rigid bodies, and of the bunches that hang on their plants."""
@@ -197,6 +218,7 @@ class RosWorker:
         wanted = self.channel.wanted
         wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
         wanted["goals"][0] = self.node.has_goals
+        wanted["sound"][0] = any(map(self.node.has_subscribers, SOUND_TOPICS))
         wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
         if (parameters := self.node.set_parameters) is not self._reported_parameters:
             self._reported_parameters = parameters
