@@ -5,6 +5,7 @@ import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
 import { Headset } from "./headset.js";
 import { DeskHand, WalkingEyes } from "./person.js";
+import { Voice } from "./voice.js";
 import { World } from "./world.js";
 
 const RETRY = 1000; // ms
@@ -80,7 +81,8 @@ class Viewer {
   async reconnect() {
     element("state").textContent = "the client is gone; waiting for it ...";
     try {
-      const header = await load("scene");
+      page.voice = new Voice();
+const header = await load("scene");
       if (header.scene !== this.world.header.scene || header.seed !== this.world.header.seed) location.reload();
       this.world.rigidVersion = 0;
       this.connect();
@@ -132,6 +134,7 @@ class Viewer {
     else this.look(this.eyes.pose);
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
     const eye = new THREE.Vector3(...pose.slice(0, 3));
+    page.voice.listen(pose);
     this.world.list(eye);
     this.renderer.info.reset();
     if (now - this.shadowAt > SHADOW_PERIOD) {
