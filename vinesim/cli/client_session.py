@@ -136,6 +136,7 @@ class ClientSession:
             server = self.enter(PageServer(world, port, sound=sound))
         print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
         client.post_step.append(lambda _: world.collect(server))
+        client.faults_elsewhere.append(lambda: {"page_messages_refused": server.refused})
 
     def run(
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,

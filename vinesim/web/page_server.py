@@ -29,6 +29,14 @@ WINDOW = 2
 """States in flight to one page. Without a limit a page on a busy machine was 0.4 to 1 s behind."""
 _MAX_INPUT = 8192
 """Longest message of a page [B]."""
+_THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
+_POLICY = "; ".join(
+    (
+        "default-src 'self'", "style-src 'self' 'unsafe-inline'", "img-src 'self' data:", "media-src 'self' blob:",
+        "worker-src 'self' blob:", "object-src 'none'", "base-uri 'none'",
+    )
+)  # fmt: skip
+"""Content Security Policy: browsers load nothing from other hosts for the page, whatever its scripts ask for."""
 
 
 class World(Protocol):
@@ -125,7 +133,7 @@ class PageServer:
 
     async def _serve(self) -> None:
         self._stopping = asyncio.Event()
-        app = web.Application(middlewares=[_refuse_other_origins, self._refuse_without_token])
+        app = web.Application(middlewares=[_refuse_other_origins, self._refuse_strangers])
         app.router.add_get("/", self._index)
         app.router.add_get("/scene", self._scene)
         app.router.add_get("/rigid", self._rigid)
@@ -155,17 +163,19 @@ class PageServer:
             event.set()
 
     @web.middleware
-    async def _refuse_without_token(
-        self, request: web.Request, handler: Callable[..., Any]
-    ) -> web.StreamResponse:  # fmt: skip
-        """The token comes in the address once, and as a cookie from then on."""
+    async def _refuse_strangers(self, request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
+        """With a token: who does not have it in the address, or as a cookie from then on. Without one: who calls this
+        machine by a name that it does not have, since any site can give a name of its own this address."""
         given = request.query.get("token", request.cookies.get("token", ""))
         if self._token is not None and not hmac.compare_digest(given.encode(), self._token.encode()):
             raise web.HTTPForbidden(text="open the address with its token, as the client has printed it")
+        if self._token is None and request.url.host not in (self._host, *_THIS_MACHINE):
+            raise web.HTTPForbidden(text=f"this is not {request.url.host}; open {self.address}")
         return await handler(request)
 
     async def _index(self, _: web.Request) -> web.FileResponse:
-        page = web.FileResponse(PAGE / "index.html", headers={"Cache-Control": "no-cache"})
+        headers = {"Cache-Control": "no-cache", "Content-Security-Policy": _POLICY}
+        page = web.FileResponse(PAGE / "index.html", headers=headers)
         if self._token is not None:
             page.set_cookie("token", self._token, httponly=True, samesite="Strict", secure=self._tls is not None)
         return page
@@ -212,8 +222,9 @@ class PageServer:
         """Take what a page sends; ``flight`` are the ticks of the states that it has not drawn yet."""
         async for message in socket:
             if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
+                if self.refused == 0:
+                    log.warning("a page sent what is no message of a page: refused (further ones are only counted)")
                 self.refused += 1
-                log.warning("a page sent what is no message of a page: dropped (%d so far)", self.refused)
                 continue
             while flight and flight[0] <= said.drawn:
                 flight.popleft()
