@@ -33,7 +33,7 @@ MAX_WAITING = 64
 back."""
 
 _MAX_MESSAGE = 1 + max(MAX_OPUS, 1000)
-_BURST = 50.0
+_BURST = 250.0
 _PACE = 2.5 / FRAME
 """Frames a second that a page may send: both codecs, a quarter faster than sound."""
 
