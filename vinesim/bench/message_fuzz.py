@@ -69,7 +69,9 @@ def valid_message(model: Model, actor: Sender, now: float, chance: random.Random
         return kind, encode_pose(actor.pose(now))
     if kind == "voice":
         codec = chance.choice(tuple(Codec))
-        sound = chance.randbytes(640) if codec is Codec.PCM16 else bytes((72,)) + chance.randbytes(chance.randint(0, 90))
+        sound = (
+            chance.randbytes(640) if codec is Codec.PCM16 else bytes((72,)) + chance.randbytes(chance.randint(0, 90))
+        )
         return kind, encode_voice(VoiceFrame(chance.randrange(1 << 16), now + chance.uniform(-0.1, 0.1), codec, sound))
     if kind == "force" and chance.random() < 0.5:
         return kind, _couplings_message(model, now, chance)
