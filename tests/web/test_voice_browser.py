@@ -28,7 +28,8 @@ from vinesim.web.page_server import PageServer
 
 AS_RECORDED = """
   const media = navigator.mediaDevices, open = media.getUserMedia.bind(media);
-  media.getUserMedia = () => open({ audio: { echoCancellation: false, noiseSuppression: false, autoGainControl: false } });
+  const raw = { echoCancellation: false, noiseSuppression: false, autoGainControl: false };
+  media.getUserMedia = () => open({ audio: raw });
 """
 """A tone is noise to the filters of a browser, which remove it: the test needs it as it is."""
 

@@ -1,4 +1,4 @@
-"""Sound of one client for its pages: what its actor hears goes to all pages, and the first page that speaks is its voice.
+"""Sound of one client for its pages: what its actor hears goes to all pages, the first that speaks is its voice.
 
 A page that only watches a robot hears what the robot hears and says nothing.
 """
@@ -16,8 +16,8 @@ from vinesim.web.voice_socket import PageVoice, encode_frame
 
 
 class PageSound:
-    """See :class:`vinesim.web.voice_socket.Sound`, which the server's thread calls; the client's loop calls the listener
-    of each page."""
+    """See :class:`vinesim.web.voice_socket.Sound`, which the server's thread calls; the client's loop calls the
+    listener of each page."""
 
     def __init__(self, client: Client) -> None:
         self._client, self._name = client, client.name
