@@ -16,6 +16,7 @@ from vinesim.avatar.gestures import Gestures
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client, label_index
 from vinesim.client.page_world import PageWorld
+from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
@@ -28,7 +29,7 @@ from vinesim.web.page_server import PageServer
 
 BUNCH, BOX = 10, 0
 BOX_PLACE = np.array([-2.4, -0.7, 0.0])
-HANDED_OVER_FROM = BOX_PLACE[:2] + [0.0, 0.45]
+HANDED_OVER_FROM = BOX_PLACE[:2] + np.array([0.0, 0.45])
 POINTS_FROM, PICKS_FROM = 1.15, 0.75
 """Distances of the first person from the bunch [m]."""
 HAND_HEIGHT = 1.0
@@ -118,9 +119,7 @@ class Meeting:
         frame = Camera(spec, spec.info(mount.frame, 0.25)).render(
             primitives, self.robot.robot.frame_pose(mount.frame)
         )  # fmt: skip
-        return {
-            name for name in ("anna", "ben") if (frame.labels == label(Organ.HUMAN, label_index(name))).sum() > 50
-        }
+        return {name for name in ("anna", "ben") if (frame.labels == label(Organ.HUMAN, label_index(name))).sum() > 50}
 
     def in_box(self, client: Client) -> bool:
         """Whether a client has the bunch between the walls of the box."""
@@ -175,8 +174,13 @@ def test_one_person_points_picks_and_lays_the_bunch_into_the_box_of_another():
         point_at(a, bunch)
         tap(a, "KeyR")
         tap(a, "Digit3")
-        hand = lambda: meeting.robot.remote_actors["anna"].pose  # noqa: E731
-        wait(lambda: Gestures().name_of(hand().right_fingers) == "point", "the robot is told of the gesture")
+
+        def gesture() -> str:
+            copy = meeting.robot.remote_actors["anna"]
+            assert isinstance(copy, RemoteHuman)
+            return "" if copy.pose is None else Gestures().name_of(copy.pose.right_fingers)
+
+        wait(lambda: gesture() == "point", "the robot is told of the gesture")
 
         def off() -> float:
             palm = robot.hand("anna", "right").pose
@@ -201,7 +205,7 @@ def test_one_person_points_picks_and_lays_the_bunch_into_the_box_of_another():
 
         # she brings it to ben's box and opens her hand
         walk_to(a, *HANDED_OVER_FROM)
-        point_at(a, BOX_PLACE + [0.0, 0.0, HAND_HEIGHT])
+        point_at(a, BOX_PLACE + np.array([0.0, 0.0, HAND_HEIGHT]))
 
         def is_over_box() -> bool:
             rigid = meeting.ben.physics.rigid

@@ -13,8 +13,8 @@ from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
-from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch
 from vinesim.client.tasks.meet_planning import REACH
+from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch
 from vinesim.errors import writing
 from vinesim.physics.step import Physics
 
@@ -113,7 +113,7 @@ def pick_and_give(
         before, still = here, still + human.dt if is_still else 0.0
     yield from human.walk(standing_place(box_place(), human.place))
     yield from human.face((float(before[0]), float(before[1])))
-    yield from human.reach("right", lambda: box_place() + [0.0, 0.0, GIVING_HEIGHT])
+    yield from human.reach("right", lambda: box_place() + np.array([0.0, 0.0, GIVING_HEIGHT]))
     yield from human.wait(0.5)
     yield from human.release("right")
     yield from human.wait(0.5)

@@ -49,7 +49,7 @@ def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
             for heading, base in _waiting_places(model, stand)[:MAX_PATHS]:
                 path = find_path(model, to_box[-1], base, TURNING_RADIUS)
                 if path is not None and _keeps_away(path, stand):
-                    return MeetPlan(bunch, box, to_box[1:], path[1:], heading)
+                    return MeetPlan(bunch, stand, box, to_box[1:], path[1:], heading)
     raise PlacementError("no bunch hangs where a person and a carrier have room beside each other; choose another seed")
 
 

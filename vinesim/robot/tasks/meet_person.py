@@ -1,11 +1,11 @@
 """The task of a carrier that works with a person: it takes a box, holds it before the person, and waits for a bunch.
 
-    meet = MeetPerson(physics, robot, plan)
-    while not meet.is_done:
-        meet.control(time)
-        robot.control(time)
-        physics.step()
-    assert meet.succeeded, meet.reason
+meet = MeetPerson(physics, robot, plan)
+while not meet.is_done:
+    meet.control(time)
+    robot.control(time)
+    physics.step()
+assert meet.succeeded, meet.reason
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ class MeetPlan:
     """Which box to bring to which place, and the bunch that the person there picks."""
 
     bunch: int
+    stand: np.ndarray
+    """[2] m, where the person picks it."""
     box: int
     path_to_box: np.ndarray
     """[n, 2] m, from the start to a place with room to turn, straight before a long side of the box."""
