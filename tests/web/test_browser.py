@@ -75,6 +75,7 @@ def open_page(page, live, before=""):
     page.open(live.server.address + "?triangles=30000", before=before)
     wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
     assert page.run("vinesim.failure") is None
+    page.run("vinesim.viewer.shadowAt = Infinity, 0")  # no shadows
     assert page.errors == []
 
 
