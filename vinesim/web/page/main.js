@@ -7,6 +7,7 @@ import { Headset } from "./headset.js";
 import { Absence, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { DeskHand, WalkingEyes } from "./person.js";
+import { Voice } from "./voice.js";
 import { World } from "./world.js";
 
 const RETRY = 1000; // ms
@@ -151,6 +152,7 @@ class Viewer {
     else this.look(this.eyes.pose);
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
     const eye = new THREE.Vector3(...pose.slice(0, 3));
+    page.voice.listen(pose);
     this.world.list(eye);
     this.overlays.draw(actors, this.camera);
     this.renderer.info.reset();
@@ -238,6 +240,7 @@ addEventListener("unhandledrejection", (event) => fail(event.reason));
 addEventListener("error", (event) => { if (event.message) fail(event.message); });
 
 if (window.pageMisses) throw new Error(window.pageMisses);
+page.voice = new Voice();
 const header = await load("scene");
 const world = new World(header);
 const budget = Number(new URLSearchParams(location.search).get("triangles"));
