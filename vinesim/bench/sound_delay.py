@@ -1,10 +1,12 @@
 """``vinesim bench sound``: how late an alarm is seen and heard, and how late voices are, in simulated time.
 
-A robot and a person 3 m from it, of two clients, over a network in memory. Again and again the robot switches its lights
-to alarm with their tone and plays an alarm as a waveform, too, and the person says a word. The light is seen when the copy
-of the robot in the person's client is lit; the tone is heard when the person's page is told to make it, the waveform when
-the page has the two frames with which it begins; the word when the robot's microphone has recorded a block of 20 ms with
-it, counted from its first sample. What a headset, a browser and a sound card need comes on top.
+A robot and a person 3 m from it, of two clients, over a network in memory. Again and again the robot switches its
+lights to alarm with their tone and plays an alarm as a waveform, too, and the person says a word.
+
+The light is seen when the copy of the robot in the person's client is lit. The tone is heard when the person's page is
+told to make it, the waveform when the page has the two frames with which it begins. The word is heard when the robot's
+microphone has recorded a block of 20 ms with it, counted from its first sample. What a headset, a browser and a sound
+card need comes on top.
 """
 
 from __future__ import annotations
