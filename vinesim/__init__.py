@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from vinesim.api.sensors import Lidar as Lidar
     from vinesim.api.sensors import look_at as look_at
     from vinesim.api.simulation import Simulation as Simulation
+    from vinesim.api.sweep import sweep as sweep
     from vinesim.errors import UsageError as UsageError
     from vinesim.net.server.server import Server as Server
     from vinesim.robot.drives.controlled_robot import Robot as Robot
@@ -73,6 +74,7 @@ _MODULES = {
     "load_scene": "scene.spec",
     "look_at": "api.sensors",
     "reachable_grasps": "api.picking",
+    "sweep": "api.sweep",
 }
 """Module of each public name, below this package."""
 
@@ -105,6 +107,7 @@ __all__ = [
     "load_scene",
     "look_at",
     "reachable_grasps",
+    "sweep",
 ]
 
 
