@@ -56,11 +56,16 @@ def write_block(block: int, island: int, contacts: Contacts, islands: Islands, r
 
 
 @wp.func_native("""
-    const double* from = a.data + source;
-    double* to = a.data + target;
-    for (int i = 0; i < count; ++i) {
-        const double change = factor * from[i];
-        to[i] -= change;
+    const int pitch = a.strides[0] / (int)sizeof(double);
+    const double* from = a.data + source * pitch;
+    double* to = a.data + target * pitch;
+    if (pitch == 1) {
+        for (int i = 0; i < count; ++i) {
+            const double change = factor * from[i];
+            to[i] -= change;
+        }
+    } else {
+        for (int i = 0; i < count; ++i) to[i * pitch] -= factor * from[i * pitch];
     }
 """)
 def subtract_row(a: wp.array(dtype=wp.float64), target: int, source: int, count: int, factor: wp.float64):

@@ -85,30 +85,27 @@ def copy_impulses(
             impulse_out[row] = impulse[row]
 
 
-@wp.kernel
-def solve_islands(
-    # model
+@wp.func
+def solve_island(
+    island: int,
     max_sweeps: int,
     max_newton_steps: int,
     max_newton_contacts: int,
     tolerance: wp.float64,
     geoms: Geoms,
-    # in
     rigid: RigidBodies,
     contacts: Contacts,
-    # out
     islands_out: Islands,
     scratch_out: SolverScratch,
     rows_out: Rows,
 ):
-    """One thread per island: solve it from the guess in ``impulse`` on.
+    """Solve an island from the guess in ``impulse`` on.
 
     Contacts that depend on each other (two fingers about a bunch) slow Gauss-Seidel down: within a few sweeps it finds
     which contacts stick, slide or open, and takes a hundred for the rest. So islands of small blocks take a Newton step
     after every other sweep, at first. If these do not settle, sweeps go on from where they began, with conjugate
     gradients, as they do from the first one on in islands with a large block.
     """
-    island = wp.tid()
     first = islands_out.start[island]
     last = islands_out.start[island + 1]
     newton_end = 2 * max_newton_steps
@@ -140,3 +137,26 @@ def solve_islands(
                     copy_impulses(island, islands_out, rows_out.impulse, scratch_out.impulse_first)
                 newton_step(island, contacts, islands_out, scratch_out, rows_out)
     islands_out.sweeps[island] = sweeps
+
+
+@wp.kernel
+def solve_islands(
+    # model
+    max_sweeps: int,
+    max_newton_steps: int,
+    max_newton_contacts: int,
+    tolerance: wp.float64,
+    geoms: Geoms,
+    # in
+    rigid: RigidBodies,
+    contacts: Contacts,
+    # out
+    islands_out: Islands,
+    scratch_out: SolverScratch,
+    rows_out: Rows,
+):
+    """One thread per island: see :func:`solve_island`."""
+    solve_island(
+        wp.tid(), max_sweeps, max_newton_steps, max_newton_contacts, tolerance, geoms, rigid, contacts, islands_out,
+        scratch_out, rows_out,
+    )  # fmt: skip

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -364,6 +365,11 @@ class ArticulationSolver:
         self.buffers.synchronize()
         self.tick += 1
 
+    @property
+    def contact_onset_steps(self) -> int:
+        """Steps with phi = 1 after contact began, the first one not counted."""
+        return self._onset_steps
+
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
         if len(self._roots) == 0:
@@ -372,8 +378,9 @@ class ArticulationSolver:
         roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
         return self.buffers.slots[roots], self.model.body_tree[roots]
 
-    def advance(self, steps: int) -> None:
-        """Many steps of the awake trees with nothing in between: no contacts, no sleep, no fault guard.
+    def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
+        """Many steps of the awake trees with nothing in between: no contacts (but those that ``between`` launches, see
+        :class:`vinesim.physics.contact.resident_contacts.ResidentContacts`), no sleep, no fault guard.
 
         Threads part once for all of them. A GPU works on its own copies meanwhile: :meth:`upload` before and
         :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free`` and
@@ -388,9 +395,9 @@ class ArticulationSolver:
             self._loaded_bodies = _NO_TREES
             self.launches.upload_wrenches(len(self._runner.stepped))
             self._runner.integrate(_NO_TREES, *floating)
-            self._runner.advance(steps - 1, *floating)
+            self._runner.advance(steps - 1, *floating, between)
         else:
-            self._runner.advance(steps, *floating)
+            self._runner.advance(steps, *floating, between)
         self.tick += steps
 
     def upload(self) -> None:

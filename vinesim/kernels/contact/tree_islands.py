@@ -1,0 +1,436 @@
+"""Contacts of many trees that touch rigid geoms but not each other: the contacts of each tree are an island of one block.
+
+On a GPU a tree is a thread. The arrays of contacts hold all trees side by side: entry ``i`` of a tree lies at
+``i * trees + tree``, so that threads in step read one stretch of memory. A *view* of an array has an offset and a pitch
+that show one tree all of its own entries and nothing else: with views, a tree is solved by the functions that solve an
+island of a vineyard.
+"""
+
+import warp as wp
+
+from vinesim.kernels.articulation.impulse_response import apply_tree_wrenches
+from vinesim.kernels.articulation.prediction import predict_tree
+from vinesim.kernels.articulation.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    Factors,
+    JointState,
+    Prediction,
+    Scratch,
+    SolverParameters,
+    WrenchScratch,
+)
+from vinesim.kernels.contact.forces import store_contact
+from vinesim.kernels.contact.jacobians import write_rows
+from vinesim.kernels.contact.projected_gauss_seidel import solve_island
+from vinesim.kernels.contact.structs import (
+    Candidates,
+    Capsules,
+    Contacts,
+    Geoms,
+    Islands,
+    MaterialPairs,
+    Parameters,
+    PlantBodies,
+    RigidBodies,
+    Rows,
+    SolverScratch,
+    WarmStart,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+VIEW = "a.data += tree; a.strides[0] = trees * (int)sizeof(*a.data); return a;"
+VIEW_2D = """
+a.data += tree;
+a.strides[1] = trees * (int)sizeof(*a.data);
+a.strides[0] = columns * a.strides[1];
+return a;
+"""
+
+
+@wp.struct
+class TreeContacts:
+    """What is kept of each tree's contacts [tree] from step to step."""
+
+    count: wp.array(dtype=wp.int32)
+    """of this step."""
+    dropped: wp.array(dtype=wp.int32)
+    """left out since the start, for want of room."""
+    loaded_count: wp.array(dtype=wp.int32)
+    """bodies that the wrenches of the last contacts act on."""
+    loaded: wp.array(dtype=wp.int32)
+    """[i * trees + tree] these bodies."""
+
+
+@wp.struct
+class ResponseRows:
+    """Velocities by unit impulses along the three rows of a contact [slot * bodies + body]."""
+
+    a: wp.array(dtype=wp.mat33)
+    """[1/kg] linear."""
+    alpha: wp.array(dtype=wp.mat33)
+    """[1/(kg m)] angular."""
+
+
+@wp.func_native(VIEW)
+def view_int(a: wp.array(dtype=wp.int32), tree: int, trees: int) -> wp.array(dtype=wp.int32): ...
+
+
+@wp.func_native(VIEW)
+def view_double(a: wp.array(dtype=wp.float64), tree: int, trees: int) -> wp.array(dtype=wp.float64): ...
+
+
+@wp.func_native(VIEW)
+def view_vec3d(a: wp.array(dtype=wp.vec3d), tree: int, trees: int) -> wp.array(dtype=wp.vec3d): ...
+
+
+@wp.func_native(VIEW)
+def view_mat33d(a: wp.array(dtype=wp.mat33d), tree: int, trees: int) -> wp.array(dtype=wp.mat33d): ...
+
+
+@wp.func_native(VIEW_2D)
+def view_table(
+    a: wp.array2d(dtype=wp.float64), tree: int, trees: int, columns: int
+) -> wp.array2d(dtype=wp.float64): ...
+
+
+@wp.func
+def view_contacts(s: Contacts, tree: int, trees: int):
+    """The contacts of one tree. Islands, blocks and places are the same for all: one island, one block, in order."""
+    return Contacts(
+        s.source,
+        view_int(s.feature, tree, trees),
+        view_int(s.other, tree, trees),
+        view_int(s.body, tree, trees),
+        s.body_slot,
+        view_int(s.other_body, tree, trees),
+        s.other_slot,
+        view_double(s.gap, tree, trees),
+        view_double(s.friction, tree, trees),
+        view_double(s.stiffness, tree, trees),
+        view_double(s.damping, tree, trees),
+        view_double(s.compliance, tree, trees),
+        view_vec3d(s.point, tree, trees),
+        view_mat33d(s.axes, tree, trees),
+        s.island,
+        s.block,
+        s.place,
+        view_vec3d(s.force, tree, trees),
+    )
+
+
+@wp.func
+def view_rows(s: Rows, tree: int, trees: int):
+    """The rows of one tree's contacts, and its Delassus matrix."""
+    return Rows(
+        view_table(s.plant_jacobian, tree, trees, 12),
+        s.rigid_jacobian,
+        s.plant_response,
+        s.other_response,
+        s.rigid_response,
+        view_double(s.delassus, tree, trees),
+        view_double(s.velocity_free, tree, trees),
+        view_double(s.bias, tree, trees),
+        view_double(s.impulse, tree, trees),
+        s.rigid_velocity,
+    )
+
+
+@wp.func
+def view_scratch(s: SolverScratch, tree: int, trees: int):
+    """What the solve of one tree works with."""
+    return SolverScratch(
+        view_double(s.matrix, tree, trees),
+        view_table(s.columns, tree, trees, 1),
+        s.rigid_system,
+        view_double(s.impulse_first, tree, trees),
+        view_double(s.impulse_before, tree, trees),
+        view_double(s.direction, tree, trees),
+    )
+
+
+@wp.func
+def view_warm_start(s: WarmStart, tree: int, trees: int):
+    """What one tree's contacts start from."""
+    return WarmStart(
+        view_int(s.count, tree, trees),
+        view_int(s.feature, tree, trees),
+        view_int(s.other, tree, trees),
+        view_double(s.normal_impulse, tree, trees),
+        view_vec3d(s.friction_impulse, tree, trees),
+        view_vec3d(s.anchor, tree, trees),
+    )
+
+
+@wp.func
+def view_islands(s: Islands, tree: int, trees: int):
+    """One island of one block: its first contact is 0, its end the number of the tree's contacts."""
+    return Islands(
+        view_int(s.start, tree, trees),
+        s.first_block,
+        view_int(s.start, tree, trees),
+        s.matrix_start,
+        s.contact,
+        s.label,
+        s.block_label,
+        s.first_dof,
+        s.dof,
+        s.rigid_last_contact,
+        view_int(s.sweeps, tree, trees),
+    )
+
+
+@wp.kernel
+def predict_impacted_trees(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    onset_steps: int,
+    # in
+    is_impact: wp.array(dtype=wp.bool),
+    forces: AppliedForces,
+    joints: JointState,
+    # out
+    tree_phi_out: wp.array(dtype=float),
+    tree_euler_steps_out: wp.array(dtype=wp.int32),
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """One thread predicts one tree anew with phi = 1 if it is about to suffer an impact and was not predicted so."""
+    tree = wp.tid()
+    if is_impact[tree] and tree_phi_out[tree] < 1.0:
+        tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], onset_steps)
+        tree_phi_out[tree] = 1.0
+        predict_tree(p, model, forces, joints, tree, 1.0, bodies_out, factors_out, scratch_out, prediction_out)
+
+
+@wp.kernel
+def write_tree_rows(
+    # model
+    parameters: Parameters,
+    pairs: MaterialPairs,
+    capsules: Capsules,
+    geoms: Geoms,
+    # in
+    trees: int,
+    bodies: PlantBodies,
+    rigid: RigidBodies,
+    candidates: Candidates,
+    warm_start: WarmStart,
+    # out
+    tree_contacts_out: TreeContacts,
+    contacts_out: Contacts,
+    islands_out: Islands,
+    rows_out: Rows,
+):
+    """One thread per slot of a tree: the rows of its contact, and by the first one the number of contacts."""
+    tree = wp.tid() % trees
+    slot = wp.tid() // trees
+    slots = candidates.feature.shape[1]
+    count = wp.min(candidates.count[tree], slots)
+    if slot == 0:
+        tree_contacts_out.count[tree] = count
+        tree_contacts_out.dropped[tree] += candidates.count[tree] - count
+        islands_out.start[tree] = 0
+        islands_out.start[trees + tree] = count
+    if slot < count:
+        contacts = view_contacts(contacts_out, tree, trees)
+        contacts.feature[slot] = candidates.feature[tree, slot]
+        contacts.other[slot] = candidates.other[tree, slot]
+        contacts.body[slot] = capsules.body[candidates.feature[tree, slot] // 2]
+        contacts.other_body[slot] = -1
+        write_rows(
+            slot, tree, slot, parameters, pairs, capsules, geoms, bodies, rigid, candidates,
+            view_warm_start(warm_start, tree, trees), contacts, view_rows(rows_out, tree, trees),
+        )  # fmt: skip
+
+
+@wp.func
+def row_vector(row: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
+    """Three entries of a row, in single precision."""
+    return wp.vec3(
+        wp.float32(jacobian[row, column]), wp.float32(jacobian[row, column + 1]), wp.float32(jacobian[row, column + 2])
+    )
+
+
+@wp.func
+def propagate_rows_inward(
+    c: int,
+    body: int,
+    first: int,
+    last: int,
+    shift: int,
+    jacobian: wp.array2d(dtype=wp.float64),
+    model: ArticulationModel,
+    factors: Factors,
+    response_out: ResponseRows,
+):
+    """Carry unit impulses along the three rows of contact ``c`` from its body to the root, and note what each joint on
+    the path takes of them."""
+    force = wp.mat33()
+    moment = wp.mat33()
+    for r in range(3):
+        f = row_vector(3 * c + r, 0, jacobian)
+        m = row_vector(3 * c + r, 3, jacobian)
+        for j in range(3):
+            force[j, r] = f[j]
+            moment[j, r] = m[j]
+    path = int(body)
+    for i in range((last - first) / model.pitch + 1):
+        k = last - i * model.pitch
+        taken = wp.mat33()
+        if k == path:
+            taken = factors.D[k] * moment
+            force = force - wp.transpose(factors.DH[k]) * moment
+            moment = moment - wp.transpose(factors.DJ[k]) * moment + wp.skew(factors.lever[k]) * force
+            path = model.body_parent[k]
+        response_out.alpha[shift + k] = taken
+
+
+@wp.kernel
+def respond_to_rows(
+    # model
+    model: ArticulationModel,
+    is_branching: wp.array(dtype=wp.bool),
+    # in
+    trees: int,
+    bodies: int,
+    factors: Factors,
+    tree_contacts: TreeContacts,
+    contacts_all: Contacts,
+    # out
+    response_out: ResponseRows,
+    rows_out: Rows,
+):
+    """One thread per slot of a tree: the columns of the Delassus matrix of its contact.
+
+    The articulated-body algorithm with impulses only (Featherstone 2008, section 7.3), of trees that stand. Contacts are in the order of
+    their bodies. is_branching: [body] whether a body is the parent of another than the next one, or of none. bodies: how
+    many entries of ``response_out``, which is scratch, each slot has.
+    """
+    tree = wp.tid() % trees
+    c = wp.tid() // trees
+    count = tree_contacts.count[tree]
+    if c >= count:
+        return
+    contacts = view_contacts(contacts_all, tree, trees)
+    rows = view_rows(rows_out, tree, trees)
+    first = model.tree_first[tree]
+    last = contacts.body[count - 1]
+    shift = c * bodies
+    propagate_rows_inward(
+        c, contacts.body[c], first, last, shift, rows.plant_jacobian, model, factors, response_out
+    )
+    a = wp.mat33()
+    alpha = wp.mat33()
+    at = int(0)
+    for k in range(first, last + 1, model.pitch):
+        parent = model.body_parent[k]
+        if parent < 0:
+            a = wp.mat33()
+            alpha = wp.mat33()
+        else:
+            if parent != k - model.pitch:
+                a = response_out.a[shift + parent]
+                alpha = response_out.alpha[shift + parent]
+            a = a - wp.skew(factors.lever[k]) * alpha
+        alpha = alpha + response_out.alpha[shift + k] - factors.DJ[k] * alpha - factors.DH[k] * a
+        if is_branching[k]:
+            response_out.a[shift + k] = a
+            response_out.alpha[shift + k] = alpha
+        while at < count and contacts.body[wp.min(at, count - 1)] == k:
+            for r in range(3):
+                row = 3 * at + r
+                along = wp.transpose(a) * row_vector(row, 0, rows.plant_jacobian)
+                along = along + wp.transpose(alpha) * row_vector(row, 3, rows.plant_jacobian)
+                for j in range(3):
+                    rows.delassus[3 * row * count + 3 * c + j] = wp.float64(along[j])
+            at = at + 1
+
+
+@wp.kernel
+def solve_trees(
+    # model
+    max_sweeps: int,
+    max_newton_steps: int,
+    max_newton_contacts: int,
+    tolerance: wp.float64,
+    parameters: Parameters,
+    geoms: Geoms,
+    # in
+    trees: int,
+    rigid: RigidBodies,
+    # out
+    tree_contacts_out: TreeContacts,
+    contacts_out: Contacts,
+    islands_out: Islands,
+    scratch_out: SolverScratch,
+    rows_out: Rows,
+    warm_start_out: WarmStart,
+    body_wrench_out: wp.array(dtype=wp.spatial_vector),
+):
+    """One thread per tree: the impulses of its contacts, the wrenches on its bodies, and what the next step starts from."""
+    tree = wp.tid()
+    loaded = view_int(tree_contacts_out.loaded, tree, trees)
+    for i in range(tree_contacts_out.loaded_count[tree]):
+        body_wrench_out[loaded[i]] = wp.spatial_vector()
+    count = tree_contacts_out.count[tree]
+    tree_contacts_out.loaded_count[tree] = count
+    warm_start_out.count[tree] = count
+    if count == 0:
+        return
+    contacts = view_contacts(contacts_out, tree, trees)
+    islands = view_islands(islands_out, tree, trees)
+    rows = view_rows(rows_out, tree, trees)
+    warm_start = view_warm_start(warm_start_out, tree, trees)
+    solve_island(
+        0, max_sweeps, max_newton_steps, max_newton_contacts, tolerance, geoms, rigid, contacts, islands,
+        view_scratch(scratch_out, tree, trees), rows,
+    )  # fmt: skip
+    for c in range(count):
+        store_contact(c, parameters, geoms, rigid, islands, rows, contacts, warm_start)
+        body = contacts.body[c]
+        loaded[c] = body
+        wrench = body_wrench_out[body]
+        for r in range(3):
+            row = 3 * c + r
+            share = wp.float32(rows.impulse[row] / parameters.dt)
+            wrench = wrench + share * wp.spatial_vector(
+                row_vector(row, 0, rows.plant_jacobian), row_vector(row, 3, rows.plant_jacobian)
+            )
+        body_wrench_out[body] = wrench
+
+
+@wp.kernel
+def apply_contact_wrenches(
+    # model
+    dt: float,
+    model: ArticulationModel,
+    onset_steps: int,
+    # in
+    tree_contacts: TreeContacts,
+    was_in_contact: wp.array(dtype=wp.bool),
+    body_wrench: wp.array(dtype=wp.spatial_vector),
+    factors: Factors,
+    # out
+    tree_euler_steps_out: wp.array(dtype=wp.int32),
+    work_out: WrenchScratch,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """One thread adds to the prediction of one tree what its contacts do over the step.
+
+    was_in_contact: [tree] whether it was in contact in the last step; brought up to date. A tree whose contact begins
+    takes ``onset_steps`` backward Euler steps, this one included.
+    """
+    tree = wp.tid()
+    is_in_contact = tree_contacts.count[tree] > 0
+    if is_in_contact:
+        if not was_in_contact[tree]:
+            tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], onset_steps + 1)
+        apply_tree_wrenches(tree, dt, model, body_wrench, factors, work_out, scratch_out, prediction_out)
+    was_in_contact[tree] = is_in_contact
