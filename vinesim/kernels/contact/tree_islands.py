@@ -21,14 +21,21 @@ from vinesim.kernels.articulation.structs import (
     SolverParameters,
     WrenchScratch,
 )
+from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable, sweep_capsule
 from vinesim.kernels.contact.forces import store_contact
 from vinesim.kernels.contact.jacobians import write_rows
+from vinesim.kernels.contact.narrowphase_rigid import add_pair
 from vinesim.kernels.contact.projected_gauss_seidel import solve_island
 from vinesim.kernels.contact.structs import (
+    AABB_BLOCK,
+    Aabbs,
     Candidates,
     Capsules,
+    CapsuleStates,
     Contacts,
     Geoms,
+    GeomStates,
+    Hulls,
     Islands,
     MaterialPairs,
     Parameters,
@@ -36,12 +43,14 @@ from vinesim.kernels.contact.structs import (
     RigidBodies,
     Rows,
     SolverScratch,
+    Trees,
     WarmStart,
 )
 
 wp.set_module_options({"enable_backward": False})
 
 VIEW = "a.data += tree; a.strides[0] = trees * (int)sizeof(*a.data); return a;"
+VIEW_COLUMNS = "a.data += first * (a.strides[1] / (int)sizeof(*a.data)); a.shape.dims[1] = count; return a;"
 VIEW_2D = """
 a.data += tree;
 a.strides[1] = trees * (int)sizeof(*a.data);
@@ -56,6 +65,12 @@ class TreeContacts:
 
     count: wp.array(dtype=wp.int32)
     """of this step."""
+    found: wp.array(dtype=wp.int32)
+    """[capsule of the tree * trees + tree] contacts of each capsule in this step."""
+    hits: wp.array(dtype=wp.bool)
+    """[capsule of the tree * trees + tree] whether one of them is an impact."""
+    is_impact: wp.array(dtype=wp.bool)
+    """[tree]"""
     dropped: wp.array(dtype=wp.int32)
     """left out since the start, for want of room."""
     loaded_count: wp.array(dtype=wp.int32)
@@ -96,11 +111,40 @@ def view_table(
 ) -> wp.array2d(dtype=wp.float64): ...
 
 
+@wp.func_native(VIEW_COLUMNS)
+def columns_int(a: wp.array2d(dtype=wp.int32), first: int, count: int) -> wp.array2d(dtype=wp.int32): ...
+
+
+@wp.func_native(VIEW_COLUMNS)
+def columns_double(a: wp.array2d(dtype=wp.float64), first: int, count: int) -> wp.array2d(dtype=wp.float64): ...
+
+
+@wp.func_native(VIEW_COLUMNS)
+def columns_vec3d(a: wp.array2d(dtype=wp.vec3d), first: int, count: int) -> wp.array2d(dtype=wp.vec3d): ...
+
+
+@wp.func
+def view_candidates(s: Candidates, first: int, count: int):
+    """Candidates with the slots from ``first`` on."""
+    return Candidates(
+        s.count,
+        s.is_impact,
+        s.near_geoms,
+        s.skipped_geoms,
+        columns_int(s.feature, first, count),
+        columns_int(s.other, first, count),
+        columns_double(s.gap, first, count),
+        columns_double(s.end_gap, first, count),
+        columns_vec3d(s.normal, first, count),
+        columns_vec3d(s.point, first, count),
+    )
+
+
 @wp.func
 def view_contacts(s: Contacts, tree: int, trees: int):
     """The contacts of one tree. Islands, blocks and places are the same for all: one island, one block, in order."""
     return Contacts(
-        s.source,
+        view_int(s.source, tree, trees),
         view_int(s.feature, tree, trees),
         view_int(s.other, tree, trees),
         view_int(s.body, tree, trees),
@@ -183,6 +227,90 @@ def view_islands(s: Islands, tree: int, trees: int):
 
 
 @wp.kernel
+def find_capsule_contacts(
+    # model
+    parameters: Parameters,
+    capsules: Capsules,
+    geoms: Geoms,
+    # in
+    trees: int,
+    slots: int,
+    tree_states: Trees,
+    bodies: PlantBodies,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    static_blocks: Aabbs,
+    # out
+    capsule_states_out: CapsuleStates,
+    tree_contacts_out: TreeContacts,
+    candidates_out: Candidates,
+):
+    """One thread per capsule of a tree: its contacts with static geoms, in the order of (geom, end).
+
+    Capsule i of a tree is ``i * trees + tree``, and ``slots`` slots of the candidates are its own; a capsule without a
+    body is none.
+    """
+    s = wp.tid()
+    tree = s % trees
+    count = int(0)
+    is_impact = bool(False)
+    if capsules.body[s] >= 0 and is_collidable(
+        capsules.level[s], tree_states.is_fine[tree], capsules.bunch[s], tree_states.bunch_attached
+    ):
+        start, end, speed, low, high = sweep_capsule(s, wp.float32(parameters.dt), capsules, bodies)
+        for block in range(static_blocks.low.shape[0]):
+            if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
+                capsule_states_out.start[s] = start
+                capsule_states_out.end[s] = end
+                capsule_states_out.speed[s] = speed
+                capsule_states_out.low[s] = low
+                capsule_states_out.high[s] = high
+                for g in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, geoms.count[1])):
+                    count, hits = add_pair(
+                        tree, count, s, g, parameters, capsules, geoms, bodies, capsule_states_out, rigid, hulls,
+                        geom_states, view_candidates(candidates_out, (s // trees) * slots, slots),
+                    )  # fmt: skip
+                    is_impact = is_impact or hits
+    tree_contacts_out.found[s] = count
+    tree_contacts_out.hits[s] = is_impact
+
+
+@wp.kernel
+def list_tree_contacts(
+    # in
+    trees: int,
+    capsule_slots: int,
+    slots: int,
+    # out
+    tree_contacts_out: TreeContacts,
+    contacts_out: Contacts,
+    islands_out: Islands,
+):
+    """One thread per tree: its contacts in the order of its capsules; what exceeds the slots is only counted."""
+    tree = wp.tid()
+    count = int(0)
+    dropped = int(0)
+    is_impact = bool(False)
+    for i in range(tree_contacts_out.found.shape[0] / trees):
+        s = i * trees + tree
+        found = tree_contacts_out.found[s]
+        if found > 0:
+            is_impact = is_impact or tree_contacts_out.hits[s]
+            for k in range(found):
+                if k < capsule_slots and count < slots:
+                    contacts_out.source[count * trees + tree] = i * capsule_slots + k
+                    count = count + 1
+                else:
+                    dropped = dropped + 1
+    tree_contacts_out.is_impact[tree] = is_impact
+    tree_contacts_out.count[tree] = count
+    tree_contacts_out.dropped[tree] += dropped
+    islands_out.start[tree] = 0
+    islands_out.start[trees + tree] = count
+
+
+@wp.kernel
 def predict_impacted_trees(
     # model
     p: SolverParameters,
@@ -221,30 +349,23 @@ def write_tree_rows(
     rigid: RigidBodies,
     candidates: Candidates,
     warm_start: WarmStart,
+    tree_contacts: TreeContacts,
     # out
-    tree_contacts_out: TreeContacts,
     contacts_out: Contacts,
-    islands_out: Islands,
     rows_out: Rows,
 ):
-    """One thread per slot of a tree: the rows of its contact, and by the first one the number of contacts."""
+    """One thread per slot of a tree: the rows of its contact."""
     tree = wp.tid() % trees
-    slot = wp.tid() // trees
-    slots = candidates.feature.shape[1]
-    count = wp.min(candidates.count[tree], slots)
-    if slot == 0:
-        tree_contacts_out.count[tree] = count
-        tree_contacts_out.dropped[tree] += candidates.count[tree] - count
-        islands_out.start[tree] = 0
-        islands_out.start[trees + tree] = count
-    if slot < count:
+    c = wp.tid() // trees
+    if c < tree_contacts.count[tree]:
         contacts = view_contacts(contacts_out, tree, trees)
-        contacts.feature[slot] = candidates.feature[tree, slot]
-        contacts.other[slot] = candidates.other[tree, slot]
-        contacts.body[slot] = capsules.body[candidates.feature[tree, slot] // 2]
-        contacts.other_body[slot] = -1
+        slot = contacts.source[c]
+        contacts.feature[c] = candidates.feature[tree, slot]
+        contacts.other[c] = candidates.other[tree, slot]
+        contacts.body[c] = capsules.body[candidates.feature[tree, slot] // 2]
+        contacts.other_body[c] = -1
         write_rows(
-            slot, tree, slot, parameters, pairs, capsules, geoms, bodies, rigid, candidates,
+            c, tree, slot, parameters, pairs, capsules, geoms, bodies, rigid, candidates,
             view_warm_start(warm_start, tree, trees), contacts, view_rows(rows_out, tree, trees),
         )  # fmt: skip
 
@@ -309,8 +430,8 @@ def respond_to_rows(
     """One thread per slot of a tree: the columns of the Delassus matrix of its contact.
 
     The articulated-body algorithm with impulses only (Featherstone 2008, section 7.3), of trees that stand. Contacts are in the order of
-    their bodies. is_branching: [body] whether a body is the parent of another than the next one, or of none. bodies: how
-    many entries of ``response_out``, which is scratch, each slot has.
+    their bodies. is_branching: [body] whether a body is the parent of another than the next one. bodies: how many
+    entries of ``response_out``, which is scratch, each slot has.
     """
     tree = wp.tid() % trees
     c = wp.tid() // trees

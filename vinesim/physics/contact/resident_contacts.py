@@ -13,16 +13,19 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.articulation import structs as plant_structs
-from vinesim.kernels.contact import broadphase, narrowphase_rigid, structs, tree_islands
+from vinesim.kernels.contact import broadphase, structs, tree_islands
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters, material_pairs
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
 from vinesim.physics.contact.plant_capsules import plant_capsules
+from vinesim.physics.contact.warp_arrays import SharedArrays
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
 
 AABB_BLOCK = int(structs.AABB_BLOCK)
+CAPSULE_SLOTS = 4
+"""Contacts that one capsule can have at once: with two geoms along whose faces it lies."""
 DEFAULT_SLOTS = 8
 """Contacts that one tree can have at once: 17 kB a contact and tree of 17 bodies."""
 
@@ -95,22 +98,31 @@ class ResidentContacts:
         return made
 
     def _take_over_plants(self, arrays: PlantArrays) -> None:
-        buffers, model, trees = self.plants.buffers, self.plants.model, self._trees
-        rows, zeros = buffers.arrays, self._zeros
-        self._order = wp.array(np.arange(trees, dtype=np.int32), device=self._device)
-        self._tree_states = self._on_device(structs.Trees, arrays.trees.struct, awake=self._order)
+        rows, zeros = self.plants.buffers.arrays, self._zeros
+        self._tree_states = self._on_device(structs.Trees, arrays.trees.struct)
         self._bodies = structs.PlantBodies()
         self._bodies.parent, self._bodies.tree = rows["body_parent"], rows["body_tree"]
         self._bodies.is_cut = zeros(wp.bool, self._places)
         self._bodies.q, self._bodies.qd, self._bodies.qd_free = rows["body_q"], rows["body_qd"], rows["body_qd_free"]
-        slots = buffers.slots[arrays.capsules.body].astype(np.int32)
-        self._capsules = self._on_device(structs.Capsules, arrays.capsules.struct, body=slots)
-        self._capsule_states = self._on_device(structs.CapsuleStates, arrays.capsule_states.struct)
-        next_is_child = np.append(model.body_parent[1:] == np.arange(len(model.body_parent) - 1), False)
-        children = np.bincount(model.body_parent[model.body_parent >= 0], minlength=len(model.body_parent))
-        is_branching = np.zeros(self._places, np.bool_)
-        is_branching[buffers.slots] = ~next_is_child | (children > 1)
-        self._is_branching = wp.array(is_branching, dtype=wp.bool, device=self._device)
+        self._capsules = self._interleaved(arrays.capsules)
+        self._capsule_states = self._allocated(
+            structs.CapsuleStates, dict.fromkeys(structs.CapsuleStates.vars, self._capsule_count), {}
+        )
+    def _interleaved(self, capsules: SharedArrays) -> Any:
+        """The capsules on the device, capsule i of a tree at ``i * trees + tree``; -1 as the body of what is none."""
+        start = capsules.tree_start
+        number = np.arange(start[-1]) - np.repeat(start[:-1], np.diff(start))
+        self._capsule_count = (int(number.max(initial=-1)) + 1) * self._trees
+        at = number * self._trees + np.repeat(np.arange(self._trees), np.diff(start))
+        given: dict[str, np.ndarray] = {}
+        for name in structs.Capsules.vars:
+            source = getattr(capsules, name)
+            if len(source) == start[-1]:
+                given[name] = np.zeros((self._capsule_count, *source.shape[1:]), source.dtype)
+                given[name][at] = source
+        given["body"][:] = -1
+        given["body"][at] = self.plants.buffers.slots[capsules.body]
+        return self._on_device(structs.Capsules, capsules.struct, **given)
 
     @property
     def _places(self) -> int:
@@ -139,7 +151,6 @@ class ResidentContacts:
             wp.array(np.array(corner, np.float32), dtype=wp.vec3, device=device) for corner in zip(*boxes, strict=True)
         )
         self._pairs = self._on_device(structs.MaterialPairs, material_pairs(self.parameters).struct)
-        self._near = min(rigid.count, self.parameters.max_static_geoms_per_tree)
 
     def _by_slot(self, dtype: Any, columns: int) -> wp.array:
         """A table [tree, column] of zeros in which the trees of one column lie side by side."""
@@ -152,12 +163,12 @@ class ResidentContacts:
     def _allocate(self) -> None:
         trees, slots = self._trees, self.slots
         rows = 3 * slots
-        self.candidates = structs.Candidates()
-        for name, field in structs.Candidates.vars.items():
-            width = self._near if name == "near_geoms" else slots
-            made = self._zeros(field.type.dtype, trees) if field.type.ndim == 1 else self._by_slot(field.type.dtype, width)
-            setattr(self.candidates, name, made)
-        of_all = dict.fromkeys(structs.Contacts.vars, trees * slots) | {"source": 1, "island": 1}
+        capsules = self._capsule_count // trees
+        self.candidates = self._allocated(structs.Candidates, {}, {})
+        for name in ("feature", "other", "gap", "end_gap", "normal", "point"):
+            dtype = structs.Candidates.vars[name].type.dtype
+            setattr(self.candidates, name, self._by_slot(dtype, capsules * CAPSULE_SLOTS))
+        of_all = dict.fromkeys(structs.Contacts.vars, trees * slots) | {"island": 1}
         self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("block", "place"), slots), {})
         self.contacts.place.assign(np.arange(slots, dtype=np.int32))
         of_rows = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
@@ -172,15 +183,13 @@ class ResidentContacts:
         self.islands = self._allocated(structs.Islands, lists, {})
         self.islands.contact.assign(np.arange(slots, dtype=np.int32))
         self.islands.first_block.assign(np.array([0, 1], np.int32))
-        of_trees = {"count": trees, "dropped": trees, "loaded_count": trees, "loaded": trees * slots}
+        of_trees = dict.fromkeys(("count", "is_impact", "dropped", "loaded_count"), trees)
+        of_trees |= {"loaded": trees * slots, "found": self._capsule_count, "hits": self._capsule_count}
         self._tree_contacts = self._allocated(tree_islands.TreeContacts, of_trees, {})
         self._response = self._allocated(
             tree_islands.ResponseRows, dict.fromkeys(("a", "alpha"), slots * self._places), {}
         )
         self._was_in_contact = self._zeros(wp.bool, trees)
-        self._tree_boxes, self._wood_boxes = (
-            self._allocated(structs.Aabbs, {"low": trees, "high": trees}, {}) for _ in range(2)
-        )
 
     # ------------------------------------------------------------------ kernels
 
@@ -193,28 +202,28 @@ class ResidentContacts:
         model, forces, joints = fill(s.ArticulationModel), fill(s.AppliedForces), fill(s.JointState)
         bodies, factors = fill(s.BodyState), fill(s.Factors)
         scratch, prediction, work = fill(s.Scratch), fill(s.Prediction), fill(s.WrenchScratch)
-        onset = self.plants.contact_onset_steps
+        onset, contacts = self.plants.contact_onset_steps, self._tree_contacts
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
             return bind_launch(kernel, list(given), [], device=device), count
 
         return [
-            bound(broadphase.tree_aabbs, trees, parameters, capsules, self._order, self._tree_states, self._bodies,
-                  self._capsule_states, self._wood_boxes, self._tree_boxes),
-            bound(narrowphase_rigid.find_rigid_contacts, trees, parameters, p.max_static_geoms_per_tree, capsules, geoms,
-                  self._order, self._tree_states, self._tree_boxes, self._bodies, self._capsule_states,
-                  self._rigid_bodies, self._hulls, self._geom_states, self._static_blocks, self.candidates),
-            bound(tree_islands.predict_impacted_trees, trees, plants.parameters, model, onset, self.candidates.is_impact,
+            bound(tree_islands.find_capsule_contacts, self._capsule_count, parameters, capsules, geoms, trees,
+                  CAPSULE_SLOTS, self._tree_states, self._bodies, self._rigid_bodies, self._hulls, self._geom_states,
+                  self._static_blocks, self._capsule_states, contacts, self.candidates),
+            bound(tree_islands.list_tree_contacts, trees, trees, CAPSULE_SLOTS, self.slots, contacts, self.contacts,
+                  self.islands),
+            bound(tree_islands.predict_impacted_trees, trees, plants.parameters, model, onset, contacts.is_impact,
                   forces, joints, arrays["phi_used"], arrays["tree_euler_steps"], bodies, factors, scratch, prediction),
-            bound(tree_islands.write_tree_rows, trees * self.slots, parameters, self._pairs,
-                  capsules, geoms, trees, self._bodies, self._rigid_bodies, self.candidates, self._warm_start,
-                  self._tree_contacts, self.contacts, self.islands, self.rows),
-            bound(tree_islands.respond_to_rows, trees * self.slots, model, self._is_branching, trees, self._places,
-                  factors, self._tree_contacts, self.contacts, self._response, self.rows),
+            bound(tree_islands.write_tree_rows, trees * self.slots, parameters, self._pairs, capsules, geoms, trees,
+                  self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts, self.contacts,
+                  self.rows),
+            bound(tree_islands.respond_to_rows, trees * self.slots, model, arrays["body_branches"], trees, self._places,
+                  factors, contacts, self.contacts, self._response, self.rows),
             bound(tree_islands.solve_trees, trees, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts,
-                  p.solver_tolerance, parameters, geoms, trees, self._rigid_bodies, self._tree_contacts, self.contacts,
+                  p.solver_tolerance, parameters, geoms, trees, self._rigid_bodies, contacts, self.contacts,
                   self.islands, self._scratch, self.rows, self._warm_start, arrays["body_wrench"]),
-            bound(tree_islands.apply_contact_wrenches, trees, self.plants.dt, model, onset, self._tree_contacts,
+            bound(tree_islands.apply_contact_wrenches, trees, self.plants.dt, model, onset, contacts,
                   self._was_in_contact, arrays["body_wrench"], factors, arrays["tree_euler_steps"], work, scratch,
                   prediction),
         ]  # fmt: skip
