@@ -23,6 +23,7 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.contact.resident_contacts import ResidentContacts
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
@@ -35,6 +36,8 @@ PER_TREE = 17
 BARS = ((0.3, 1.975), (0.6, 1.9), (0.85, 1.75))
 """[m] x, z of the bars that the canes fall on."""
 BAR_RADIUS = 0.012
+SWEEPS = 20
+"""Largest number of sweeps: a GPU waits for the tree that takes most. One in two hundred does not converge in so many."""
 PEERS = ("discrete", "implicitfast")
 """Integrators of mujoco-warp."""
 CONTACT_CLOCK = 300
@@ -102,7 +105,7 @@ def canes_on_bars(device: str, count: int) -> tuple[ArticulationSolver, Resident
     plants = ArticulationSolver(model, stirred(model), device=device)
     plants.wake(np.arange(count))
     plants.forward_kinematics()
-    return plants, ResidentContacts(plants)
+    return plants, ResidentContacts(plants, PhysicsParameters(solver_sweeps=SWEEPS))
 
 
 def contact_trajectory(device: str) -> dict[str, np.ndarray]:
@@ -227,7 +230,8 @@ def measure_contacts(about: dict, device: str, count: int, with_peer: bool) -> N
     assert np.isfinite(plants.state.body_q).all()
     per_tree, sweeps = float(contacts.count.mean()), contacts.sweeps
     case = f"{count} trees of {PER_TREE} bodies, resident, with contacts: {per_tree:.2f} a tree"
-    also = {"sweeps_mean": float(sweeps.mean()), "sweeps_most": int(sweeps.max()), "dropped": contacts.dropped}
+    also = {"sweeps_mean": float(sweeps.mean()), "share_at_most_sweeps": float((sweeps >= SWEEPS).mean()),
+            "dropped": contacts.dropped}  # fmt: skip
     say(about | also, case, took, "ms/tick")
     for integrator in PEERS[:1] if with_peer else ():  # the other one is unstable in contact
         theirs, their_contacts = peer_milliseconds(count, integrator, plants.state)

@@ -70,13 +70,17 @@ def test_trees_move_and_press_as_in_a_scene(interleave: int) -> None:
         for contact in scene.contacts:
             force[model.body_tree[contact.body]] -= contact.force
         np.testing.assert_allclose(contacts.force, force, atol=0.02 * np.abs(force).max() + 1e-3)
-    assert most >= 6
+    assert most >= 3
     assert contacts.dropped == 0
 
 
 def test_contacts_beyond_the_slots_are_counted() -> None:
-    plants, contacts = resident(canes(2), slots=1)
-    plants.advance(60, contacts.solve)
+    low = BARS - np.array([0, 0, 0.06], np.float32)  # a third and a fourth one right below
+    start = np.concatenate([BARS, low])
+    bars = {"fixed_start": start, "fixed_end": start * np.array([1, -1, 1], np.float32),
+            "fixed_radius": np.full((len(start), 2), 0.028, np.float32)}  # fmt: skip
+    plants, contacts = resident(canes(2, **bars), slots=1)
+    plants.advance(100, contacts.solve)
     assert contacts.count.max() == 1
     assert contacts.dropped > 0
     assert np.isfinite(plants.state.joint_q).all()

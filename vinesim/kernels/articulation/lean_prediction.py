@@ -3,7 +3,7 @@
 There, what is left of a subtree is added to its parent's record and read again; on a GPU, where every tree is a thread and
 none of these records stays in a cache, that is most of the time. Here a body's own inertia is made when its joint is
 eliminated, and what is left goes on in registers to the parent, which mostly is the body before; records serve branches
-alone. The functions of one body are the same, so results differ by the order of sums.
+alone. The functions of one body and the order of sums are the same, but where two branches or more leave one body.
 """
 
 import warp as wp

@@ -14,7 +14,7 @@ import warp as wp
 
 from vinesim.kernels.articulation import structs as plant_structs
 from vinesim.kernels.contact import broadphase, structs, tree_islands
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.launch import THREADS_PER_BLOCK, bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters, material_pairs
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
 from vinesim.physics.contact.plant_capsules import plant_capsules
@@ -23,6 +23,8 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
 
+FULL_BLOCK = 128
+"""CUDA threads a block of kernels with several threads for each tree."""
 AABB_BLOCK = int(structs.AABB_BLOCK)
 CAPSULE_SLOTS = 4
 """Contacts that one capsule can have at once: with two geoms along whose faces it lies."""
@@ -205,7 +207,8 @@ class ResidentContacts:
         onset, contacts = self.plants.contact_onset_steps, self._tree_contacts
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
-            return bind_launch(kernel, list(given), [], device=device), count
+            block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
+            return bind_launch(kernel, list(given), [], device=device, block=block), count
 
         return [
             bound(tree_islands.find_capsule_contacts, self._capsule_count, parameters, capsules, geoms, trees,

@@ -31,7 +31,6 @@ from vinesim.kernels.launch import bind_launch
 from vinesim.physics.parameters import PhysicsParameters
 
 if TYPE_CHECKING:
-    from vinesim.physics.plants.device_buffers import DeviceBuffers
     from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
 Launch = Callable[..., None]
@@ -71,11 +70,6 @@ BUDGET_PERIOD = 8
 
 MIN_CAPACITY = 16
 """Bodies that a list holds at least."""
-
-
-def is_lean(buffers: DeviceBuffers) -> bool:
-    """Whether predictions spare memory traffic: on a GPU, where results are not the CPU's to the bit anyway."""
-    return buffers.device.is_cuda
 
 
 class KernelLaunches:
@@ -194,7 +188,7 @@ class KernelLaunches:
         joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
         partitioned = {"index_list": "trees", "partitions": self._threads}
-        kernel = (predict_lean, ("body_branches",)) if is_lean(self.buffers) else (predict, ())
+        kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
         self.predict, self.predict_subset = (
             record(
                 kernel[0], parameters, self._model, *kernel[1], trees, "tree_phi", "tree_euler_steps", "tree_steps",
