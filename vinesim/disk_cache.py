@@ -47,13 +47,18 @@ def folder() -> pathlib.Path:
     """The folder of the cache; it need not exist."""
     if chosen := os.environ.get("VINESIM_CACHE"):
         return pathlib.Path(chosen)
+    return user_folder() / "vinesim"
+
+
+def user_folder() -> pathlib.Path:
+    """The folder in which this user's programs keep their caches; it need not exist."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
     elif sys.platform == "darwin":
         base = "~/Library/Caches"
     else:
         base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return pathlib.Path(base).expanduser() / "vinesim"
+    return pathlib.Path(base).expanduser()
 
 
 def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndarray]]) -> Arrays:

@@ -57,6 +57,7 @@ def test_help_shows_every_command_with_examples():
         "certs",
         "render",
         "dataset",
+        "doctor",
     ):
         assert command in top
     commands = (["demo"], ["server"], ["client"], ["scene", "show"], ["bench"], ["ros", "build-interfaces"])

@@ -74,7 +74,8 @@ WRITTEN = [
     "own/0/0/{}",
     "fact/3/4/{}",
     "force/bob/{}",
-    "voice/0/0/{}",
+    "voice/{}",
+    "voice/{}/pcm",
 ]
 
 
@@ -118,10 +119,11 @@ def test_an_actor_writes_under_its_own_name_and_no_other(server, certs):
     assert keys_received(certs, server, "ada", [*others, *own, *invalid]) == own
 
 
-def test_a_spectator_writes_its_pose_and_nothing_else(server, certs):
+def test_a_spectator_writes_its_pose_and_its_voice_and_nothing_else(server, certs):
     keys = [f"vs/1/vineyard/{key.format(name)}" for key in WRITTEN for name in ("guest", "ada")]
-    poses = [f"vs/1/vineyard/a/guest{layer.suffix}" for layer in reversed(POSE_LAYERS)]
-    assert sorted(keys_received(certs, server, "guest", keys)) == sorted(poses)
+    own = [f"vs/1/vineyard/a/guest{layer.suffix}" for layer in POSE_LAYERS]
+    own += [f"vs/1/vineyard/voice/guest{suffix}" for suffix in ("", "/pcm")]
+    assert sorted(keys_received(certs, server, "guest", keys)) == sorted(own)
 
 
 def test_another_world_is_inaccessible(server, certs):

@@ -28,7 +28,7 @@ KEYS = (
     "vineyard/a/ada",
     "vineyard/live/ada/1", "vineyard/join/ada/1", "vineyard/hello/ada", "vineyard/clock", "vineyard/snap/0/0",
     "vineyard/snap/*/x", "vineyard/" + "n/" * 500 + "n", "vineyard/" + "n" * 5000, "vineyard/fact/x/" + ATTACKER,
-    "vineyard/force/ada/ada", "vineyard/voice/0/0/ada", "vineyard/mesh/0", "vineyard/offer/0",
+    "vineyard/force/ada/ada", "vineyard/voice/ada", "vineyard/mesh/0", "vineyard/offer/0",
 )  # fmt: skip
 """Patterns of keys below the root; ``{key}``: as the storm chose it."""
 

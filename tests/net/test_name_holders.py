@@ -25,7 +25,7 @@ from vinesim.scene.ids import ObjectKind, object_id
 
 KEYS = (
     "a/ada", "a/ada/far", "c/0/-1/ada", "tree/0/-1/ada", "near/0/-1/ada", "own/0/0/ada", "fact/3/4/ada",
-    "force/bob/ada", "voice/0/0/ada",
+    "force/bob/ada", "voice/ada", "voice/ada/pcm",
 )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ if middleware.unavailable_reason() is not None:
 from geometry_msgs.msg import TwistStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
-from std_msgs.msg import ColorRGBA, String
+from std_msgs.msg import Bool, ColorRGBA, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tests.support.contact_scenes import cane
@@ -53,6 +53,7 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
     robot = client.robot
     head = robot.description.joints.index("head_1_joint")
     received: list[JointState] = []
+    played: list[bytes] = []
 
     def head_of(message: JointState) -> float:
         return message.position[message.name.index("head_1_joint")]
@@ -63,7 +64,7 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
         ) as node,
         StockNode() as peer,
     ):
-        client.pre_step.append(RosCommandHandler(robot, node.commands))
+        client.pre_step.append(RosCommandHandler(robot, node.commands, play=played.append))
         client.post_step.append(lambda c: node.publish_robot_state(robot.sample(c.physics.time, c.physics.contacts)))
         peer.node.create_subscription(JointState, "/joint_states", received.append, 10)
         arm = peer.node.create_publisher(JointTrajectory, "/head_controller/joint_trajectory", 10)
@@ -106,11 +107,37 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
         wait_until(lambda: robot.lights == Lights(LightPattern.WARNING, (255, 150, 0)), step, "the usual colour")
         color.publish(ColorRGBA(r=0.0, g=1.0, b=0.0, a=1.0))
         wait_until(lambda: robot.lights == Lights(LightPattern.WARNING, (0, 255, 0)), step, "green")
+        sound = peer.node.create_publisher(Bool, "/indicator_lights/sound", 10)
+        wait_until(sound.get_subscription_count, step, "the sound of lights")
+        sound.publish(Bool(data=True))
+        wait_until(lambda: robot.lights == Lights(LightPattern.WARNING, (0, 255, 0), True), step, "they sound")
         refused = node._commands.rejected
         pattern.publish(String(data="disco"))
         wait_until(lambda: node._commands.rejected == refused + 1, step, "a refusal")
         pattern.publish(String(data="off"))
         wait_until(lambda: robot.lights.pattern == LightPattern.OFF, step, "lights off")
+
+        # F37, F38, F97: sound as audio_common has it
+        from audio_common_msgs.msg import AudioData, AudioDataStamped, AudioInfo
+
+        loudspeaker = peer.node.create_publisher(AudioData, "/speaker/audio", 10)
+        wait_until(loudspeaker.get_subscription_count, step, "the loudspeaker")
+        loudspeaker.publish(AudioData(data=b"odd"))
+        wait_until(lambda: node._commands.rejected == refused + 2, step, "a refusal")
+        loudspeaker.publish(AudioData(data=bytes(range(8))))
+        wait_until(lambda: played == [bytes(range(8))], step, "what is to be played")
+        plain, stamped, facts = [], [], []
+        peer.node.create_subscription(AudioData, "/audio", plain.append, 10)
+        peer.node.create_subscription(AudioDataStamped, "/audio_stamped", stamped.append, 10)
+        peer.node.create_subscription(
+            AudioInfo, "/audio_info", facts.append, QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        )
+        wait_until(lambda: node.has_subscribers("audio") and node.has_subscribers("audio_stamped"), step, "listeners")
+        node.publish_sound(12.5, bytes(range(200)))
+        wait_until(lambda: plain and stamped and facts, step, "what the microphone hears")
+        assert bytes(plain[0].data) == bytes(stamped[0].audio.data) == bytes(range(200))
+        assert (stamped[0].header.stamp.sec, stamped[0].header.stamp.nanosec) == (12, 500_000_000)
+        assert (facts[0].channels, facts[0].sample_rate, facts[0].sample_format) == (1, 16_000, "S16LE")
 
         node.publish_intentions([Intention("anna", "pick", 2.0)])
         heard: list[String] = []

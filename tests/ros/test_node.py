@@ -151,6 +151,7 @@ def test_large_messages_reach_another_process():
             time.sleep(max(due - time.monotonic(), 0.0))
             t = tick / 100
             robot.publish_clock(t)
+            robot.publish_sound(t, bytes(640))
             robot.publish_robot_state(robot_sample(t))
             for name in small:
                 offered[name] += 1
@@ -204,7 +205,8 @@ def test_every_topic_is_heard_with_its_official_type():
     assert received["/tf"]["type_hash"] == "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 
 
-LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static", "human_intention")
+LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static", "human_intention",
+           "audio_info")  # fmt: skip
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/robot_description": "std_msgs/msg/String",
@@ -212,6 +214,9 @@ TYPES = {
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/human_intention": "std_msgs/msg/String",
+    "/audio": "audio_common_msgs/msg/AudioData",
+    "/audio_stamped": "audio_common_msgs/msg/AudioDataStamped",
+    "/audio_info": "audio_common_msgs/msg/AudioInfo",
     "/tf_environment": "tf2_msgs/msg/TFMessage",
     "/tf_environment_static": "tf2_msgs/msg/TFMessage",
     "/mobile_base_controller/odom": "nav_msgs/msg/Odometry",

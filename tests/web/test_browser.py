@@ -31,7 +31,7 @@ HEADSET = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
 class LiveVineyard:
     """A client that steps in a thread of its own, as in its process: a spectator or a person before a bunch."""
 
-    def __init__(self, bus, *, is_person=False):
+    def __init__(self, bus, *, is_person=False, port=0):
         scene = load_scene("demo")
         model = generate(scene)
         hangs = model.forward_kinematics(model.joint_settled)[model.bunch_body[BUNCH]]
@@ -45,7 +45,7 @@ class LiveVineyard:
             eye = frames.pose(self.bunch - np.array([0.7, 0.0, 0.0]))
             self.client = Spectator(scene, model, None, bus, name="viewer", pose=eye)
         self.world = PageWorld(self.client, person)
-        self.server = PageServer(self.world)
+        self.server = PageServer(self.world, port)
         self.client.post_step.append(lambda _: self.world.collect(self.server))
         self.due = []
         """Called once before the next step."""
@@ -71,9 +71,11 @@ class LiveVineyard:
 
 def open_page(page, live, before=""):
     """Open the page, and let it draw little: the browser of a test has no graphics card."""
-    page.open(live.server.address + "?triangles=60000", before=before)
+    page.call("Emulation.setDeviceMetricsOverride", width=320, height=240, deviceScaleFactor=1, mobile=False)
+    page.open(live.server.address + "?triangles=30000", before=before)
     wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
     assert page.run("vinesim.failure") is None
+    page.run("vinesim.viewer.shadowAt = Infinity, 0")  # no shadows
     assert page.errors == []
 
 
@@ -197,3 +199,48 @@ def test_a_headset_moves_head_and_hands():
         wait(lambda: frames.to_yaw(human.pose.head[3:]) < 0.0, "the stick turns to the right")
         assert page.run("vinesim.calls") <= 2 * MAX_CALLS
         assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile():
+    """Its tab is hidden, its connection is cut, its client is started again; and what a browser lacks is said."""
+    with browser_page() as page:
+        with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
+            open_page(page, live, "Object.defineProperty(window, 'isSecureContext', {value: false});")
+            assert "--page-lan" in page.run("document.getElementById('notices').textContent")
+            hosts = "[...new Set(performance.getEntriesByType('resource').map(entry => new URL(entry.name).origin))]"
+            assert page.run(hosts) == [page.run("location.origin")]
+            page.run("vinesim.viewer.absence.long = 0.3, 0")
+            told = "vinesim.viewer.absence.told.join(' ')"
+
+            page.run("vinesim.viewer.renderer.setAnimationLoop(null), 0")  # as browsers do with tabs that are hidden
+            sent, tick = live.server.states_sent, live.client.physics.tick
+            live.due.append(lambda: live.client.physics.pick(BUNCH))
+            wait(lambda: live.client.physics.tick > tick + 60, "0.6 s pass while the tab is hidden")
+            assert live.server.states_sent - sent <= WINDOW
+            page.run("vinesim.viewer.renderer.setAnimationLoop(() => vinesim.viewer.draw())")
+            wait(lambda: "unseen: 1 bunch was picked." in page.run(told), "the page tells of the picked bunch")
+            assert "1 bunch was picked" in page.run("document.getElementById('notices').textContent")
+
+            page.run("vinesim.viewer.absence.told.length = 0, vinesim.viewer.socket.close(), 0")
+            wait(lambda: "unseen" in page.run(told), "the page connects again")
+            tree = live.client.model.body_tree[live.client.model.bunch_body[BUNCH]]
+            body, port = live.client.model.bodies_of(tree).stop - 1, live.server.port
+            rest = live.client.model.forward_kinematics(live.client.model.joint_settled)[body, :3]
+            carried = f"vinesim.viewer.world.place({body}).toArray()"
+            page.run(f"vinesim.viewer.world.poses.image.data[{8 * body}] += 1, 0")  # as if it had moved for good
+        with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, port=port) as live:
+            wait(lambda: "started again" in page.run(told), "the page knows that the client is a new one")
+            assert page.run("vinesim.viewer.world.picked.size") == 0
+            np.testing.assert_allclose(page.run(carried), rest, atol=0.02)
+            assert page.run("vinesim.failure") is None
+            assert page.errors == []
+
+            missing = "document.querySelector('#failure:not([hidden])')?.textContent"
+            for lacks, said in (
+                ("HTMLCanvasElement.prototype.getContext = () => null;", "no WebGL 2"),
+                ("delete HTMLScriptElement.prototype.noModule;", "too old"),
+            ):
+                page.open(live.server.address, before=lacks)
+                wait(lambda said=said: said in (page.run(missing) or ""), said)

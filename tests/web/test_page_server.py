@@ -2,16 +2,22 @@
 
 import asyncio
 import json
+import re
 import ssl
 import urllib.error
 import urllib.request
 
 import aiohttp
+import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.support.waiting import wait
 from vinesim.client import page_access
 from vinesim.errors import UsageError
+from vinesim.web import page_files
+from vinesim.web.page_input import decode_input
 from vinesim.web.page_server import WINDOW, PageServer
 
 HERE = [1.0, 2.0, 1.6, 0.0, 0.0, 0.0, 1.0]
@@ -120,11 +126,90 @@ def test_what_is_no_message_of_a_page_is_counted_and_changes_nothing(served, mes
     assert world.poses == []
 
 
+@pytest.mark.parametrize("message", ["x" * 100_000, b"\x00\x01" * 100], ids=["huge", "binary"])
+def test_a_message_of_a_wrong_size_or_kind_is_counted_and_others_are_served(served, message):
+    world, server = served
+
+    async def page():
+        async with aiohttp.ClientSession() as session, session.ws_connect(server.address + "state") as socket:
+            await (socket.send_str if isinstance(message, str) else socket.send_bytes)(message)
+            while server.refused == 0:
+                await asyncio.sleep(0.002)
+        async with aiohttp.ClientSession() as session, session.ws_connect(server.address + "state") as socket:
+            advance(world, server, 1)
+            return (await socket.receive()).data
+
+    assert int(asyncio.run(page())) == world.tick
+    assert server.refused == 1
+    assert world.poses == []
+
+
+def _mutated(value, path, new):
+    """A message with what lies at a ``path`` replaced."""
+    if not path:
+        return new
+    inner = {**value} if isinstance(value, dict) else list(value)
+    inner[path[0]] = _mutated(value[path[0]], path[1:], new)
+    return inner
+
+
+def _paths(value, path=()):
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, part in items:
+        yield from _paths(part, (*path, key))
+
+
+_HAND = {"pose": HERE, "closed": False, "fingers": [0.0] * 5}
+_WHOLE = {"drawn": 3, "view": HERE, "person": {"head": HERE, "left": _HAND, "right": _HAND, "intention": "pick"}}
+_JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=40),
+    lambda inner: st.lists(inner, max_size=9) | st.dictionaries(st.text(max_size=9), inner, max_size=5),
+    max_leaves=12,
+)
+
+
+@given(st.sampled_from(list(_paths(_WHOLE))), _JSON, st.integers(0, 400), st.text(max_size=3))
+@settings(max_examples=300, deadline=None)
+def test_whatever_a_page_sends_is_a_pose_within_bounds_or_nothing(path, new, place, inserted):
+    """Every field replaced by anything; and the text cut or changed anywhere."""
+    text = json.dumps(_mutated(_WHOLE, path, new))
+    for given_text in (text, text[:place], text[:place] + inserted + text[place + 1 :]):
+        said = decode_input(given_text)
+        for pose in () if said is None else said.poses():
+            assert np.isfinite(pose).all()
+            assert np.abs(pose[:3]).max() <= 1e5
+            assert np.linalg.norm(pose[3:]) == pytest.approx(1.0, abs=0.011)
+
+
 def test_a_site_of_another_origin_is_refused(served):
     _, server = served
     request = urllib.request.Request(server.address + "scene", headers={"Origin": "http://example.org"})
     with pytest.raises(urllib.error.HTTPError, match="403"):
         urllib.request.urlopen(request, timeout=10)
+
+
+def test_a_site_that_gives_this_address_a_name_of_its_own_is_refused(served):
+    """DNS rebinding: its pages would be of one origin with ours, and could move the person."""
+    _, server = served
+    for host in ("example.org", f"example.org:{server.port}"):
+        request = urllib.request.Request(server.address + "scene", headers={"Host": host, "Origin": f"http://{host}"})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(request, timeout=10)
+    request = urllib.request.Request(server.address + "scene", headers={"Host": f"localhost:{server.port}"})
+    assert urllib.request.urlopen(request, timeout=10).read() == b"scene"
+
+
+def test_nothing_is_loaded_from_another_host(served):
+    """Browsers are told so, and the page's own sources name no other host."""
+    _, server = served
+    with urllib.request.urlopen(server.address, timeout=10) as index:
+        policy = dict(rule.split(" ", 1) for rule in index.headers["Content-Security-Policy"].split("; "))
+    assert policy["default-src"] == "'self'"
+    assert not any("http" in sources or "*" in sources for sources in policy.values())
+    for path in page_files.PAGE.glob("*.*"):
+        if path.suffix in (".js", ".html"):
+            assert not re.search(r"""["'(=]\s*(https?:)?//\w""", path.read_text()), path
 
 
 def test_a_port_that_is_taken_is_said(served):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
+from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import FOLLOW_YAW, Spectator, standing_view
@@ -12,8 +13,9 @@ from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
+from vinesim.scene.values import INTENTIONS
 from vinesim.web.array_message import decode
-from vinesim.web.page_input import PageInput
+from vinesim.web.page_input import PageInput, TrackedHand, TrackedPerson
 
 
 class OnePage:
@@ -131,6 +133,39 @@ def test_the_eyes_of_a_spectator_follow_the_page(shown):
     world.take(1, PageInput(1, there))
     client.tick()
     assert tuple(client.pose) == there
+
+
+def test_the_pages_of_a_spectator_move_its_eyes_and_nothing_else(shown):
+    """A person in a message of a spectator's page is no person in the world, nor is what it indicates."""
+    client, world = shown
+    world.scene()
+    away = (4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0)
+    hand = TrackedHand(tuple(client.model.forward_kinematics(client.model.joint_settled)[40]), closed=True)
+    world.take(0, PageInput(1, away, TrackedPerson(away, hand, hand, INTENTIONS[1])))
+    for _ in range(5):
+        client.tick()
+    assert tuple(client.pose) == away
+    assert not client.humans
+    assert {visual.organ for visual in client.physics.snapshot().visuals} <= {Organ.BOX}
+    assert len(client.physics.plants.awake) == 0
+    assert client.physics.state.bunch_attached.all()
+
+
+def test_only_the_first_page_moves_the_person():
+    with MemoryHub().bus("anna") as bus:
+        scene = load_scene("demo")
+        start = frames.pose(np.array([-2.0, 0.0, 0.0]))
+        person = TrackedHuman(start)
+        client = Client(scene, generate(scene), None, bus, name="anna", pose=start, source=person)
+        world = PageWorld(client, person)
+        client.post_step.append(lambda _: world.collect(OnePage()))
+        mine, other = ((-2.0, y, 1.6, 0.0, 0.0, 0.0, 1.0) for y in (0.1, 0.5))
+        world.take(0, PageInput(1, mine, TrackedPerson(mine)))
+        world.take(1, PageInput(1, other, TrackedPerson(other, intention=INTENTIONS[1])))
+        for _ in range(30):
+            client.tick()
+        np.testing.assert_allclose(client.humans["anna"].pose.head[:3], mine[:3], atol=1e-9)
+        assert client.humans["anna"].intention == ""
 
 
 def test_the_page_of_a_robot_far_away_looks_over_its_shoulder_to_the_vines():

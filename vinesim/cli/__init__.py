@@ -3,7 +3,8 @@
 ``commands`` holds the options of all commands and nothing else; a command imports its implementation when it runs, so
 that ``vinesim --help`` opens at once.
 
-Exit codes: 0 done; 2 wrong use or bad input; 3 a part is missing on this machine; 4 the network or the server;
+Exit codes: 0 done; 1 ``doctor`` has found an error, or a defect of vinesim; 2 wrong use or bad input; 3 a part is
+missing on this machine; 4 the network or the server;
 5 a job was not done, or its files could not be written; 130 stopped by Ctrl-C or SIGTERM where stopping is not the
 ordinary end.
 """
@@ -26,7 +27,8 @@ from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, render, scene_show
 from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
-from vinesim.cli.commands.tools import bench, certs_new, ros_build_interfaces, ros_play, ros_record
+from vinesim.cli.commands.tools import bench, certs_new, doctor, ros_build_interfaces, ros_play, ros_record
+from vinesim.cli.commands.tuning import tune
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False,
@@ -39,7 +41,7 @@ certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certi
 app.add_typer(scene_app, name="scene")
 app.add_typer(ros_app, name="ros")
 app.add_typer(certs_app, name="certs")
-for command in (demo, server, client, record, replay, render, dataset, bench):
+for command in (demo, server, client, record, replay, render, dataset, tune, bench, doctor):
     app.command()(command)
 scene_app.command("show")(scene_show)
 ros_app.command("build-interfaces")(ros_build_interfaces)

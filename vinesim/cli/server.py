@@ -7,6 +7,7 @@ import pathlib
 import threading
 from typing import Any
 
+from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.cli.signals import stop_at_signals
 from vinesim.errors import UsageError
 from vinesim.net.server.admission import SceneId
@@ -21,11 +22,13 @@ STATUS_PERIOD = 1.0
 def run(
     *, listen: list[str] | None, connect: list[str] | None, state_dir: pathlib.Path | None, scene: str | None,
     seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, insecure: bool,
-    status: str,
+    status: str, spectators_speak_to: str = "people",
 ) -> int:  # fmt: skip
     """Carry messages until SIGINT or SIGTERM."""
     if status not in ("text", "json", "none"):
         raise UsageError(f"--status {status!r}: give text, json or none")
+    if spectators_speak_to not in tuple(SpectatorsSpeakTo):
+        raise UsageError(f"--spectators-speak-to {spectators_speak_to!r}: give nobody, people or all")
     if min(quota) <= 0.0:
         raise UsageError(f"--quota {quota[0]:g} {quota[1]:g}: both must be above zero, or nothing is ever kept")
     if seed is not None and scene is None:
@@ -37,6 +40,7 @@ def run(
     with Server(
         places, connect=connect or (), state_folder=state_dir, scene=plan,
         max_actors=max_clients, quota=Quota(*quota), certificates=tls,
+        spectators_speak_to=SpectatorsSpeakTo(spectators_speak_to),
     ) as server:  # fmt: skip
         if status != "json":
             print(f"listening on {', '.join(map(str, server.endpoints))}", flush=True)

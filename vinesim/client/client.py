@@ -32,6 +32,7 @@ from vinesim.client.remote.plant_couplings import PlantCouplings
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
 from vinesim.client.signals import show_lights
+from vinesim.client.sound.exchange import SoundExchange
 from vinesim.client.world_time import WorldTime
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
@@ -134,6 +135,7 @@ class Client:
         """Called after :meth:`reset`: parts that keep the physics or a robot take the new ones."""
         self.earlier_faults: collections.Counter[str] = collections.Counter()
         """Faults of the physics and of couplings before the last reset."""
+        self.faults_elsewhere: list[Callable[[], dict[str, int]]] = []  # counts of parts that serve it: of its page
         self.frame_score: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
         """How much there is to see now; the picture with the highest score is kept."""
         self.trace: Trace | None = None
@@ -141,7 +143,8 @@ class Client:
         self.interest_audit = InterestAudit()
         self.world_time = WorldTime(self.physics.dt)
         """Time of the world, in which ROS messages are stamped."""
-        self._clock = clock
+        self.clock = clock
+        self.sound = SoundExchange(self)
         self._remote_trees: dict[int, TreeUpdate] = {}
         self.spawner = RemoteSpawner(self.physics.rigid, description, executor, self.meshes)
 
@@ -256,7 +259,7 @@ class Client:
             if self.steps_before_pause == 0:
                 return
             self.steps_before_pause -= 1
-        now = self._clock()
+        now = self.clock()
         self.receive(now)
         if self.replicator.has_clock:
             self.world_time.follow(self.physics.time, now + self.replicator.offset)
@@ -271,9 +274,9 @@ class Client:
 
     def wait_for_clock(self, timeout: float) -> None:
         """Before the first step: wait up to ``timeout`` [s] for the server's clock, so that no stamp jumps later."""
-        until = self._clock() + timeout
-        while not self.replicator.has_clock and self._clock() < until:
-            self.receive(self._clock())
+        until = self.clock() + timeout
+        while not self.replicator.has_clock and self.clock() < until:
+            self.receive(self.clock())
             time.sleep(CLOCK_POLL_PERIOD)
 
     # ------------------------------------------------------------------ the parts of a tick
@@ -362,7 +365,7 @@ class Client:
     def leave(self) -> None:
         """Before the buses close: publish objects at rest on local robots in the world frame, as their parent goes."""
         self.meshes.close()
-        now = self._clock()
+        now = self.clock()
         for name, robot in self.robots.items():
             supported = self.objects.supported_by(name)
             if supported:

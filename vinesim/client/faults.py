@@ -22,6 +22,7 @@ DESCRIPTIONS = {
     "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
     "meshes_refused": "meshes of other clients were refused, as they were corrupt or too many: they stay boxes",
     "meshes_not_taken": "meshes of robots here were not taken by the server: others see boxes in their place",
+    "page_messages_refused": "messages of pages were refused, as they were malformed or cannot be true",
     "deadlines_dropped": "steps were skipped after the process had stood still",
 }
 """What each fault is, for a person."""
@@ -38,6 +39,8 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
         "meshes_not_taken": client.meshes.refused_offers,
         "deadlines_dropped": deadlines_dropped,
     }
+    for others in client.faults_elsewhere:
+        counts |= others()
     return {name: count for name, count in counts.items() if count}
 
 

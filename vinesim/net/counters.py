@@ -40,6 +40,8 @@ class Counters:
     """Retained records: these leave even if no peer is near, because the server keeps them."""
     force: Traffic = dataclasses.field(default_factory=Traffic)
     """Wrenches of hands on robots of other clients, and couplings of two actors to one tree."""
+    voice: Traffic = dataclasses.field(default_factory=Traffic)
+    """Frames of sound."""
     control: Traffic = dataclasses.field(default_factory=Traffic)
     """Hellos, clock replies and snapshots (received only)."""
     malformed: int = 0

@@ -8,4 +8,4 @@ def sender_of(key: str) -> str:
     family, *rest = key.split("/")
     if not rest or family == "snap":
         return ""
-    return rest[0] if family in ("a", "hello", "live") else rest[-1]
+    return rest[0] if family in ("a", "hello", "live", "voice") else rest[-1]

@@ -11,6 +11,7 @@ import logging
 import os
 import pathlib
 import time
+from collections.abc import Iterator
 
 log = logging.getLogger(__name__)
 
@@ -21,25 +22,33 @@ YOUNGEST = 60.0
 """A segment younger than this may belong to a process that is about to lock it [s]."""
 
 
+def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
+    """Large segments of this user whose owner is dead, each with its lock file, which is locked for so long."""
+    try:
+        import fcntl
+    except ImportError:
+        return  # no such system has Fast DDS's locks
+    for path in (*folder.glob("fastrtps_*"), *folder.glob("fastdds_*")):
+        lock = path.with_name(f"{path.name}_el")
+        with contextlib.suppress(OSError):  # gone, locked, or of another user: not ours to remove
+            status = path.stat()
+            is_ours = status.st_size >= SMALLEST and status.st_uid == os.getuid()
+            if not is_ours or time.time() - status.st_mtime < YOUNGEST:
+                continue
+            with lock.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                yield path, lock
+
+
 def remove_dead_segments(folder: pathlib.Path = FOLDER) -> int:
     """Remove large segments of this user whose owner is dead; how many. The log has their number and size."""
-    with contextlib.suppress(ImportError):
-        import fcntl
-
-        removed = size = 0
-        for path in (*folder.glob("fastrtps_*"), *folder.glob("fastdds_*")):
-            lock = path.with_name(f"{path.name}_el")
-            with contextlib.suppress(OSError):  # gone, locked, or of another user: not ours to remove
-                status = path.stat()
-                is_ours = status.st_size >= SMALLEST and status.st_uid == os.getuid()
-                if not is_ours or time.time() - status.st_mtime < YOUNGEST:
-                    continue
-                with lock.open("rb") as file:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    path.unlink()
-                    lock.unlink()
-                removed, size = removed + 1, size + status.st_size
-        if removed:
-            log.info("removed %d shared-memory segments (%.0f MB) that killed processes left", removed, size / 1e6)
-        return removed
-    return 0  # no such system has Fast DDS's locks
+    removed = size = 0
+    for path, lock in dead_segments(folder):
+        with contextlib.suppress(OSError):  # another process removes them as well
+            length = path.stat().st_size
+            path.unlink()
+            lock.unlink()
+            removed, size = removed + 1, size + length
+    if removed:
+        log.info("removed %d shared-memory segments (%.0f MB) that killed processes left", removed, size / 1e6)
+    return removed

@@ -25,6 +25,7 @@ from vinesim.ros.publishers.control import ControlPublisher
 from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
 from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
 from vinesim.ros.publishers.robot import RobotPublisher
+from vinesim.ros.publishers.sound import SoundPublisher
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage
 from vinesim.scene.values import ComponentStatus, ControllerSpec, Intention, RobotSample
 
@@ -32,7 +33,7 @@ FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
 MAP_TO_ODOM, TRUTH, ENVIRONMENT_RATE = "publish_map_to_odom", "publish_truth", "environment_rate"
 """Names of parameters."""
-OWN_MESSAGES = ("tf2_msgs", "control_msgs")
+OWN_MESSAGES = ("tf2_msgs", "control_msgs", "audio_common_msgs")
 """Message packages that no wheel has."""
 
 
@@ -73,11 +74,14 @@ class RobotNode(Node):
         super().__init__(name, namespace, [*names, *imus, *wrenches], params_file, parameters)
 
     def _open(self) -> None:
+        from audio_common_msgs.msg import AudioData
         from tf2_msgs.msg import TFMessage
 
         self._clock = ClockPublisher(self._node, self._advertise, self._withdraw) if self._has_clock else None
         self._robot = RobotPublisher(self._advertise, TFMessage, self._urdf, self._static_transforms, self._base)
         self._ground_truth = GroundTruthPublisher(self._advertise, TFMessage)
+        self._sound = SoundPublisher(self._advertise)
+        self._send(self._sound.pending_info(), always=True)
         self._intentions = self._advertise(String, "human_intention", TRANSIENT_LOCAL)
         self._diagnostics = self._advertise(DiagnosticArray, "/diagnostics", RELIABLE)
         self._proprioception = ProprioceptionPublisher(self._advertise, self._imus, self._wrenches)
@@ -86,7 +90,7 @@ class RobotNode(Node):
         numbers = {link.get("name", ""): number for number, link in enumerate(links)}
         self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers)
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
-        CommandSubscriptions(self._node, self._controllers, self._commands)
+        CommandSubscriptions(self._node, self._controllers, self._commands, AudioData)
 
         self._declare_parameters()
 
@@ -158,6 +162,10 @@ class RobotNode(Node):
     def publish_intentions(self, intentions: Sequence[Intention]) -> None:
         """Publish what people indicate, when it changes; late subscribers receive the last message, too."""
         self._send([(self._intentions, lambda: convert.intentions(intentions))], always=True)
+
+    def publish_sound(self, time: float, pcm: bytes) -> None:
+        """Publish what the microphone recorded from ``time`` [s] of the world on: PCM16 of 16 kHz, mono."""
+        self._send(self._sound.pending(time, pcm))
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
         """Publish the states of parts of the client; the node adds its own. 1 Hz will do."""

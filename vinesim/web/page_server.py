@@ -21,6 +21,7 @@ from vinesim.errors import UsageError
 from vinesim.web import page_files
 from vinesim.web.page_files import PAGE
 from vinesim.web.page_input import PageInput, decode_input
+from vinesim.web.voice_socket import Sound, VoiceSocket
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +29,14 @@ WINDOW = 2
 """States in flight to one page. Without a limit a page on a busy machine was 0.4 to 1 s behind."""
 _MAX_INPUT = 8192
 """Longest message of a page [B]."""
+_THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
+_POLICY = "; ".join(
+    (
+        "default-src 'self'", "style-src 'self' 'unsafe-inline'", "img-src 'self' data:", "media-src 'self' blob:",
+        "worker-src 'self' blob:", "object-src 'none'", "base-uri 'none'",
+    )
+)  # fmt: skip
+"""Content Security Policy: browsers load nothing from other hosts for the page, whatever its scripts ask for."""
 
 
 class World(Protocol):
@@ -59,15 +68,18 @@ class PageServer:
 
     def __init__(
         self, world: World, port: int = 0, host: str = "127.0.0.1", *, tls: ssl.SSLContext | None = None,
-        token: str | None = None,
+        token: str | None = None, sound: Sound | None = None,
     ) -> None:  # fmt: skip
-        """``port`` 0: any that is free; ``tls``: by https; ``token``: only who has it in the address is let in.
+        """``port`` 0: any that is free; ``tls``: by https; ``token``: only who has it in the address is let in;
+        ``sound``: what pages hear and say.
 
         Raises :class:`UsageError` if the page lacks anything or the port is taken.
         """
         page_files.check()
         self._world, self._host, self._asked = world, host, port
         self._tls, self._token = tls, token
+        self.voice = None if sound is None else VoiceSocket(sound)
+        """The socket of sound."""
         self.port = 0
         self._pages = 0
         self.states_sent = 0
@@ -121,11 +133,13 @@ class PageServer:
 
     async def _serve(self) -> None:
         self._stopping = asyncio.Event()
-        app = web.Application(middlewares=[_refuse_other_origins, self._refuse_without_token])
+        app = web.Application(middlewares=[_refuse_other_origins, self._refuse_strangers])
         app.router.add_get("/", self._index)
         app.router.add_get("/scene", self._scene)
         app.router.add_get("/rigid", self._rigid)
         app.router.add_get("/state", self._state)
+        if self.voice is not None:
+            app.router.add_get("/voice", self.voice.serve)
         app.router.add_static("/", PAGE)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
@@ -140,6 +154,8 @@ class PageServer:
         finally:
             for event in self._fresh:
                 event.set()
+            if self.voice is not None:
+                await self.voice.close()
             await runner.cleanup()
 
     def _wake(self) -> None:
@@ -147,17 +163,19 @@ class PageServer:
             event.set()
 
     @web.middleware
-    async def _refuse_without_token(
-        self, request: web.Request, handler: Callable[..., Any]
-    ) -> web.StreamResponse:  # fmt: skip
-        """The token comes in the address once, and as a cookie from then on."""
+    async def _refuse_strangers(self, request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
+        """With a token: who does not have it in the address, or as a cookie from then on. Without one: who calls this
+        machine by a name that it does not have, since any site can give a name of its own this address."""
         given = request.query.get("token", request.cookies.get("token", ""))
         if self._token is not None and not hmac.compare_digest(given.encode(), self._token.encode()):
             raise web.HTTPForbidden(text="open the address with its token, as the client has printed it")
+        if self._token is None and request.url.host not in (self._host, *_THIS_MACHINE):
+            raise web.HTTPForbidden(text=f"this is not {request.url.host}; open {self.address}")
         return await handler(request)
 
     async def _index(self, _: web.Request) -> web.FileResponse:
-        page = web.FileResponse(PAGE / "index.html", headers={"Cache-Control": "no-cache"})
+        headers = {"Cache-Control": "no-cache", "Content-Security-Policy": _POLICY}
+        page = web.FileResponse(PAGE / "index.html", headers=headers)
         if self._token is not None:
             page.set_cookie("token", self._token, httponly=True, samesite="Strict", secure=self._tls is not None)
         return page
@@ -204,8 +222,9 @@ class PageServer:
         """Take what a page sends; ``flight`` are the ticks of the states that it has not drawn yet."""
         async for message in socket:
             if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
+                if self.refused == 0:
+                    log.warning("a page sent what is no message of a page: refused (further ones are only counted)")
                 self.refused += 1
-                log.warning("a page sent what is no message of a page: dropped (%d so far)", self.refused)
                 continue
             while flight and flight[0] <= said.drawn:
                 flight.popleft()

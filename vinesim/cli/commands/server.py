@@ -38,6 +38,9 @@ def server(
         tuple[float, float],
         typer.Option(help="MESSAGES/s and BYTES/s of retained records (cuts, resting objects) for each actor."),
     ] = (200.0, 200_000.0),
+    spectators_speak_to: Annotated[
+        str, typer.Option(help="Who hears spectators: nobody, people (robots are deaf to them) or all.")
+    ] = "people",
     tls: Annotated[
         pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): all others are refused.")
     ] = None,

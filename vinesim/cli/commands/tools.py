@@ -1,4 +1,4 @@
-"""``vinesim bench``, ``vinesim ros`` and ``vinesim certs``: their options."""
+"""``vinesim bench``, ``vinesim doctor``, ``vinesim ros`` and ``vinesim certs``: their options."""
 
 from __future__ import annotations
 
@@ -54,6 +54,24 @@ def bench(
     from vinesim.cli.bench import run
 
     raise typer.Exit(run(names, json, plot, row or (), minutes, times, seed, messages, lies))
+
+
+def doctor(
+    json: Annotated[bool, typer.Option("--json", help="All findings as one JSON object.")] = False,
+) -> None:
+    """Check what vinesim needs of this machine: one line each, ok, warning or error, with the remedy.
+
+    Python, packages, processor, GPU, ROS 2, page, certificates, ports, shared memory, clock, caches. The exit code is 0
+    if a client can run, and 1 if it lacks something.
+
+    \b
+    Examples:
+      vinesim doctor
+      vinesim doctor --json
+    """
+    from vinesim.cli.doctor.command import run
+
+    raise typer.Exit(run(json))
 
 
 def ros_build_interfaces(

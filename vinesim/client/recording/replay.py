@@ -18,6 +18,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 
+from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.keys import sender_of
@@ -204,6 +205,10 @@ class ReplayBus:
 
     def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
         return []
+
+    @property
+    def spectators_speak_to(self) -> SpectatorsSpeakTo:
+        return SpectatorsSpeakTo.PEOPLE
 
     @property
     def admissions(self) -> int:

@@ -12,6 +12,7 @@ from typing import Any, Self
 import numpy as np
 
 from vinesim import frames
+from vinesim.audio import opus
 from vinesim.client.client import Client
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
@@ -20,12 +21,14 @@ from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import Run, WorkerProcess
 from vinesim.client.signals import IntentionLog
+from vinesim.client.sound.exchange import SoundStep
+from vinesim.client.sound.microphone_step import at_place
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.simulation_control import SimulationControl
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import series_stiffness
-from vinesim.ros.commands.types import Command
+from vinesim.ros.commands.types import Command, GoalResult
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import ComponentStatus, JointReference, RigidVisual
@@ -98,8 +101,10 @@ class RosProcess:
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
         self.handler = RosCommandHandler(
-            self.robot, self._take_commands, lambda result: self.worker.send("finish", result), client.world_time
-        )
+            self.robot, self._take_commands, self._finish, client.world_time,
+            lambda pcm: client.sound.play(self.robot.name, pcm),
+        )  # fmt: skip
+        client.sound.listen(self.robot.name, _Microphone(self))
         client.pre_step.insert(0, self._control)
         client.after_reset.append(self._begin_anew)
         if self._leads:
@@ -114,6 +119,11 @@ class RosProcess:
             self._is_restarted = False
             self.handler.cancel_all(time)
         self.handler(time)
+
+    def _finish(self, result: GoalResult) -> None:
+        """Tell the process how a goal ended; its client hears of it after the steps that led there."""
+        run = self.worker.current()
+        run.send("finish", (run.shared.steps.put_count, result))
 
     def _begin_anew(self) -> None:
         """After a reset: obey no earlier command, and publish the new robot."""
@@ -180,6 +190,10 @@ class RosProcess:
             truth["version"][0] = self._truth_list.version
             self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
 
+    def hear(self, step: SoundStep) -> None:
+        """Pass what is heard at the robot to the process."""
+        self.worker.send("sound", at_place(step, self.client.sound.place_of(self.robot.name)))
+
     def _wake(self) -> None:
         channel = self.worker.current().shared
         channel.steps.wake()
@@ -232,3 +246,19 @@ class RosProcess:
 
     def __exit__(self, *_: types.TracebackType | type[BaseException] | BaseException | None) -> None:
         self.close()
+
+
+class _Microphone:
+    """Listens for a robot while its topics of sound have subscribers."""
+
+    decodes_opus = opus.is_available()
+
+    def __init__(self, process: RosProcess) -> None:
+        self._process = process
+
+    @property
+    def is_open(self) -> bool:
+        return bool(self._process.worker.current().shared.wanted["sound"][0])
+
+    def hear(self, step: SoundStep) -> None:
+        self._process.hear(step)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Callable, Iterable
 
@@ -25,6 +26,8 @@ from vinesim.ros.commands.types import (
     JointTrajectory,
     LightsColor,
     LightsPattern,
+    LightsSound,
+    LoudspeakerSound,
 )
 
 log = logging.getLogger(__name__)
@@ -41,10 +44,12 @@ class RosCommandHandler:
         commands: Callable[[], Iterable[Command]],
         finish: Callable[[GoalResult], None] = lambda _: None,
         world_time: WorldTime | None = None,
+        play: Callable[[bytes], None] = lambda _: None,
     ) -> None:
         """``commands`` returns the commands that have arrived since the last call; ``finish`` takes ended goals.
 
-        ``world_time``: in which commands are stamped; without it they are stamped in simulated time.
+        ``world_time``: in which commands are stamped; without it they are stamped in simulated time. ``play``:
+        takes PCM16 for the loudspeaker.
         """
         self.robot = robot
         self.controllers = ControllerManager(robot)
@@ -53,6 +58,7 @@ class RosCommandHandler:
         self._lights_color: tuple[float, float, float] | None = None
         """Of the indicator lights; None: that of the pattern."""
         self._commands, self._finish, self._world_time = commands, finish, world_time
+        self._play = play
 
     def __call__(self, time: float) -> None:
         """Apply the new commands in the step that starts at ``time`` [s], and advance the controllers."""
@@ -94,6 +100,10 @@ class RosCommandHandler:
                 controllers.start_gripper(command.controller, command.position, command.max_effort, time, command.goal)
             case CancelGoal():
                 controllers.cancel(command.goal, time)
+            case LightsSound():
+                self.robot.lights = dataclasses.replace(self.robot.lights, has_sound=command.is_on)
+            case LoudspeakerSound():
+                self._play(command.pcm)
             case LightsPattern():
                 self.robot.command_lights(command.pattern, self._lights_color)
             case LightsColor():

@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 
+from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.net.codec.header import (
     MAGIC,
     MAX_COORDINATE,
@@ -74,6 +75,8 @@ class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Name of the world's scene."""
     digest: str = ""
     """``Model.digest()`` of that scene."""
+    spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE
+    """Who hears spectators in this world."""
     protocol: int = PROTOCOL
 
 

@@ -12,7 +12,7 @@ import enum
 import math
 import struct
 
-PROTOCOL = 3
+PROTOCOL = 4
 """Version of the wire format. Messages of any other version are refused."""
 
 MAGIC = b"VS"
@@ -29,6 +29,7 @@ class MessageKind(enum.IntEnum):
     HUMAN = 6
     WRENCHES = 7
     COUPLINGS = 8
+    VOICE = 9
     HELLO = 16
     CLOCK = 17
     WELCOME = 18

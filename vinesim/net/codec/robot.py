@@ -32,6 +32,9 @@ _BASE = struct.Struct("<3f3h6hH4B")  # position, turn, velocity, scale of joint 
 
 _PATTERNS = frozenset(map(int, LightPattern))
 
+_SOUND = 128
+"""Added to a pattern of lights that sounds."""
+
 _OUT_OF_RANGE = -32768  # a joint position that no i2 holds; it follows as f4
 """Marks a joint position that i2 cannot hold; it follows as f4."""
 
@@ -69,7 +72,7 @@ def encode_robot(update: RobotUpdate) -> bytes:
     scale = min(math.ceil(float(speed.max(initial=0.0)) / (127.0 * JOINT_RATE_LSB)), 65535)
     unit = max(scale, 1) * JOINT_RATE_LSB
     rates = np.minimum(np.maximum(np.rint(velocity / unit), -127.0), 127.0)
-    lights = (int(update.lights.pattern), *update.lights.color)
+    lights = (int(update.lights.pattern) + _SOUND * update.lights.has_sound, *update.lights.color)
     if not all(0 <= number <= 255 for number in lights):
         raise MessageError(f"lights {lights} of {update.actor!r}: each of four numbers must be 0 to 255")
     turn = _to_lsb([x * factor, y * factor, z * factor], TURN_LSB)
@@ -98,11 +101,11 @@ def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
     position[apart] = np.frombuffer(payload, "<f4", rest // 4, joints + 3 * count)
     if not (all(-1e9 < number < 1e9 for number in base[:3]) and (np.abs(position) < 1e9).all()):
         raise MessageError("actor pose with a number that is not finite or beyond 1e9")
-    if base[13] not in _PATTERNS:
+    if base[13] % _SOUND not in _PATTERNS:
         raise MessageError(f"actor pose with lights of an unknown pattern, {base[13]}")
     turn = check_rotation_vectors(np.array(base[3:6]) * TURN_LSB, "actor pose")
     velocity = np.frombuffer(payload, "i1", count, joints + 2 * count) * (base[12] * JOINT_RATE_LSB)
     return RobotUpdate(
         actor, time, np.concatenate([base[:3], quaternion(turn)]), np.array(base[6:12]) * BASE_VELOCITY_LSB,
-        position, velocity, Lights(LightPattern(base[13]), base[14:17]),
+        position, velocity, Lights(LightPattern(base[13] % _SOUND), base[14:17], base[13] >= _SOUND),
     )  # fmt: skip

@@ -95,6 +95,7 @@ class Receiver:
             state.ownership.remove_actor(name, time, state.successor_of)
             state.wrench_sync.remove_peer(name)
             state.coupling_sync.remove_peer(name)
+            state.voices.remove_peer(name)
         inbox.joined, replies = peers.process_replies()
         for reply in replies:
             self._receive_snapshot(reply, step)
@@ -124,9 +125,10 @@ class Receiver:
         state, counters = self._state, self._state.counters
         family, _, rest = key.partition("/")
         chunks = rest.split("/")
-        sender = chunks[0] if family == "a" else chunks[-1]
+        sender = chunks[0] if family in ("a", "voice") else chunks[-1]
         traffic = {
             "a": counters.actor, "c": counters.environment, "fact": counters.retained, "force": counters.force,
+            "voice": counters.voice,
             **dict.fromkeys(_TREE_FAMILIES, counters.environment),
         }  # fmt: skip
         traffic.get(family, counters.event).count_in(payload)
@@ -136,11 +138,14 @@ class Receiver:
                 counters.dropped += self._keep_early(sender, key, payload) if family == "fact" else 1
             return
         try:
-            if family != "a" and peer is not None and peer.hello.kind == SPECTATOR:
-                raise MessageError(f"a spectator publishes only its pose, not {key!r}")
+            if family not in ("a", "voice") and peer is not None and peer.hello.kind == SPECTATOR:
+                raise MessageError(f"a spectator publishes only its pose and its voice, not {key!r}")
             if family == "a":
                 assert peer is not None
                 counters.dropped += not peer.receive(decode_pose(payload, sender), step.time)
+            elif family == "voice":
+                assert peer is not None
+                state.voices.receive(payload, peer, step.now, step.time)
             elif family == "force":
                 assert peer is not None
                 pose = peer.update if peer.update and step.time - peer.update.time <= MAX_POSE_AGE else None

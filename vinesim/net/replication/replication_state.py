@@ -16,6 +16,7 @@ from vinesim.net.replication.peers import PeerRegistry
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.replication.streams import ObjectStream, TreeStream, object_counts
 from vinesim.net.replication.tree_channels import TreeChannels
+from vinesim.net.replication.voices import VoiceSync
 from vinesim.net.transport.bus import Bus, Publisher
 from vinesim.scene.ids import is_tree
 from vinesim.scene.model import Model
@@ -37,6 +38,7 @@ class ReplicationState:
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
         self.wrench_sync = WrenchSync(bus, hello.name, self.counters, hand_force)
         self.coupling_sync = CouplingSync(bus, hello.name, model, self.counters)
+        self.voices = VoiceSync(bus, hello, self.counters)
         self.ownership = Ownership(hello.name, self.peers.known)
         self.siblings: tuple[ReplicationState, ...] = ()
         """Of the other actors of the same client."""

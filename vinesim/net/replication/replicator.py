@@ -7,7 +7,8 @@ is near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong
 
 Keys: ``a/<actor>`` poses, ``tree/<x>/<y>/<actor>`` and ``near/<x>/<y>/<actor>`` states of trees that move in a cell,
 ``c/<x>/<y>/<actor>`` those of boxes and bunches, ``own/<x>/<y>/<actor>`` claims and
-states at rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, and the queries
+states at rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, ``voice/<actor>``
+frames of sound, and the queries
 ``snap/<x>/<y>`` (records of a cell), ``hello/<actor>`` and ``clock``.
 """
 
@@ -27,6 +28,7 @@ from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
 from vinesim.net.replication.sender import LocalStep, Sender
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots, StateReader
+from vinesim.net.replication.voices import VoiceSync
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.model import Model
 from vinesim.scene.values import Coupling, HumanUpdate, RobotUpdate, TreeUpdate
@@ -63,6 +65,11 @@ class Replicator:
     def counters(self) -> Counters:
         """Traffic and rejected messages since the start."""
         return self._state.counters
+
+    @property
+    def voices(self) -> VoiceSync:
+        """What this actor says and hears."""
+        return self._state.voices
 
     @property
     def interest_radius(self) -> float:

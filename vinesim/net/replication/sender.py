@@ -117,6 +117,7 @@ class Sender:
         state.tree_channels.update(state.cells.position, trees)
         state.retained.update_window(state.cells.subscriptions, state.cells.changes, now)
         state.peers.update_interest(state.cells.position)
+        state.voices.update_interest(state.peers.known, state.cells.position, now)
 
     # ------------------------------------------------------------ moving
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import PROTOCOL, Hello, MessageError, Welcome, WrongVersion
 
@@ -28,9 +29,13 @@ class SceneId(NamedTuple):
 class AdmissionControl:
     """Decides about hellos. ``session`` distinguishes two programs with the same name."""
 
-    def __init__(self, scene: SceneId | None = None, max_actors: int | None = None) -> None:
+    def __init__(
+        self, scene: SceneId | None = None, max_actors: int | None = None,
+        spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE,
+    ) -> None:  # fmt: skip
         """``scene``: the only one allowed, in every world. ``max_actors``: over all worlds. None: no such limit."""
         self._required_scene, self._max_actors = scene, max_actors
+        self._spectators_speak_to = spectators_speak_to
         self._scenes: dict[str, SceneId] = {}
         self._pinned: set[str] = set()
         self._alive: dict[tuple[str, str], set[str]] = {}
@@ -121,7 +126,7 @@ class AdmissionControl:
                 (self._spectators.add if hello.kind == "spectator" else self._spectators.discard)((world, name))
                 self._scenes.setdefault(world, SceneId(hello.scene, hello.digest))
         self.refused += bool(reason)
-        return Welcome(reason, *self.scene_of(world))
+        return Welcome(reason, *self.scene_of(world), self._spectators_speak_to)
 
     def _find_objection(self, world: str, name: str, session: str, hello: Hello) -> str:
         """Why an actor cannot be admitted; empty if it can."""

@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import zenoh
 
+from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
@@ -65,6 +66,7 @@ class Server:
         state_folder: pathlib.Path | None = None,
         scene: SceneId | None = None,
         max_actors: int | None = None,
+        spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE,
         quota: Quota = Quota(),
         certificates: pathlib.Path | None = None,
         world: str = WORLD,
@@ -73,7 +75,8 @@ class Server:
 
         ``connect``: routers or servers to link to. A linked server only routes; of linked servers the one that connects
         to none admits and retains. ``state_folder``: folder of the journals; without one the state lives as long as the
-        server. ``scene``: the only one allowed. ``max_actors``: at a time. ``certificates``: folder of a server, see
+        server. ``scene``: the only one allowed. ``max_actors``: at a time. ``spectators_speak_to``:
+        who hears them. ``certificates``: folder of a server, see
         :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate. It is read
         again when its files change.
 
@@ -105,7 +108,7 @@ class Server:
         self.foreign = 0
         """Messages with records under the name of another session."""
         self._malformed = 0
-        self._admission = AdmissionControl(scene, max_actors)
+        self._admission = AdmissionControl(scene, max_actors, spectators_speak_to)
         self._lock = threading.Lock()
         self._session_lock = threading.Lock()
         """While the router is closed and opened again."""

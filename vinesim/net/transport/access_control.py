@@ -2,8 +2,8 @@
 
 Every actor has a certificate with its name as common name. It may subscribe to its whole world, query, and publish only
 under keys that end with its own name. A robot also offers its meshes to the server, under its own name. A spectator
-publishes only its presence, its hello and its viewpoint. The rules are applied by the router, so a foreign key ends
-there.
+publishes only its presence, its hello, its viewpoint and its voice. The rules are applied by the router, so a foreign
+key ends there.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class CertificateError(BusError):
     """A certificate or key is missing or unusable; the text names it."""
 
 
-FAMILIES = ("c", "tree", "near", "own", "fact", "voice")
+FAMILIES = ("c", "tree", "near", "own", "fact")
 """First chunks of keys ``FAMILY/<cx>/<cy>/<actor>``."""
 
 _EVERYTHING = [
@@ -135,6 +135,7 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         if role == Role.ROBOT:
             own.append(rule(f"{name} offers its meshes", "ingress", ["query"], f"{root}/offer/{name}"))
         written = (f"{root}/a/{name}", *(f"{root}/a/{name}/{layer}" for layer in ("far", "mid", "near")))
+        written += (f"{root}/voice/{name}", f"{root}/voice/{name}/pcm")
         if role != Role.SPECTATOR:
             written += (f"{root}/force/*/{name}", *(f"{root}/{family}/*/*/{name}" for family in FAMILIES))
         own.append(rule(f"{name} writes", "ingress", ["put", "delete"], *written))

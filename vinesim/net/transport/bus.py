@@ -14,6 +14,8 @@ import threading
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+from vinesim.audio.permission import SpectatorsSpeakTo
+
 KEEP_LAST_1 = 1
 """History depth that keeps the newest sample of each key: poses."""
 
@@ -136,6 +138,11 @@ class Bus(Protocol):
     def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
         """Ask all queryables that match ``key`` and wait for their replies, some seconds at most: not for the real-time
         loop. Any thread may call it; it delays no other message, and returns nothing if the network fails."""
+        ...
+
+    @property
+    def spectators_speak_to(self) -> SpectatorsSpeakTo:
+        """Who hears spectators in this world, as the server has said; people unless it has."""
         ...
 
     @property

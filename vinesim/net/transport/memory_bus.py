@@ -9,6 +9,7 @@ import random
 from collections.abc import Callable
 from typing import Self
 
+from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Reply, SampleStore, matches
 from vinesim.net.transport.name_holders import bound_name
 
@@ -37,6 +38,8 @@ class MemoryHub:
         """False: members may send and answer under the names of others, as if no bus checked it."""
         self.rejection_reason: Callable[[bytes], str] = lambda greeting: ""
         """Why the emulated server rejects a hello; empty: it admits the actor."""
+        self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
+        """What the emulated server says of them."""
         self._random = random.Random(seed)
         self._order = 0
         self._pending: list[tuple[float, int, Callable[[], None]]] = []
@@ -265,6 +268,10 @@ class MemoryBus:
 
     def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
         return self.hub.fetch(self.name, key, payload)
+
+    @property
+    def spectators_speak_to(self) -> SpectatorsSpeakTo:
+        return self.hub.spectators_speak_to
 
     @property
     def admissions(self) -> int:

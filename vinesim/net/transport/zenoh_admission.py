@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import zenoh
 
+from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.net.codec import messages
 from vinesim.net.transport.bus import JoinRejected
 from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, has_match
@@ -39,6 +40,8 @@ class ServerAdmission:
         """Empty, or why a server that was restarted rejects this actor."""
         self.count = 0
         """How often a server has admitted this actor."""
+        self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
+        """Who hears spectators, as the server that admitted this actor has said."""
         self._servers: frozenset[str] | None = None
         """The session that admitted this actor, if any did; None: it has not joined."""
         self._declared: list[object] = []
@@ -106,7 +109,10 @@ class ServerAdmission:
         known, routers = self._servers or frozenset(), {str(router) for router in self._session.info.routers_zid()}
         order = sorted(found, key=lambda zid: (zid not in routers, zid not in known, zid))
         self._servers = frozenset(order[:1]) or known
-        return [self._decode(found[zid]) for zid in order]
+        welcomes = [self._decode(found[zid]) for zid in order]
+        if welcomes and not welcomes[0].refused:
+            self.spectators_speak_to = welcomes[0].spectators_speak_to
+        return welcomes
 
     def _decode(self, answer: bytes) -> messages.Welcome:
         try:

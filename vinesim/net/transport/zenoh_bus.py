@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Self
 
 import zenoh
 
+from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.transport.access_control import tls_config
@@ -379,6 +380,10 @@ class ZenohBus:
             self.count_failure(error)
             return []
         return [payload.to_bytes() for payload in found if len(payload) <= messages.MAX_MESSAGE]
+
+    @property
+    def spectators_speak_to(self) -> SpectatorsSpeakTo:
+        return self._admission.spectators_speak_to
 
     @property
     def admissions(self) -> int:

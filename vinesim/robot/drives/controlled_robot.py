@@ -190,14 +190,14 @@ class Robot(RobotInstance):
 
     def command_lights(self, pattern: LightPattern, color: Sequence[float] | None = None) -> None:
         """Let the indicator lights show a pattern, in a ``color`` [3] of sRGB from 0 to 1, that of the pattern unless
-        given; see :class:`Lights`."""
+        given; whether it sounds stays as it was. See :class:`Lights`."""
         if color is None:
-            self.lights = Lights(pattern, USUAL_COLOR[pattern])
+            self.lights = Lights(pattern, USUAL_COLOR[pattern], self.lights.has_sound)
             return
         if len(color) != 3 or not all(0.0 <= part <= 1.0 for part in color):
             raise CommandError(f"{self.name}: colour of lights {list(color)}; give three numbers from 0 to 1")
         red, green, blue = (round(255.0 * part) for part in color)
-        self.lights = Lights(pattern, (red, green, blue))
+        self.lights = Lights(pattern, (red, green, blue), self.lights.has_sound)
 
     def _validated(self, values: Values, joints: Joints) -> tuple[np.ndarray, np.ndarray]:
         """Indices [k] and finite values [k], or :class:`CommandError`."""

@@ -21,9 +21,13 @@ from vinesim.ros.commands.types import (
     JointTrajectory,
     LightsColor,
     LightsPattern,
+    LoudspeakerSound,
 )
 from vinesim.ros.messages.convert import seconds
 from vinesim.scene.values import LightPattern
+
+MAX_SOUND = 960_000
+"""Bytes of sound in one message: half a minute."""
 
 
 class CommandError(ValueError):
@@ -54,6 +58,14 @@ def lights_color(message: ColorRGBA) -> LightsColor:
     if not all(0.0 <= part <= 1.0 for part in (*color, message.a)):
         raise CommandError(f"colour of lights {(*color, message.a)}; give four numbers from 0 to 1")
     return LightsColor(color if message.a > 0.0 else None)
+
+
+def loudspeaker_sound(message: Any) -> LoudspeakerSound:
+    """Sound for the loudspeaker: whole samples of PCM16, not more than half a minute."""
+    pcm = bytes(message.data)
+    if len(pcm) % 2 or len(pcm) > MAX_SOUND:
+        raise CommandError(f"sound of {len(pcm)} B; give PCM16 of 16 kHz, mono, at most {MAX_SOUND} B at a time")
+    return LoudspeakerSound(pcm)
 
 
 def _joint_values(message: Float64MultiArray, controller: str, joints: Sequence[str], *, nan: bool) -> np.ndarray:

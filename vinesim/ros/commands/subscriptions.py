@@ -12,7 +12,7 @@ from typing import Any
 import rclpy.node
 from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import ColorRGBA, Float64MultiArray, String
+from std_msgs.msg import Bool, ColorRGBA, Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory as JointTrajectoryMessage
 
 from vinesim.ros.commands import convert
@@ -24,6 +24,7 @@ from vinesim.ros.commands.types import (
     ImpedanceCommand,
     LightsColor,
     LightsPattern,
+    LightsSound,
 )
 from vinesim.ros.topic import RELIABLE
 from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
@@ -70,7 +71,7 @@ def _setpoint_key(command: Command) -> tuple[str, ...] | None:
     match command:
         case BaseVelocity():
             return ("base",)
-        case LightsPattern() | LightsColor():
+        case LightsPattern() | LightsColor() | LightsSound():
             return (type(command).__name__,)
         case ForwardCommand():
             return (command.controller,)
@@ -82,13 +83,17 @@ def _setpoint_key(command: Command) -> tuple[str, ...] | None:
 
 
 class CommandSubscriptions:
-    """The command topics of a base and of these ``controllers``."""
+    """The command topics of a base and of these ``controllers``. ``audio_data``: the message type of sound."""
 
-    def __init__(self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue) -> None:
+    def __init__(
+        self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue, audio_data: type
+    ) -> None:  # fmt: skip
         self._node, self._queue = node, queue
         self._subscribe(TwistStamped, "mobile_base_controller/cmd_vel", convert.base_velocity)
         self._subscribe(String, "indicator_lights/command", convert.lights_pattern)
         self._subscribe(ColorRGBA, "indicator_lights/color", convert.lights_color)
+        self._subscribe(Bool, "indicator_lights/sound", lambda message: LightsSound(message.data))
+        self._subscribe(audio_data, "speaker/audio", convert.loudspeaker_sound)
         for spec in controllers:
             self._subscribe_controller(spec.name, spec.kind, spec.joints)
 

@@ -116,6 +116,21 @@ class LightsColor:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class LightsSound:
+    """Whether a tone is heard while they are lit (std_msgs/Bool on indicator_lights/sound)."""
+
+    is_on: bool
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class LoudspeakerSound:
+    """Sound to be played behind what plays (audio_common_msgs/AudioData on speaker/audio)."""
+
+    pcm: bytes
+    """PCM16 of 16 kHz, mono."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class CancelGoal:
     """A goal is to end."""
 
@@ -131,6 +146,8 @@ Command = (
     | GripperGoal
     | LightsPattern
     | LightsColor
+    | LightsSound
+    | LoudspeakerSound
     | CancelGoal
 )
 

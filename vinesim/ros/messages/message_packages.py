@@ -87,6 +87,11 @@ def is_installed(package: str) -> bool:
     return mark.is_file() and json.loads(mark.read_text())["key"] == key(package)
 
 
+def is_built(package: str) -> bool:
+    """Whether the cache has a package built from the present definitions, which a client then imports from there."""
+    return _place(package).is_dir()
+
+
 def build(packages: Iterable[str]) -> dict[str, pathlib.Path]:
     """Build those packages that the cache lacks, side by side; returns the folder of each to put on ``sys.path``."""
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -100,7 +105,7 @@ def _build(package: str) -> pathlib.Path:
             f"message package {package!r} is not installed and vinesim ships no definitions of it; "
             f"source a ROS 2 that has it, or add its .msg files to {DEFINITIONS / package}"
         )
-    place = _cache() / f"{package}-{key(package)}"
+    place = _place(package)
     if place.is_dir():
         return place
     _check_toolchain(package)
@@ -129,6 +134,10 @@ def _build(package: str) -> pathlib.Path:
             if not place.is_dir():
                 raise
     return place
+
+
+def _place(package: str) -> pathlib.Path:
+    return _cache() / f"{package}-{key(package)}"
 
 
 def _cache() -> pathlib.Path:

@@ -32,7 +32,7 @@ from vinesim.scene.values.sensors import (
     LevelLaser,
     LidarScan,
 )
-from vinesim.scene.values.signals import INTENTIONS, Intention, LightPattern, Lights
+from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
@@ -41,6 +41,7 @@ __all__ = [
     "INTENTIONS",
     "MIN_BERRY_PIXELS",
     "POINT_NAMES",
+    "TONE_LEVEL",
     "Box",
     "BunchTruth",
     "CameraFrame",

@@ -27,6 +27,12 @@ class LightPattern(enum.IntEnum):
 FREQUENCY = {LightPattern.NOTIFICATION: 0.4, LightPattern.WARNING: 0.8, LightPattern.ALARM: 2.0}
 """[Hz] Flashes; slow ones are 0.4 to 0.8 Hz, normal ones 1.4 to 2.8 Hz (IEC 60073)."""
 
+TONE = {LightPattern.NOTIFICATION: 600.0, LightPattern.WARNING: 900.0, LightPattern.ALARM: 1500.0}
+"""[Hz] What is heard while a lamp is lit, if it sounds: within the 500 to 2500 Hz of danger signals (ISO 7731)."""
+
+TONE_LEVEL = 0.5
+"""Amplitude of that tone within 1 m. GUESSED."""
+
 USUAL_COLOR: dict[LightPattern, Color] = {
     LightPattern.OFF: UNLIT, LightPattern.NOTIFICATION: (255, 255, 255), LightPattern.WARNING: (255, 150, 0),
     LightPattern.ALARM: (255, 0, 0),
@@ -40,6 +46,8 @@ class Lights:
 
     pattern: LightPattern = LightPattern.OFF
     color: Color = UNLIT
+    has_sound: bool = False
+    """Whether a tone is heard while the lamps are lit; hearers make it, no sound crosses the network."""
 
     def shown(self, time: float) -> Color | None:
         """The colour at a time of the world [s], :data:`UNLIT` between flashes; None: off, as the URDF has them.
@@ -49,6 +57,10 @@ class Lights:
         if self.pattern is LightPattern.OFF:
             return None
         return self.color if time * FREQUENCY[self.pattern] % 1.0 < 0.5 else UNLIT
+
+    def tone(self, time: float) -> float:
+        """Frequency of the tone that is heard at a time of the world [s] [Hz]; 0: none."""
+        return TONE.get(self.pattern, 0.0) if self.has_sound and self.shown(time) != UNLIT else 0.0
 
 
 LIGHTS_OFF = Lights()

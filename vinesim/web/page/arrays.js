@@ -16,6 +16,6 @@ export function decode(buffer) {
 /** The message at a path of this server. */
 export async function load(path) {
   const response = await fetch(path);
-  if (!response.ok) throw new Error(`${path}: ${response.status} ${response.statusText}`);
+  if (!response.ok) throw Object.assign(new Error(`${path}: ${await response.text()}`), { status: response.status });
   return decode(await response.arrayBuffer());
 }

@@ -1,6 +1,6 @@
 // A person in a headset: WebXR poses of head and controllers, sticks to walk and turn, pulses for what the hands feel.
 
-import * as THREE from "three";
+import * as THREE from "./vendor/three.module.js";
 
 const WALK = 1.4, TURN = Math.PI / 6, DEAD = 0.25; // m/s, rad, share of a stick's way
 const HALF = Math.SQRT1_2;

@@ -1,13 +1,16 @@
 // The page: loads the vineyard, follows its states; a spectator flies, a person walks, reaches and may wear a headset.
 
-import * as THREE from "three";
+import * as THREE from "./vendor/three.module.js";
 import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
 import { Headset } from "./headset.js";
+import { Absence, say } from "./notices.js";
 import { DeskHand, WalkingEyes } from "./person.js";
+import { Voice } from "./voice.js";
 import { World } from "./world.js";
 
 const RETRY = 1000; // ms
+const SILENCE = 3; // s
 const SHADOW_PERIOD = 250; // ms
 const element = (id) => document.getElementById(id);
 
@@ -30,11 +33,13 @@ class Viewer {
     this.scene.add(this.rig);
     this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons);
     this.offerHeadset();
+    this.absence = new Absence();
     this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
     this.help.hidden = false;
     this.intention = "";
     this.offerIntentions(world.header.intentions);
     this.newest = null;
+    this.heardAt = performance.now();
     this.followed = -1;
     this.shadowAt = -1e9;
     this.lastFrame = performance.now();
@@ -65,6 +70,9 @@ class Viewer {
 
   async offerHeadset() {
     const button = element("enter");
+    if (!isSecureContext)
+      say("Headset and microphone need https: start the client with --page-lan, and open the address that it prints.",
+        { stays: true });
     button.hidden = !await navigator.xr?.isSessionSupported("immersive-vr");
     button.addEventListener("click", () => this.headset.enter(this.eyes.place, this.eyes.yaw).catch(fail));
   }
@@ -76,26 +84,34 @@ class Viewer {
     this.socket.onclose = () => setTimeout(() => this.reconnect(), RETRY);
   }
 
-  /** The client may have been started again, with another vineyard. */
+  /** The client may have been started again, with another vineyard or with this one at rest. */
   async reconnect() {
     element("state").textContent = "the client is gone; waiting for it ...";
     try {
       const header = await load("scene");
-      if (header.scene !== this.world.header.scene || header.seed !== this.world.header.seed) location.reload();
+      const { scene, seed, person } = this.world.header;
+      if (header.scene !== scene || header.seed !== seed || header.person !== person) location.reload();
+      this.world.rest(header.arrays.poses);
       this.world.rigidVersion = 0;
       this.connect();
-    } catch { setTimeout(() => this.reconnect(), RETRY); }
+    } catch (failure) {
+      if (failure.status === 403) fail("This address is no longer valid: open the one that the client has printed now.");
+      setTimeout(() => this.reconnect(), RETRY);
+    }
   }
 
   async take(state) {
     // poses of trees come once: those of a state that is overtaken before it is drawn count, too
     this.world.apply(state);
     this.newest = state;
+    this.heardAt = performance.now();
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
     this.headset.pulse(state.haptics);
     if (state.rigid !== this.world.rigidVersion && !this.loading) {
       this.loading = true;
-      try { this.world.setRigid(await load("rigid")); } finally { this.loading = false; }
+      const header = await load("rigid").catch(() => null); // a client that goes meanwhile is waited for by the socket
+      this.loading = false;
+      if (header !== null) this.world.setRigid(header);
     }
   }
 
@@ -132,6 +148,7 @@ class Viewer {
     else this.look(this.eyes.pose);
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
     const eye = new THREE.Vector3(...pose.slice(0, 3));
+    page.voice.listen(pose);
     this.world.list(eye);
     this.renderer.info.reset();
     if (now - this.shadowAt > SHADOW_PERIOD) {
@@ -143,11 +160,16 @@ class Viewer {
     Object.assign(page, { frames: page.frames + 1, calls: this.renderer.info.render.calls,
       triangles: this.renderer.info.render.triangles });
     this.label(actors);
+    const silence = (now - this.heardAt) / 1000;
+    if (this.socket.readyState === WebSocket.OPEN && silence > SILENCE)
+      element("state").textContent = `no news for ${silence.toFixed(0)} s: the client pauses, or does not answer`;
     if (this.newest !== null) {
       page.drawn += 1;
       page.tick = this.newest.tick;
       const said = `${this.world.header.scene}  ${this.newest.time.toFixed(1)} s  ${(1 / this.frame).toFixed(0)} frames/s`;
       element("state").textContent = said;
+      const isKnown = this.newest.rigid === this.world.rigidVersion;
+      this.absence.drawn(this.newest.time, this.world.picked, isKnown ? actors.map(({ name }) => name) : null);
       this.newest = null;
       if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(this.message(pose)));
     }
@@ -210,10 +232,13 @@ function fail(failure) {
 }
 
 addEventListener("unhandledrejection", (event) => fail(event.reason));
-addEventListener("error", (event) => fail(event.message));
+addEventListener("error", (event) => { if (event.message) fail(event.message); });
 
+if (window.pageMisses) throw new Error(window.pageMisses);
+page.voice = new Voice();
 const header = await load("scene");
 const world = new World(header);
 const budget = Number(new URLSearchParams(location.search).get("triangles"));
 if (budget > 0) world.budget = budget;
 page.viewer = new Viewer(world, [...header.arrays.start]);
+window.pageStarted();

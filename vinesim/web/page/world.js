@@ -1,6 +1,6 @@
 // The vineyard on the graphics card: primitives and poses in textures, one draw call for each kind and level of detail.
 
-import * as THREE from "three";
+import * as THREE from "./vendor/three.module.js";
 import { MESHES } from "./geometry.js";
 import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
 
@@ -31,11 +31,7 @@ export class World {
     this.surfaces = dataTexture(THREE.RGBAIntegerFormat, THREE.UnsignedIntType, Uint32Array, 4, this.rows, SURFACE_SHIFT);
     this.poses = dataTexture(THREE.RGBAFormat, THREE.FloatType, Float32Array, 4, this.carriers * 2, POSE_SHIFT);
     for (let k = 0; k < this.carriers; ++k) this.poses.image.data[8 * k + 7] = 1;
-    for (let k = 0; k < this.bodies; ++k) {
-      const pose = arrays.poses.subarray(7 * k, 7 * k + 7);
-      this.poses.image.data.set(pose.subarray(0, 3), 8 * k);
-      this.poses.image.data.set(pose.subarray(3), 8 * k + 4);
-    }
+    this.rest(arrays.poses);
     this.write(arrays, 0);
     this.plantClusters = clusters(arrays);
     this.rigidClusters = clusters({ first: [], size: [], kind: [], bunch: [], ball: [], shape: [], carrier: [] });
@@ -50,6 +46,16 @@ export class World {
     this.budget = TRIANGLE_BUDGET;
     this.makeMeshes(arrays);
     this.poses.needsUpdate = this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
+  }
+
+  /** All plants to their poses [7] at rest. */
+  rest(poses) {
+    for (let k = 0; k < this.bodies; ++k) {
+      const pose = poses.subarray(7 * k, 7 * k + 7);
+      this.poses.image.data.set(pose.subarray(0, 3), 8 * k);
+      this.poses.image.data.set(pose.subarray(3), 8 * k + 4);
+    }
+    this.poses.needsUpdate = true;
   }
 
   /** Rows of primitives into the textures, from a row on. */

@@ -1,0 +1,57 @@
+"""Frames of sound as they cross the network and the page's socket: 20 ms of mono, coded by Opus or as PCM16.
+
+An Opus frame is one packet with one frame of 20 ms (RFC 6716, section 3.1), PCM16 is 16 bit little-endian at
+:data:`SAMPLE_RATE`.
+"""
+
+from __future__ import annotations
+
+import enum
+
+import numpy as np
+
+SAMPLE_RATE = 16_000
+"""[Hz] Of PCM16, and of robots' microphones and loudspeakers: what speech recognition expects."""
+
+FRAME = 0.02
+"""[s] Sound in one frame."""
+
+FRAME_SAMPLES = 320
+"""Samples of a frame of PCM16."""
+
+MAX_OPUS = 800
+"""[B] Longest Opus packet; speech at 24 kbit/s has 60."""
+
+_OPUS_20_MS = frozenset((1, 5, 9, 13, 15, 19, 23, 27, 31))
+"""Configurations of Opus with frames of 20 ms (RFC 6716, table 2)."""
+
+
+class Codec(enum.IntEnum):
+    """How the sound of a frame is coded; the number crosses the network."""
+
+    OPUS = 1
+    PCM16 = 2
+
+
+def find_fault(codec: int, data: bytes) -> str:
+    """Why ``data`` is no frame of this codec; empty: it is one, as far as its length and first byte say."""
+    if codec == Codec.PCM16:
+        return "" if len(data) == 2 * FRAME_SAMPLES else f"PCM16 of {len(data)} B, not {2 * FRAME_SAMPLES}"
+    if codec != Codec.OPUS:
+        return f"unknown codec {codec}"
+    if not 1 <= len(data) <= MAX_OPUS:
+        return f"Opus packet of {len(data)} B, not 1 to {MAX_OPUS}"
+    configuration, channels, count = data[0] >> 3, 1 + (data[0] >> 2 & 1), data[0] & 3
+    if configuration not in _OPUS_20_MS or channels != 1 or count != 0:
+        return f"Opus packet that is not one frame of 20 ms of mono (first byte {data[0]})"
+    return ""
+
+
+def to_pcm(samples: np.ndarray) -> bytes:
+    """PCM16 of samples [n] from -1 to 1; clipped beyond."""
+    return np.round(np.clip(samples, -1.0, 1.0) * 32767.0).astype("<i2").tobytes()
+
+
+def from_pcm(data: bytes) -> np.ndarray:
+    """Samples [n] float32 from -1 to 1 of PCM16; an odd last byte is left out."""
+    return np.frombuffer(data, "<i2", len(data) // 2).astype(np.float32) / np.float32(32767.0)

@@ -1,0 +1,62 @@
+"""A robot's loudspeaker: plays what it is given, frame by frame, at the pace of time."""
+
+from __future__ import annotations
+
+import collections
+import threading
+from collections.abc import Iterator
+
+from vinesim.audio.frame import FRAME, FRAME_SAMPLES
+
+MAX_QUEUED = 30.0
+"""[s] Sound that waits to be played; more is refused."""
+
+PREPARATION = 0.06
+"""[s] Sound that must wait, or time that must pass, before it begins: so messages join without gaps."""
+
+_FRAME_BYTES = 2 * FRAME_SAMPLES
+
+
+class Loudspeaker:
+    """Takes PCM16 of any length, from any thread, and gives it out in frames; the last one ends with silence."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        """Bytes that found no room."""
+        self._waiting: collections.deque[bytes] = collections.deque()
+        self._rest = b""
+        self._due: float | None = None
+        """[s] When the next frame begins; None: it is silent."""
+        self._waits_since: float | None = None
+        """[s] When the sound that has not begun yet was first seen."""
+        self._lock = threading.Lock()
+
+    def play(self, pcm: bytes) -> None:
+        """Play PCM16 behind what waits."""
+        with self._lock:
+            room = round(MAX_QUEUED / FRAME) * _FRAME_BYTES - len(self._waiting) * _FRAME_BYTES - len(self._rest)
+            self.refused += max(len(pcm) - max(room, 0), 0)
+            data = self._rest + pcm[: max(room, 0)]
+            whole = len(data) - len(data) % _FRAME_BYTES
+            self._waiting.extend(data[at : at + _FRAME_BYTES] for at in range(0, whole, _FRAME_BYTES))
+            self._rest = data[whole:]
+
+    def frames(self, now: float) -> Iterator[tuple[float, bytes]]:
+        """Frames that were played until ``now`` [s], and when each began; the first begins a frame before ``now``."""
+        with self._lock:
+            if self._due is None and (self._waiting or self._rest):
+                self._waits_since = now if self._waits_since is None else self._waits_since
+                enough = len(self._waiting) * FRAME >= PREPARATION
+                if not enough and 0.0 <= now - self._waits_since < PREPARATION:
+                    return
+                self._due, self._waits_since = now - FRAME, None
+            while self._due is not None and self._due + FRAME <= now + 1e-9:
+                if self._waiting:
+                    data = self._waiting.popleft()
+                elif self._rest:
+                    data, self._rest = self._rest.ljust(_FRAME_BYTES, b"\0"), b""
+                else:
+                    self._due = None
+                    return
+                began, self._due = self._due, self._due + FRAME
+                yield began, data

@@ -1,0 +1,184 @@
+"""What a microphone records: the sum of all voices and tones near it, each by its loudness there, in blocks of 20 ms.
+
+Frames of sound are stamped with the network time at which they began. A block is recorded :attr:`Microphone.delay`
+after its end, so that frames that are under way still reach it; one that comes too late is counted, and the delay
+grows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from vinesim.audio import opus
+from vinesim.audio.frame import FRAME, FRAME_SAMPLES, SAMPLE_RATE, Codec, from_pcm
+
+DELAY = 0.06
+"""[s] From the end of a block until it is recorded, at first."""
+
+MAX_DELAY = 0.3
+"""[s] The same at most; voices may be 500 ms late (CANOPIES D6.4, section 5.5)."""
+
+MAX_CONCEALED = 3
+"""Lost frames in a row that are filled with the one before."""
+
+CAPACITY = 2.0
+"""[s] Sound that is stored; what is stamped later than this after the present is not of it."""
+
+MAX_SPEAKERS = 64
+"""Voices that are followed at a time; the one that has been silent for longest is forgotten."""
+
+_RING = round(CAPACITY * SAMPLE_RATE)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class HeardFrame:
+    """A frame of sound as it reaches one hearer."""
+
+    speaker: str
+    number: int
+    """Of the frame, counted by the speaker, modulo 65,536."""
+    time: float
+    """[s] of the network, when it began."""
+    codec: Codec
+    data: bytes
+    gain: float
+    """Amplitude at the hearer, relative to that at the speaker."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Block:
+    """Recorded sound."""
+
+    time: float
+    """[s] of the network, of the first sample."""
+    samples: np.ndarray
+    """[:data:`FRAME_SAMPLES`] float32; louder sounds go beyond 1"""
+
+
+@dataclasses.dataclass(slots=True)
+class _Voice:
+    """What is known of one speaker."""
+
+    number: int
+    end: int
+    """Sample after the last one."""
+    gain: float
+    last: np.ndarray
+    decoder: opus.OpusDecoder | None = None
+
+
+class Microphone:
+    """Mixes sound; not for several threads."""
+
+    def __init__(self) -> None:
+        self.delay = DELAY
+        """[s] From the end of a block until it is recorded."""
+        self.lost = 0
+        """Frames that never came."""
+        self.late = 0
+        """Frames that came when their block had been recorded."""
+        self.undecoded = 0
+        """Frames that could not be decoded."""
+        self._mix = np.zeros(_RING, np.float32)
+        self._next: int | None = None
+        """First sample of the next block; None: nothing was recorded."""
+        self._voices: dict[str, _Voice] = {}
+        self._tones: dict[str, tuple[int, float, float]] = {}
+        """Sample up to which a tone is mixed, its amplitude there and its frequency [Hz]."""
+
+    def hear(self, frame: HeardFrame) -> None:
+        """Mix a frame that has arrived."""
+        voice = self._voices.pop(frame.speaker, None)
+        step = 1 if voice is None else (frame.number - voice.number) % 65536
+        if voice is not None and not 0 < step < 32768:  # twice, or overtaken
+            self._voices[frame.speaker] = voice
+            self.late += step != 0
+            return
+        samples, decoder = self._decode(frame, None if voice is None else voice.decoder)
+        if samples is None:
+            self.undecoded += 1
+            if voice is not None:
+                self._voices[frame.speaker] = voice
+            return
+        start = round(frame.time * SAMPLE_RATE)
+        before = frame.gain if voice is None else voice.gain
+        if voice is not None:
+            self.lost += step - 1
+            if abs(start - voice.end) <= 2:
+                start = voice.end
+            if 0 < voice.end - start < SAMPLE_RATE:  # a voice does not add to itself
+                self.late += 1
+                self._voices[frame.speaker] = dataclasses.replace(voice, number=frame.number, decoder=decoder)
+                return
+            missing = start - voice.end
+            if 1 < step <= 1 + MAX_CONCEALED and missing > 0:
+                self._conceal(voice, missing)
+        ramp = np.linspace(before, frame.gain, len(samples), dtype=np.float32)
+        if not self._add(start, samples * ramp):
+            self.late += 1
+            self.delay = min(self.delay + FRAME, MAX_DELAY)
+        if len(self._voices) >= MAX_SPEAKERS:
+            del self._voices[next(iter(self._voices))]
+        self._voices[frame.speaker] = _Voice(frame.number, start + len(samples), frame.gain, samples, decoder)
+
+    def sound(self, source: str, frequency: float, gain: float, now: float) -> None:
+        """Mix a tone of ``frequency`` [Hz] up to ``now`` [s] of the network, from where it was mixed before; its
+        amplitude goes from what it was to ``gain``. Frequency 0: it ends."""
+        end = round(now * SAMPLE_RATE)
+        start, before, last = self._tones.pop(source, (end, 0.0, frequency))
+        if start < end - 2 * FRAME_SAMPLES:  # it was not heard for a while
+            start, before = end - 2 * FRAME_SAMPLES, 0.0
+        frequency = frequency or last
+        if end > start and (gain or before):
+            time = np.arange(start, end)
+            wave = np.sin(2.0 * np.pi * (frequency * time / SAMPLE_RATE % 1.0))
+            self._add(start, (wave * np.linspace(before, gain, len(time))).astype(np.float32))
+        if len(self._tones) >= MAX_SPEAKERS:
+            del self._tones[next(iter(self._tones))]
+        self._tones[source] = end, gain, frequency
+
+    def blocks(self, now: float) -> Iterator[Block]:
+        """Blocks that are complete at ``now`` [s] of the network."""
+        ready = int((now - self.delay) * SAMPLE_RATE)
+        if self._next is None or not self._next - _RING < ready < self._next + _RING // 2:
+            self._mix[:] = 0.0  # the first, or the clock was set
+            self._voices.clear()
+            self._next = ready - ready % FRAME_SAMPLES
+        while self._next + FRAME_SAMPLES <= ready:
+            rows = np.arange(self._next, self._next + FRAME_SAMPLES) % _RING
+            samples = self._mix[rows]
+            self._mix[rows] = 0.0
+            yield Block(self._next / SAMPLE_RATE, samples)
+            self._next += FRAME_SAMPLES
+
+    def _add(self, start: int, samples: np.ndarray) -> bool:
+        """Add samples at their place; whether all of them were in time."""
+        if self._next is None:
+            return True
+        skip = max(self._next - start, 0)
+        end = start + len(samples)
+        if skip >= len(samples) or end > self._next + _RING:
+            return False
+        self._mix[np.arange(start + skip, end) % _RING] += samples[skip:]
+        return skip == 0
+
+    def _conceal(self, voice: _Voice, count: int) -> None:
+        """Fill ``count`` samples that were lost with the last frame, fading."""
+        count = min(count, MAX_CONCEALED * FRAME_SAMPLES)
+        filled = np.resize(voice.last, count) * np.linspace(voice.gain, 0.0, count, dtype=np.float32)
+        self._add(voice.end, filled)
+
+    def _decode(
+        self, frame: HeardFrame, decoder: opus.OpusDecoder | None
+    ) -> tuple[np.ndarray | None, opus.OpusDecoder | None]:  # fmt: skip
+        """Samples of a frame, None if it cannot be decoded; the decoder of that speaker."""
+        if frame.codec is Codec.PCM16:
+            return from_pcm(frame.data), decoder
+        if decoder is None:
+            if not opus.is_available():
+                return None, None
+            decoder = opus.OpusDecoder()
+        return decoder.decode(frame.data), decoder

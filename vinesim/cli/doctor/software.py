@@ -1,0 +1,173 @@
+"""Checks of what is installed and kept: Python, packages, ROS 2, the page, certificates, caches."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import pathlib
+import platform
+import sys
+import tempfile
+from collections.abc import Iterable
+
+import vinesim
+from vinesim import disk_cache
+from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding, amount, size_of
+
+FREE_SPACE = 1 << 30
+"""[B] Compiled kernels and tables take up to this."""
+EXTRAS = {
+    "ros": "ROS 2", "web": "the page in a browser", "tls": "certificates", "tune": "fits",
+    "tiago": "the robot tiago_pro", "perception": "point clouds from depth", "voice": "voices",
+}  # fmt: skip
+"""Extras of the package that users install, and what for."""
+
+
+def python(version: tuple[int, ...] = sys.version_info[:3]) -> Finding:
+    """The interpreter's version, as the package demands it."""
+    found = f"{'.'.join(map(str, version))} ({sys.executable})"
+    try:
+        from packaging.specifiers import SpecifierSet
+
+        wanted = importlib.metadata.metadata("vinesim")["Requires-Python"]
+    except (importlib.metadata.PackageNotFoundError, ImportError):
+        return Finding(
+            "python", ERROR, f"{found}; the package vinesim is not installed, only found", "pip install --editable ."
+        )
+    if ".".join(map(str, version)) not in SpecifierSet(wanted):
+        return Finding("python", ERROR, found, f"vinesim needs {wanted}: make a venv with another Python")
+    return Finding("python", OK, f"{found}, vinesim {vinesim.__version__}, {platform.system()} {platform.release()}")
+
+
+def packages(requirements: Iterable[str] | None = None) -> Finding:
+    """Versions of all packages that vinesim cannot do without, and which extras are complete."""
+    from packaging.requirements import Requirement
+
+    given = importlib.metadata.requires("vinesim") if requirements is None else requirements
+    wanted = [Requirement(text) for text in given or ()]
+    needed = [one for one in wanted if one.marker is None or one.marker.evaluate({"extra": ""})]
+    faults = [fault for one in needed if (fault := _fault(one))]
+    if faults:
+        return Finding("packages", ERROR, ", ".join(faults), "pip install --upgrade vinesim, in this environment")
+    states = []
+    for extra, purpose in EXTRAS.items():
+        parts = [one for one in wanted if one.marker is not None and one.marker.evaluate({"extra": extra})]
+        parts = [one for one in parts if one not in needed]
+        if any(_fault(one) for one in parts):
+            states.append(f"{extra} ({purpose})")
+    found = f"all {len(needed)} that are needed" + (f"; not complete: {', '.join(states)}" if states else "")
+    return Finding("packages", OK, found, f"if wanted: pip install 'vinesim[{states[0].split()[0]}]'" if states else "")
+
+
+def _fault(wanted) -> str:  # a packaging.requirements.Requirement
+    """Why an installed package does not fit; empty if it does."""
+    try:
+        version = importlib.metadata.version(wanted.name)
+    except importlib.metadata.PackageNotFoundError:
+        return f"{wanted.name} is missing"
+    return (
+        ""
+        if wanted.specifier.contains(version, prereleases=True)
+        else f"{wanted.name} {version} is not {wanted.specifier}"
+    )
+
+
+def ros() -> Finding:
+    """Whether this process could use ROS 2, and with which message packages."""
+    from vinesim.ros import middleware
+
+    if (reason := middleware.unavailable_reason()) is not None:
+        reason, _, remedy = reason.rpartition("; ")
+        return Finding("ros", WARNING, reason, f"{remedy}; robots run without topics until then")
+    from vinesim.ros.messages import message_packages as messages
+
+    missing = [
+        package for package in messages.available_packages()
+        if messages.place_of_official(package) is None
+        and not messages.is_installed(package) and not messages.is_built(package)
+    ]  # fmt: skip
+    domain = os.environ.get("ROS_DOMAIN_ID", "0")
+    found = f"{middleware.WHEEL_MIDDLEWARE if _wheels() else os.environ.get('ROS_DISTRO', '?')}, domain {domain}"
+    if not missing:
+        return Finding("ros", OK, f"{found}, all message packages")
+    return Finding(
+        "ros", WARNING, f"{found}, without messages of {', '.join(missing)}",
+        "vinesim ros build-interfaces (needs g++); a client does so at its first start",
+    )  # fmt: skip
+
+
+def _wheels() -> bool:
+    return importlib.util.find_spec("ros_wheels_bootstrapper") is not None
+
+
+def page() -> Finding:
+    """Whether people and spectators get their page."""
+    from vinesim.web import page_files
+
+    if (text := page_files.missing()) is not None:
+        found, _, remedy = text.partition(": ")
+        return Finding("page", WARNING, found, f"{remedy}; people and spectators have no page until then")
+    return Finding("page", OK, f"aiohttp {importlib.metadata.version('aiohttp')} and three.js are there")
+
+
+def certificates(folders: Iterable[pathlib.Path] | None = None) -> Finding:
+    """Certificates of the page and of ``certs/``: whether they are readable, and until when they are valid."""
+    from vinesim.net.transport import certificates as certs
+    from vinesim.net.transport.access_control import CertificateError
+
+    if importlib.util.find_spec("cryptography") is None:
+        return Finding(
+            "certificates", WARNING, "cryptography is missing", "pip install 'vinesim[tls]', for --tls and --page-lan"
+        )
+    places = (disk_cache.folder() / "page-certificate", pathlib.Path("certs")) if folders is None else folders
+    read = []
+    for folder in filter(pathlib.Path.is_dir, places):
+        try:
+            if soon := certs.expiring(folder):
+                return Finding("certificates", WARNING, *soon[0].split(", and refused afterwards: "))
+            for name in certs.roles(folder):
+                if (folder / f"{name}.key").exists():
+                    certs.check(folder, name)
+        except (CertificateError, OSError) as error:
+            found, _, remedy = str(error).partition(": ")
+            return Finding("certificates", WARNING, found, remedy or "remove that folder")
+        read.append(str(folder))
+    if not read:
+        return Finding("certificates", OK, "none yet; --page-lan and 'vinesim certs new' make them")
+    return Finding("certificates", OK, f"valid for more than {certs.WARNING_DAYS} days: {', '.join(read)}")
+
+
+def caches() -> Finding:
+    """Folders of compiled kernels and of tables: size, whether they can be written, whether there is room."""
+    tables, kernels = disk_cache.folder(), kernel_folder()
+    sizes = [f"kernels {amount(size_of(kernels))} in {kernels}", f"tables {amount(size_of(tables))} in {tables}"]
+    found = ", ".join(sizes)
+    for folder, variable in ((kernels, "WARP_CACHE_PATH"), (tables, "VINESIM_CACHE")):
+        if (fault := _write_fault(folder)) is not None:
+            return Finding(
+                "caches", WARNING, f"{folder}: {fault}",
+                f"set {variable} to a folder that can be written; every start computes anew until then",
+            )  # fmt: skip
+    return Finding("caches", OK, found)
+
+
+def kernel_folder() -> pathlib.Path:
+    """Where Warp keeps compiled kernels of all its versions; Warp itself would make the folder."""
+    chosen = os.environ.get("WARP_CACHE_PATH")
+    return pathlib.Path(chosen) if chosen else disk_cache.user_folder() / "warp"
+
+
+def _write_fault(folder: pathlib.Path) -> str | None:
+    """Why a file cannot be written in a folder, which need not exist yet; None if it can."""
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"x")
+        room = os.statvfs(folder) if hasattr(os, "statvfs") else None
+    except OSError as error:
+        return error.strerror or str(error)
+    if room is not None and room.f_bavail * room.f_frsize < FREE_SPACE:
+        return f"only {amount(room.f_bavail * room.f_frsize)} free"
+    return None

@@ -1,0 +1,38 @@
+"""Wire format of a frame of sound: header with the speaker's count of frames and the time it began, codec, sound."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from vinesim.audio.frame import Codec, find_fault
+from vinesim.net.codec.header import HEADER, MessageError, MessageKind, pack_header, unpack_header
+
+
+class VoiceFrame(NamedTuple):
+    """20 ms of an actor's voice, or of a robot's loudspeaker."""
+
+    number: int
+    """Counted by the speaker, modulo 65,536."""
+    time: float
+    """Network time when it began [s]."""
+    codec: Codec
+    data: bytes
+
+
+def encode_voice(frame: VoiceFrame) -> bytes:
+    """Encode a frame: 15 bytes and the sound. Raises :class:`MessageError` for what :func:`find_fault` finds."""
+    if fault := find_fault(frame.codec, frame.data):
+        raise MessageError(fault)
+    header = pack_header(MessageKind.VOICE, frame.number % 65536, frame.time)
+    return b"".join((header, bytes((frame.codec,)), frame.data))
+
+
+def decode_voice(payload: bytes) -> VoiceFrame:
+    """Decode a frame; whether the sound itself can be decoded shows when it is played."""
+    number, time = unpack_header(payload, MessageKind.VOICE, "frame of sound")
+    if len(payload) <= HEADER.size:
+        raise MessageError(f"frame of sound of {len(payload)} B without a codec")
+    codec, data = payload[HEADER.size], payload[HEADER.size + 1 :]
+    if fault := find_fault(codec, data):
+        raise MessageError(f"frame of sound: {fault}")
+    return VoiceFrame(number, time, Codec(codec), data)

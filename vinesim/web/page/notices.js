@@ -1,0 +1,48 @@
+// Sentences for the user: what happened while nothing was drawn, and what this address cannot offer.
+
+const SHOWN_FOR = 12_000; // ms
+/** Show a sentence for a while, or until it is clicked. */
+export function say(text, { stays = false } = {}) {
+  const notice = document.createElement("div");
+  notice.className = "panel";
+  notice.textContent = text;
+  document.getElementById("notices").append(notice);
+  notice.addEventListener("click", () => notice.remove());
+  if (!stays) setTimeout(() => notice.remove(), SHOWN_FOR);
+}
+
+/** Compares what was there before a gap with what is there after it, and says so. */
+export class Absence {
+  constructor() {
+    this.known = null; // before the newest picture: time, picked bunches, actors
+    this.before = null; // before a gap that was not told of yet
+    this.told = []; // sentences so far
+    this.long = 3; // a longer time of the world between two pictures is told of [s]
+  }
+
+  /** The next jump of time was asked for. */
+  expect() { this.known = null; }
+
+  /** A picture was drawn at a time of the world [s]; `picked` bunches and names of `actors`, null: not known yet. */
+  drawn(time, picked, actors) {
+    const { known } = this;
+    if (known !== null && this.before === null && (time < known.time || time > known.time + this.long)) this.before = known;
+    if (actors === null) {
+      if (known !== null) known.time = time;
+      return;
+    }
+    this.known = { time, picked: new Set(picked), actors };
+    if (this.before === null) return;
+    const { before } = this, was = new Set(before.actors), is = new Set(actors);
+    this.before = null;
+    const found = [];
+    const count = [...picked].filter((bunch) => !before.picked.has(bunch)).length;
+    if (count) found.push(count === 1 ? "1 bunch was picked" : `${count} bunches were picked`);
+    found.push(...actors.filter((name) => !was.has(name)).map((name) => `${name} came`));
+    found.push(...before.actors.filter((name) => !is.has(name)).map((name) => `${name} left`));
+    const length = time - before.time;
+    const what = length < 0 ? "The client was started again" : `${length.toFixed(1)} s of the vineyard passed unseen`;
+    this.told.push(`${what}${found.length ? `: ${found.join(", ")}` : ""}.`);
+    say(this.told.at(-1));
+  }
+}
