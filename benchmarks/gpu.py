@@ -23,8 +23,8 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.contact.resident_contacts import ResidentContacts
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
@@ -37,7 +37,7 @@ BARS = ((0.3, 1.975), (0.6, 1.9), (0.85, 1.75))
 """[m] x, z of the bars that the canes fall on."""
 BAR_RADIUS = 0.012
 SWEEPS = 20
-"""Largest number of sweeps: a GPU waits for the tree that takes most. One in two hundred does not converge in so many."""
+"""Largest number of sweeps: a GPU waits for the tree that takes most."""
 PEERS = ("discrete", "implicitfast")
 """Integrators of mujoco-warp."""
 CONTACT_CLOCK = 300
@@ -250,7 +250,7 @@ def main() -> None:
     ask.add_argument("--contacts", action="store_true", help="only with contacts")
     given = ask.parse_args()
     if given.reference:
-        np.savez_compressed(given.reference, **trajectory("cpu"), **contact_trajectory("cpu"))
+        np.savez_compressed(given.reference, allow_pickle=False, **trajectory("cpu"), **contact_trajectory("cpu"))
         return
     query = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
     name = driver = "none"

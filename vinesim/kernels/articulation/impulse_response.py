@@ -207,6 +207,4 @@ def apply_wrenches(
     trees: [thread] which tree. body_wrench: [body] N, N m at the origin, world axes; with dt = 1 an impulse, N s, N m s.
     prediction_out: accelerations and joint rates grow; ``body_qd_free`` stays. work_out, scratch_out.Du: scratch.
     """
-    apply_tree_wrenches(
-        trees[wp.tid()], dt, model, body_wrench, factors, work_out, scratch_out, prediction_out
-    )
+    apply_tree_wrenches(trees[wp.tid()], dt, model, body_wrench, factors, work_out, scratch_out, prediction_out)

@@ -67,9 +67,7 @@ def row_residual(row: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts,
 
 
 @wp.func
-def tangential_eigenvalue(
-    c: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows
-):
+def tangential_eigenvalue(c: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows):
     """The larger eigenvalue [1/kg] of the tangential block of a contact, compliance included: a step of friction by the
     residual over it stays inside the cone's convergence."""
     u = 3 * c + 1

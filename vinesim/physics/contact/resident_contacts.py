@@ -2,7 +2,8 @@
 
 For batches: every tree is a world of its own, so trees do not touch each other, and nothing they touch moves. Then the
 contacts of a tree are one island, nothing has to come back to the host between steps, and on a GPU a tree is a thread.
-Detection, rows, Delassus matrix and solve are the functions of :class:`vinesim.physics.contact.contact_solver.ContactSolver`.
+Detection, rows, Delassus matrix and solve are the functions that
+:class:`vinesim.physics.contact.contact_solver.ContactSolver` launches.
 """
 
 from __future__ import annotations
@@ -68,7 +69,9 @@ class ResidentContacts:
     def _check(self, rigid: RigidWorld) -> None:
         plants = self.plants
         if plants.dt != self.parameters.dt:
-            raise ValueError(f"dt {self.parameters.dt} s of the contacts, {plants.dt} s of the plants: must be the same")
+            raise ValueError(
+                f"dt {self.parameters.dt} s of the contacts, {plants.dt} s of the plants: must be the same"
+            )
         if len(plants.awake) < self._trees or plants.state.body_cut.any():
             raise ValueError("trees that sleep or were cut: wake all, and leave them whole")
         plants.upload()
@@ -110,6 +113,7 @@ class ResidentContacts:
         self._capsule_states = self._allocated(
             structs.CapsuleStates, dict.fromkeys(structs.CapsuleStates.vars, self._capsule_count), {}
         )
+
     def _interleaved(self, capsules: SharedArrays) -> Any:
         """The capsules on the device, capsule i of a tree at ``i * trees + tree``; -1 as the body of what is none."""
         start = capsules.tree_start
@@ -135,7 +139,7 @@ class ResidentContacts:
         return wp.zeros(shape, dtype=dtype, device=self._device)
 
     def _take_over_geoms(self, rigid: RigidArrays) -> None:
-        """The static geoms, with the boxes around them and around blocks of them; the ground reaches down without end."""
+        """The static geoms, with boxes around them and around blocks of them; the ground reaches down without end."""
         device = self._device
         self._geoms = self._on_device(structs.Geoms, rigid.geoms.struct)
         self._rigid_bodies = self._on_device(structs.RigidBodies, rigid.bodies.struct)
@@ -174,9 +178,7 @@ class ResidentContacts:
         self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("block", "place"), slots), {})
         self.contacts.place.assign(np.arange(slots, dtype=np.int32))
         of_rows = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
-        self.rows = self._allocated(
-            structs.Rows, of_rows | {"delassus": trees * rows * rows}, {"plant_jacobian": 12}
-        )
+        self.rows = self._allocated(structs.Rows, of_rows | {"delassus": trees * rows * rows}, {"plant_jacobian": 12})
         of_rows = dict.fromkeys(("columns", "impulse_first", "impulse_before", "direction"), trees * rows)
         self._scratch = self._allocated(structs.SolverScratch, of_rows | {"matrix": trees * rows * rows}, {})
         of_all = dict.fromkeys(structs.WarmStart.vars, trees * slots) | {"count": trees}
@@ -204,7 +206,7 @@ class ResidentContacts:
         model, forces, joints = fill(s.ArticulationModel), fill(s.AppliedForces), fill(s.JointState)
         bodies, factors = fill(s.BodyState), fill(s.Factors)
         scratch, prediction, work = fill(s.Scratch), fill(s.Prediction), fill(s.WrenchScratch)
-        onset, contacts = self.plants.contact_onset_steps, self._tree_contacts
+        onset, contacts = self.plants.onset_steps, self._tree_contacts
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
             block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK

@@ -105,7 +105,7 @@ class ArticulationSolver:
         if self.thread_pool is not None:
             weakref.finalize(self, self.thread_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
-        self._onset_steps = numbers["contact_steps"] - 1
+        self.onset_steps = numbers["contact_steps"] - 1  # with phi = 1 after contact began
         self.launches = KernelLaunches(self, numbers, threads, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
         self._runner = StepRunner(
@@ -356,7 +356,7 @@ class ArticulationSolver:
             launches.upload_wrenches(count)
             launches.apply_wrenches(len(touched))
             begun = touched[self._last_contact[touched] < self.tick - 1]
-            self._euler_steps[begun] = np.maximum(self._euler_steps[begun], self._onset_steps + 1)  # this step counts
+            self._euler_steps[begun] = np.maximum(self._euler_steps[begun], self.onset_steps + 1)  # this step counts
             self._last_contact[touched] = self.tick
         elif len(loaded):
             launches.upload_wrenches(count)
@@ -364,11 +364,6 @@ class ArticulationSolver:
         launches.download_joints(count)
         self.buffers.synchronize()
         self.tick += 1
-
-    @property
-    def contact_onset_steps(self) -> int:
-        """Steps with phi = 1 after contact began, the first one not counted."""
-        return self._onset_steps
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
@@ -379,13 +374,11 @@ class ArticulationSolver:
         return self.buffers.slots[roots], self.model.body_tree[roots]
 
     def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
-        """Many steps of the awake trees with nothing in between: no contacts (but those that ``between`` launches, see
-        :class:`vinesim.physics.contact.resident_contacts.ResidentContacts`), no sleep, no fault guard.
+        """Many steps of the awake trees: no sleep, no fault guard, no contacts but what ``between`` launches.
 
         Threads part once for all of them. A GPU works on its own copies meanwhile: :meth:`upload` before and
-        :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free`` and
-        ``acceleration`` are of the last step; a tree that went wrong stays where it was (``tree_rate`` is NaN or above
-        ``fault_rate``).
+        :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free``, ``acceleration``
+        are of the last step; a tree that went wrong stays where it was (``tree_rate`` NaN or above ``fault_rate``).
         """
         self._runner.list_trees(self._awake)
         floating = self._floating_roots()
@@ -414,7 +407,7 @@ class ArticulationSolver:
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
         """Use phi = 1 for ``contact_onset_duration``: trees about to be touched (``integrate()`` sees to touched)."""
-        self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self._onset_steps)
+        self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self.onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
         """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""

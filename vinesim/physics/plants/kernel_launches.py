@@ -24,8 +24,8 @@ from vinesim.kernels.articulation.impulse_response import apply_wrenches, impuls
 from vinesim.kernels.articulation.integration import integrate
 from vinesim.kernels.articulation.joint_wrench import joint_wrench
 from vinesim.kernels.articulation.kinematics import forward_kinematics
-from vinesim.kernels.articulation.lean_prediction import predict_lean
 from vinesim.kernels.articulation.lane_records import LANES, RECORD
+from vinesim.kernels.articulation.lean_prediction import predict_lean
 from vinesim.kernels.articulation.prediction import predict
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.parameters import PhysicsParameters
