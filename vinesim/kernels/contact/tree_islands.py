@@ -395,10 +395,10 @@ def apply_contact_wrenches(
     onset_steps: int,
     # in
     tree_contacts: TreeContacts,
-    was_in_contact: wp.array(dtype=wp.bool),
     body_wrench: wp.array(dtype=wp.spatial_vector),
     factors: Factors,
     # out
+    was_in_contact_out: wp.array(dtype=wp.bool),
     tree_euler_steps_out: wp.array(dtype=wp.int32),
     work_out: WrenchScratch,
     scratch_out: Scratch,
@@ -406,13 +406,13 @@ def apply_contact_wrenches(
 ):
     """One thread adds to the prediction of one tree what its contacts do over the step.
 
-    was_in_contact: [tree] whether it was in contact in the last step; brought up to date. A tree whose contact begins
+    was_in_contact_out: [tree] whether it was in contact in the last step; brought up to date. A tree whose contact begins
     takes ``onset_steps`` backward Euler steps, this one included.
     """
     tree = wp.tid()
     is_in_contact = tree_contacts.count[tree] > 0
     if is_in_contact:
-        if not was_in_contact[tree]:
+        if not was_in_contact_out[tree]:
             tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], onset_steps + 1)
         apply_tree_wrenches(tree, dt, model, body_wrench, factors, work_out, scratch_out, prediction_out)
-    was_in_contact[tree] = is_in_contact
+    was_in_contact_out[tree] = is_in_contact

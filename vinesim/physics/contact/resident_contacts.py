@@ -229,7 +229,7 @@ class ResidentContacts:
                   p.solver_tolerance, parameters, geoms, trees, self._rigid_bodies, contacts, self.contacts,
                   self.islands, self._scratch, self.rows, self._warm_start, arrays["body_wrench"]),
             bound(tree_islands.apply_contact_wrenches, trees, self.plants.dt, model, onset, contacts,
-                  self._was_in_contact, arrays["body_wrench"], factors, arrays["tree_euler_steps"], work, scratch,
+                  arrays["body_wrench"], factors, self._was_in_contact, arrays["tree_euler_steps"], work, scratch,
                   prediction),
         ]  # fmt: skip
 
