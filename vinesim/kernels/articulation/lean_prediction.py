@@ -69,6 +69,65 @@ def place_bodies(
 
 
 @wp.func
+def applied_terms(
+    k: int,
+    tree: int,
+    p: SolverParameters,
+    phi: float,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    joints: JointState,
+    pose: wp.transform,
+    motion: wp.spatial_vector,
+    axes: wp.quat,
+    q: wp.quat,
+    stiffness: wp.vec3,
+    damping: wp.vec3,
+):
+    """Implicit inertia J, H, M of body k, its bias and its tension: its own, of drag and of its ties."""
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+    com = rotation * model.body_com[k]
+    inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+    falls = float(0.0)
+    fall = wp.vec3()
+    root = model.body_root[k]
+    if root >= 0:
+        falls = 1.0
+        fall = joints.joint_xd[root]
+    load = forces.body_load[k]
+    if model.body_parent[k] < 0:
+        load = load + wp.spatial_vector(
+            wp.vec3(),
+            turned_rest_moment(
+                p.dt, phi, axes, q, stiffness, damping, forces.root_turn[tree], forces.root_turn_rate[tree]
+            ),
+        )  # fmt: skip
+    J, H, M, bias, tension, _steady = own_terms(
+        p, phi, motion, model.body_mass[k], com, inertia, load, wp.spatial_top(forces.body_wrench[k]), falls, fall
+    )
+    area = model.body_drag[k]
+    if area > 0.0:
+        J_more, H_more, M_more, bias_more, tension_more = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
+        J += J_more
+        H += H_more
+        M += M_more
+        bias += bias_more
+        tension += tension_more
+    ties = model.tie_span[k]
+    for t in range(ties[0], ties[1]):
+        J_more, H_more, M_more, bias_more, tension_more = tie_terms(
+            p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+            forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
+        )  # fmt: skip
+        J += J_more
+        H += H_more
+        M += M_more
+        bias += bias_more
+        tension += tension_more
+    return J, H, M, bias, tension
+
+
+@wp.func
 def eliminate_bodies(
     p: SolverParameters,
     model: ArticulationModel,
@@ -100,47 +159,9 @@ def eliminate_bodies(
         q = joints.joint_q[k]
         stiffness = model.joint_stiffness[k]
         damping = model.joint_damping[k]
-        rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
-        com = rotation * model.body_com[k]
-        inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
-        falls = float(0.0)
-        fall = wp.vec3()
-        root = model.body_root[k]
-        if root >= 0:
-            falls = 1.0
-            fall = joints.joint_xd[root]
-        load = forces.body_load[k]
-        if parent < 0:
-            load = load + wp.spatial_vector(
-                wp.vec3(),
-                turned_rest_moment(
-                    p.dt, phi, axes, q, stiffness, damping, forces.root_turn[tree], forces.root_turn_rate[tree]
-                ),
-            )  # fmt: skip
-        J, H, M, bias, tension, _steady = own_terms(
-            p, phi, motion, model.body_mass[k], com, inertia, load, wp.spatial_top(forces.body_wrench[k]), falls, fall
+        J, H, M, bias, tension = applied_terms(
+            k, tree, p, phi, model, forces, joints, pose, motion, axes, q, stiffness, damping
         )
-        area = model.body_drag[k]
-        if area > 0.0:
-            J_more, H_more, M_more, bias_more, tension_more = drag_terms(
-                p, phi, area, forces.tree_air[tree], motion, com
-            )
-            J += J_more
-            H += H_more
-            M += M_more
-            bias += bias_more
-            tension += tension_more
-        ties = model.tie_span[k]
-        for t in range(ties[0], ties[1]):
-            J_more, H_more, M_more, bias_more, tension_more = tie_terms(
-                p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
-                forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
-            )  # fmt: skip
-            J += J_more
-            H += H_more
-            M += M_more
-            bias += bias_more
-            tension += tension_more
         if is_branching[k]:
             J += scratch_out.J[k]
             H += scratch_out.H[k]
@@ -187,7 +208,7 @@ def eliminate_bodies(
                 add_terms(parent, J_left, H_left, M_left, bias_left, tension, scratch_out)
         else:
             factors_out.root_inverse_mass[k] = wp.mat33()
-            if root >= 0:
+            if model.body_root[k] >= 0:
                 scratch_out.H[k] = H
                 scratch_out.bias[k] = bias
                 factors_out.root_inverse_mass[k] = wp.inverse(M - wp.transpose(H) * DH)
