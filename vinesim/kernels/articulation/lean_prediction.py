@@ -129,17 +129,9 @@ def applied_terms(
 
 @wp.func
 def eliminate_bodies(
-    p: SolverParameters,
-    model: ArticulationModel,
-    forces: AppliedForces,
-    joints: JointState,
-    bodies: BodyState,
-    is_branching: wp.array(dtype=wp.bool),
-    tree: int,
-    phi: float,
-    factors_out: Factors,
-    scratch_out: Scratch,
-):
+    p: SolverParameters, model: ArticulationModel, forces: AppliedForces, joints: JointState, bodies: BodyState,
+    is_branching: wp.array(dtype=wp.bool), tree: int, phi: float, factors_out: Factors, scratch_out: Scratch,
+):  # fmt: skip
     """From the tips to the root of one tree: each body's implicit inertia and bias, its joint's factors, and what is left."""
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
