@@ -10,6 +10,7 @@ from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, SAMPLE_RATE, Codec, to_pcm
 from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.bench.sound_delay import AS_WAVEFORM, LIGHT, TONE_OF_LIGHTS, VOICE, sound
 from vinesim.bench.support.ear import Ear
 from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator
@@ -130,6 +131,14 @@ def test_a_page_that_stood_still_is_not_heard_twice_at_once():
     assert 0.4 < np.abs(heard).max() < 0.51
     assert np.mean(np.abs(heard) > 0.01) < 0.25, "what was too much was dropped"
     assert world.clients["anna"].sound.dropped >= 14
+
+
+def test_an_alarm_is_heard_with_its_light_and_a_voice_later_than_states_but_within_its_budget():
+    """F94, F98; ``vinesim bench sound`` has the figures."""
+    took = {row.case.split(": ")[1].split(",")[0]: row.value for row in sound((0.02,), 2) if "largest" in row.case}
+    assert took[TONE_OF_LIGHTS] == took[LIGHT]
+    assert took[LIGHT] <= took[AS_WAVEFORM] <= took[LIGHT] + 60.0
+    assert took[LIGHT] < took[VOICE] <= 150.0
 
 
 def test_frames_of_a_socket_that_jitters_follow_each_other_without_gaps():
