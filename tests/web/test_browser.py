@@ -75,6 +75,7 @@ def open_page(page, live, before=""):
     page.open(live.server.address + "?triangles=30000", before=before)
     wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
     assert page.run("vinesim.failure") is None
+    page.run("vinesim.viewer.shadowAt = Infinity, 0")  # no shadows
     assert page.errors == []
 
 
@@ -151,6 +152,12 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
         )
         wait(lambda: np.linalg.norm(physics.state.body_q[body, :3] - here) > 2e-3, "the bunch gives way")
         wait(lambda: physics.hand("viewer", "right").held is not None, "the hand holds the bunch")
+        for code in ("KeyC", "KeyO"):
+            page.key(code, down=True)
+            page.key(code, down=False)
+        drawn = "Number.isFinite(forces.geometry.drawRange.count) && forces.geometry.drawRange.count >= 6"
+        wait(lambda: page.run(f"(({{ forces }}) => {drawn})(vinesim.viewer.overlays)"), "its force is drawn")
+        wait(lambda: ": viewer" in page.run("document.getElementById('names').textContent"), "its tree is the person's")
         page.key("KeyS", down=True)
         wait(lambda: not physics.state.bunch_attached[BUNCH], "who walks away with it in the hand picks it")
         page.key("KeyS", down=False)
@@ -191,6 +198,14 @@ def test_a_headset_moves_head_and_hands():
         page.run("device.controllers.right.updateButtonValue('squeeze', 0), 0")
         page.run("device.controllers.right.updateButtonValue('a-button', 1), 0")
         wait(lambda: human.pose.right_fingers == VICTORY, "a button makes the person's own pose")
+        page.run("device.primaryInputMode = 'hand', device.hands.right.position.set(0.2, 1.3, -0.5), 0")
+        page.run("device.hands.right.quaternion.set(0, 0, 0, 1), 0")
+        wrist = np.array([*(start[:2] + 0.5 * ahead + 0.2 * right), 1.3])
+        wait(lambda: np.linalg.norm(human.pose.right[:3] - wrist) < 0.15, "a hand without a controller is followed")
+        wait(lambda: not human.pose.right_closed and max(human.pose.right_fingers) < 0.6, "it is open")
+        page.run("device.hands.right.updatePinchValue(1), 0")
+        wait(lambda: human.pose.right_closed, "a pinch takes hold")
+        page.run("device.primaryInputMode = 'controller', 0")
         page.run("device.controllers.left.updateAxes('thumbstick', 0, -1), 0")
         wait(lambda: np.dot(human.pose.head[:2] - head[:2], ahead) > 0.5, "the stick walks ahead")
         page.run("device.controllers.left.updateAxes('thumbstick', 0, 0), 0")

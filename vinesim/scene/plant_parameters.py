@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import pathlib
+import re
 import typing
 from typing import Annotated, Literal
 
@@ -11,13 +13,16 @@ import msgspec
 from vinesim.scene.data_files import find_data_file
 from vinesim.scene.toml_loader import DataError, load_toml
 
+Grade = Literal["READ", "DERIVED", "GUESSED", "FITTED"]
+"""Where a number comes from: a publication, what follows from one, a guess, or a fit to a measured plant."""
+
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One sourced number."""
 
     value: float
     unit: str
-    grade: Literal["READ", "DERIVED", "GUESSED"]
+    grade: Grade
     source: str
 
 
@@ -26,7 +31,7 @@ class Range(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     value: tuple[float, float]
     unit: str
-    grade: Literal["READ", "DERIVED", "GUESSED"]
+    grade: Grade
     source: str
 
     def at(self, share: typing.Any) -> typing.Any:
@@ -39,7 +44,7 @@ class Colour(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     value: tuple[float, float, float]
     unit: str
-    grade: Literal["READ", "DERIVED", "GUESSED"]
+    grade: Grade
     source: str
 
 
@@ -142,6 +147,35 @@ class Trellis(_Part, frozen=True, kw_only=True):
     tie_damping: Annotated[Number, "s"]
 
 
+class Specimen(_Part, frozen=True, kw_only=True):
+    """One cane, or one bunch on its peduncle, that was measured: what :mod:`vinesim.tune` fits.
+
+    Its base is clamped at the origin.
+    """
+
+    organ: Literal["cane", "bunch"]
+    length: Annotated[Number, "m"]
+    """Of the cane or the peduncle."""
+    base_diameter: Annotated[Number, "m"]
+    tip_diameter: Annotated[Number, "m"]
+    modulus: Annotated[Number, "Pa"]
+    """Young's modulus of bending."""
+    density: Annotated[Number, "kg/m^3"]
+    damping: Annotated[Number, "s"]
+    """Joint damping over joint stiffness."""
+    tip_mass: Annotated[Number, "kg"] | None = None
+    """A point mass at the tip of the cane; the bunch on the peduncle."""
+    direction: tuple[float, float, float] | None = None
+    """In which it grows from its base, in the world (z up); a cane along x, a peduncle down unless given."""
+    bow: tuple[float, float] = (0.0, 0.0)
+    """[rad] How much its slack shape bends from base to tip, about its y and its z axis."""
+    segments: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8
+    """Rigid bodies that the rod is cut into."""
+    markers: dict[str, float] = {}
+    """[m] Distance of named markers from the base, along the rod. ``tip`` is always known: the cane's tip or the
+    lowest point of the bunch."""
+
+
 class VineParameters(_Part, frozen=True, kw_only=True):
     """All parameters of a vine and its trellis."""
 
@@ -153,6 +187,8 @@ class VineParameters(_Part, frozen=True, kw_only=True):
     arm: Arm
     trunk: Trunk
     trellis: Trellis
+    specimen: Specimen | None = None
+    """The measured plant from which numbers of grade FITTED come; not used by scenes."""
 
 
 class Berry(_Part, frozen=True, kw_only=True):
@@ -188,12 +224,50 @@ def load_varieties() -> tuple[Berry, ...]:
     return varieties
 
 
+class _SpecimenFile(_Part, frozen=True):
+    specimen: Specimen
+
+
+def load_specimen(path: str | pathlib.Path) -> Specimen:
+    """The table ``[specimen]`` of a file that holds it alone, or of a file of plant parameters.
+
+    :class:`DataError` with file, place, value and remedy if it cannot be used.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; give a TOML file with a table [specimen]")
+    is_plant = re.search(r"^\[trellis\]", path.read_text("utf-8", "replace"), re.MULTILINE) is not None
+    found = load_toml(path, VineParameters if is_plant else _SpecimenFile)
+    if found.specimen is None:
+        raise DataError(f"{path}: specimen is missing; add a table [specimen], the plant that was measured")
+    _check_specimen(found.specimen, str(path))
+    return found.specimen
+
+
+def _check_specimen(specimen: Specimen, path: str) -> None:
+    _check_units(specimen, f"{path}: specimen")
+    for name in ("length", "base_diameter", "tip_diameter", "modulus", "density", "damping", "tip_mass"):
+        number = getattr(specimen, name)
+        if number is not None and not number.value > 0.0:
+            raise DataError(f"{path}: specimen.{name}.value is {number.value}; give a number above 0")
+    if specimen.organ == "bunch" and specimen.tip_mass is None:
+        raise DataError(f"{path}: specimen.tip_mass is missing; give the mass of the bunch in kg")
+    if specimen.direction is not None and not any(specimen.direction):
+        raise DataError(f"{path}: specimen.direction is {specimen.direction}; give a vector that is not zero")
+    for name, place in specimen.markers.items():
+        if not 0.0 < place <= specimen.length.value:
+            raise DataError(
+                f"{path}: specimen.markers.{name} is {place}; give its distance from the base, "
+                f"above 0 and up to {specimen.length.value} m"
+            )
+
+
 def _check_units(part: msgspec.Struct, place: str) -> None:
     hints = typing.get_type_hints(type(part), include_extras=True)
     for name in part.__struct_fields__:
         value, unit = getattr(part, name), getattr(hints[name], "__metadata__", None)
         if isinstance(value, _Part):
             _check_units(value, f"{place}: {name}" if ":" not in place else f"{place}.{name}")
-        elif unit and value.unit != unit[0]:
+        elif unit and isinstance(value, Number | Range | Colour) and value.unit != unit[0]:
             joint = "." if ": " in place else ": "
             raise DataError(f"{place}{joint}{name}.unit is {value.unit!r}; give the value in {unit[0]!r}")

@@ -1,0 +1,40 @@
+"""Frequency and decrement of a track, without a model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vinesim.tune import Trajectory, extract_features
+
+
+def swing(frequency: float, ratio: float, released: float, hold: bool, seed: int = 0) -> Trajectory:
+    """A damped sinusoid in two axes, irregular in time, with 2 mm noise, gaps and gross outliers."""
+    rng = np.random.default_rng(seed)
+    time = np.sort(rng.uniform(0.0 if hold else released + 0.3, 4.0, 120))
+    omega = 2.0 * np.pi * frequency
+    after = np.maximum(time - released, 0.0)
+    wave = np.exp(-ratio * omega * after) * np.cos(omega * np.sqrt(1.0 - ratio**2) * after)
+    position = np.full((120, 1, 3), np.nan)
+    position[:, 0, 0] = 0.3 + 0.02 * wave
+    position[:, 0, 2] = -0.1 - 0.06 * wave
+    position[:, 0, ::2] += rng.normal(0.0, 2e-3, (120, 2))
+    position[rng.random(120) < 0.15, 0, 2] = np.nan
+    position[rng.random(120) < 0.04, 0, 2] *= 30.0
+    return Trajectory(time, position)
+
+
+@pytest.mark.parametrize(("frequency", "ratio"), [(0.8, 0.05), (2.7, 0.01), (6.0, 0.03)])
+@pytest.mark.parametrize("hold", [True, False])
+def test_a_damped_sinusoid_is_recovered(frequency: float, ratio: float, hold: bool) -> None:
+    found = extract_features(swing(frequency, ratio, 0.5, hold))
+    assert found.frequency == pytest.approx(frequency, rel=0.01)
+    assert found.damping_ratio == pytest.approx(ratio, rel=0.2)
+    assert found.log_decrement == pytest.approx(2.0 * np.pi * found.damping_ratio, rel=0.01)
+    np.testing.assert_allclose(found.rest, [0.3, -0.1], atol=2e-3)
+    assert found.noise == pytest.approx(2e-3, rel=0.3)
+    # the release is known but for whole half periods if the track begins later
+    halves = 2.0 * found.frequency * (found.release - 0.5)
+    assert abs(halves if hold else halves - round(halves)) < 0.4
+    if hold:
+        np.testing.assert_allclose(found.displacement, [0.02, -0.06], atol=0.005)

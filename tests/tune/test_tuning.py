@@ -1,0 +1,177 @@
+"""Fits: what is put in comes out, with honest intervals; what cannot be known is said; failures are not silent."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from tests.support.tuning import bunch, cane, number
+from vinesim.cli.tune import run
+from vinesim.errors import UsageError
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.plant_parameters import load_plant, load_specimen
+from vinesim.scene.spec import load_scene
+from vinesim.scene.toml_loader import DataError
+from vinesim.tune import Experiment, Trajectory, TrajectoryError, measure, tune
+from vinesim.tune.fit import specimen_toml
+
+SHORT = Experiment(duration=2.0)
+
+
+@pytest.fixture(scope="module")
+def track() -> Trajectory:
+    """A pull of a cane of 5 GPa and 4 ms, as a camera sees it."""
+    return measure(cane(), SHORT)
+
+
+@pytest.mark.parametrize(("seed", "ratio", "off"), [(1, 0.01, 5.0), (2, 0.03, 0.2), (3, 0.1, 5.0)])
+def test_modulus_and_damping_are_recovered_from_far_away(seed: int, ratio: float, off: float) -> None:
+    """2 mm of noise, 30 pictures a second, 3 s, start values five times off; the truth was stepped at 1 ms."""
+    damping = ratio / (math.pi * 3.48)
+    truth = cane(5e9, damping)
+    fit = tune(cane(5e9 * off, damping / off), measure(truth, Experiment(seed=seed)))
+    assert fit.ok
+    assert fit.estimate("modulus").value == pytest.approx(5e9, rel=0.03)
+    assert fit.estimate("damping").value == pytest.approx(damping, rel=0.15)
+    assert fit.noise == pytest.approx(2e-3, rel=0.2)
+    deviation = fit.posterior.deviation
+    assert 2e-4 < deviation[0] < 6e-3
+    assert 0.005 < deviation[1] < 0.08
+
+
+def test_a_free_swing_tells_modulus_over_mass_and_the_fit_says_so(track: Trajectory) -> None:
+    fit = tune(cane(3e9), track, ("modulus", "damping", "mass"))
+    (ridge,) = fit.posterior.ridges
+    assert ridge.direction["modulus"] == pytest.approx(math.sqrt(0.5), abs=0.02)
+    assert ridge.direction["mass"] == pytest.approx(math.sqrt(0.5), abs=0.02)
+    assert [e.name for e in fit.estimates if not e.known] == ["modulus", "mass"]
+    assert any("force [N]" in line for line in fit.lines())
+    ratio = fit.posterior.mean[0] - fit.posterior.mean[2]
+    assert math.exp(ratio) * 3e9 == pytest.approx(5e9, rel=0.01)  # what can be known is
+
+
+def test_a_force_reading_tells_the_mass() -> None:
+    track = measure(cane(), dataclasses.replace(SHORT, force_noise=0.0))
+    wrong = cane(3e9, density=number(700.0, "kg/m^3"))
+    fit = tune(wrong, track, ("modulus", "damping", "mass"))
+    assert fit.ok
+    assert not fit.posterior.ridges
+    assert fit.estimate("modulus").value == pytest.approx(5e9, rel=0.03)
+    assert fit.estimate("mass").value * 700.0 == pytest.approx(900.0, rel=0.03)
+
+
+def test_the_slack_shape_is_recovered() -> None:
+    fit = tune(cane(), measure(cane(bow=(0.25, -0.15)), SHORT), ("modulus", "damping", "rest"))
+    assert fit.ok
+    assert fit.fitted_specimen().bow == pytest.approx((0.25, -0.15), abs=0.02)
+    assert fit.estimate("modulus").value == pytest.approx(5e9, rel=0.02)
+
+
+def test_a_bunch_that_swings_tells_its_peduncle() -> None:
+    fit = tune(bunch(1e9, 0.02), measure(bunch(), Experiment(displacement=0.04, axes="xy")))
+    assert fit.ok
+    assert fit.estimate("modulus").value == pytest.approx(0.3e9, rel=0.1)
+    assert fit.estimate("damping").value == pytest.approx(0.05, rel=0.15)
+
+
+def test_outliers_and_gaps_hardly_matter(track: Trajectory) -> None:
+    rng = np.random.default_rng(4)
+    position = track.position.copy()
+    position[rng.random(len(position)) < 0.2, 0, 2] = np.nan
+    position[rng.random(len(position)) < 0.1, 0, 2] += 0.03
+    position[50, 0, 2] *= 1000.0
+    fit = tune(cane(8e9), dataclasses.replace(track, position=position))
+    assert fit.ok
+    assert fit.gaps == np.isnan(position).sum()
+    assert fit.outliers > 3
+    assert fit.estimate("modulus").value == pytest.approx(5e9, rel=0.02)
+
+
+def test_draws_of_the_posterior_agree_with_its_approximation(track: Trajectory) -> None:
+    fit = tune(cane(), track, samples=256, seed=2)
+    assert fit.sample is not None
+    assert fit.sample.effective > 60
+    np.testing.assert_allclose(fit.sample.draws[:, :2].std(0), fit.posterior.deviation[:2], rtol=0.3)
+    np.testing.assert_allclose(fit.sample.draws[:, :2].mean(0), fit.posterior.mean[:2], atol=0.01)
+
+
+def test_a_track_that_the_plant_cannot_make_is_a_failure_in_words(track: Trajectory) -> None:
+    """Two swings of different frequency in two axes: a cane that is round has one."""
+    position = track.position.copy()
+    time = track.time - 0.2
+    position[:, 0, 1] += np.where(time > 0.0, 0.05 * np.sin(2.0 * np.pi * 2.2 * time), 0.0)
+    fit = tune(cane(), dataclasses.replace(track, position=position))
+    assert not fit.ok
+    assert fit.lines()[0].startswith("FAILED")
+    assert any(line.startswith("fault") for line in fit.lines())
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [(1e3, "correct the unit"), (1e-3, "no swing stands out|correct the unit")]
+)
+def test_a_wrong_unit_is_refused(track: Trajectory, scale: float, words: str) -> None:
+    with pytest.raises(TrajectoryError, match=words):
+        tune(cane(), dataclasses.replace(track, position=scale * track.position))
+
+
+def test_tracks_that_tell_nothing_are_refused(track: Trajectory) -> None:
+    rng = np.random.default_rng(1)
+    with pytest.raises(TrajectoryError, match="no swing stands out"):
+        tune(cane(), dataclasses.replace(track, position=rng.normal(0.0, 2e-3, track.position.shape)))
+    with pytest.raises(TrajectoryError, match="less than one period"):
+        tune(cane(), track.between(0.0, 0.45), release=0.25)
+    with pytest.raises(UsageError, match="'colour' cannot be fitted; give one or more of: modulus"):
+        tune(cane(), track, ("colour",))
+    with pytest.raises(UsageError, match="marker 'middle' is not in the specimen, which has: tip"):
+        tune(cane(), dataclasses.replace(track, markers=("middle",)))
+
+
+def test_scenes_load_what_was_fitted(track: Trajectory, tmp_path, capsys) -> None:
+    """From files on the command line: a plant whose numbers carry source and date, and a vineyard of it."""
+    track.write(tmp_path / "pull.csv")
+    (tmp_path / "cane.toml").write_text(specimen_toml(cane(8e9)))
+    out = tmp_path / "fitted.toml"
+    plot = tmp_path / "fit.png"
+    code = run(tmp_path / "pull.csv", tmp_path / "cane.toml", "modulus,damping", out, True, plot, None, 0, 0, "cpu")
+    said = json.loads(capsys.readouterr().out)
+    assert code == 0
+    assert said["ok"]
+    assert plot.stat().st_size > 10_000
+    modulus = load_plant(str(out)).cane.woody_modulus
+    assert modulus.grade == "FITTED"
+    assert modulus.value == pytest.approx(said["estimates"][0]["value"], rel=1e-4)
+    assert "pull.csv: 90 %" in modulus.source
+    assert load_specimen(out).modulus == modulus
+    scene = tmp_path / "scene.toml"
+    layout = "[layout]\nrows = 1\nvines = 1\nrow_spacing = 2.5\nvine_spacing = 2.5\nheight = 2.0\n"
+    layout += '[fruit]\nbunches = [1, 2]\nvarieties = ["italia"]\n'
+    stiffness = []
+    for plants in ("vine", str(out)):
+        head = f'name = "one"\nseed = 1\ntraining = "tendone"\nplants = "{plants}"\n'
+        scene.write_text(head + layout)
+        stiffness.append(generate(load_scene(str(scene))).joint_stiffness.max())
+    assert stiffness[1] / stiffness[0] == pytest.approx(modulus.value / 5.89e9, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "specimen is missing"),
+        (specimen_toml(cane()).replace('"Pa"', '"GPa"'), "specimen.modulus.unit is 'GPa'; give the value in 'Pa'"),
+        (specimen_toml(cane()).replace("value = 1.0", "value = -1.0"), "specimen.length.value is -1.0"),
+        (specimen_toml(bunch()).replace("tip_mass", "# "), "specimen.tip_mass is missing"),
+        (specimen_toml(cane(markers={"middle": 3.0})), "specimen.markers.middle is 3.0"),
+        (specimen_toml(cane()).replace("segments = 8", "segments = 1"), "specimen.segments is 1"),
+    ],
+)
+def test_a_specimen_that_cannot_be_is_refused(tmp_path, text: str, words: str) -> None:
+    path = tmp_path / "cane.toml"
+    path.write_text(text)
+    with pytest.raises(DataError) as refused:
+        load_specimen(path)
+    assert words in str(refused.value)
+    assert str(path) in str(refused.value)

@@ -1,0 +1,24 @@
+"""Fit a simulated cane or bunch to a measured one: stiffness, damping, mass and rest shape with their uncertainty.
+
+    from vinesim.tune import load_specimen, read_trajectory, tune
+
+    fit = tune(load_specimen("cane.toml"), read_trajectory("pull.csv"))
+    print("\\n".join(fit.lines()))
+    fit.write_plant("fitted.toml")
+
+docs/tuning.md shows it at work. It needs scipy: ``pip install 'vinesim[tune]'``.
+"""
+
+from __future__ import annotations
+
+from vinesim.scene.plant_parameters import Specimen, load_specimen
+from vinesim.tune.experiment import Experiment, measure
+from vinesim.tune.features import Features, extract_features
+from vinesim.tune.fit import Fit
+from vinesim.tune.trajectory import Trajectory, TrajectoryError, read_trajectory
+from vinesim.tune.tuning import tune
+
+__all__ = [
+    "Experiment", "Features", "Fit", "Specimen", "Trajectory", "TrajectoryError", "extract_features",
+    "load_specimen", "measure", "read_trajectory", "tune",
+]  # fmt: skip

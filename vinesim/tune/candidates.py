@@ -1,0 +1,200 @@
+"""Many candidates of one specimen at once: trees of one launch, each with its own stiffness, damping, mass and pull.
+
+The dynamics are those of :class:`~vinesim.physics.plants.articulation_solver.ArticulationSolver`. A run begins in the
+static equilibrium under a pull at the tip, found by the same solver in long steps, and lets go.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import warp as wp
+
+from vinesim import frames
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.builder import assemble
+from vinesim.scene.plant_parameters import Specimen
+from vinesim.scene.state import State
+from vinesim.tune.specimen import TIP, base_pose, build_tree, place_markers, rest_bends
+
+COLUMNS = ("modulus", "damping", "mass", "bow_y", "bow_z", "pull_y", "pull_z")
+"""What a candidate is: the natural logarithms of modulus, damping and mass over the specimen's own, its bow [rad], and
+the pull at its tip [N at the specimen's own modulus; it grows with the modulus] along the base's y and z."""
+STATIC_STEP = 1.0
+"""[s] In such a step inertia is next to nothing, and the implicit solve a Newton step towards equilibrium."""
+STATIC_STEPS = 8
+_RATE = 1e4
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Motion:
+    """Where markers were at some ticks after the release, and how they moved over the tick that follows."""
+
+    position: np.ndarray
+    """[candidate, tick, marker, 3] m"""
+    velocity: np.ndarray
+    """[candidate, tick, marker, 3] m/s"""
+    acceleration: np.ndarray
+    """[candidate, tick, marker, 3] m/s^2"""
+
+    def at(self, index: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities [candidate, sample, marker, 3] at times ``after`` [candidate or 1, sample] s past
+        the ticks of ``index`` [sample]."""
+        t = after[..., None, None]
+        x, v, a = (rows[:, index] for rows in (self.position, self.velocity, self.acceleration))
+        return x + v * t + 0.5 * a * t * t, v + a * t
+
+
+class Candidates:
+    """Runs candidates of one specimen.
+
+    Args:
+        specimen: what all of them are variations of.
+        markers: names of the points whose motion is wanted.
+        dt: step [s].
+        device: ``cpu``, ``cuda`` or ``cuda:N``.
+    """
+
+    def __init__(
+        self, specimen: Specimen, markers: tuple[str, ...] = (TIP,), *, dt: float, device: str = "cpu"
+    ) -> None:
+        self.specimen, self.markers, self.dt, self.device = specimen, markers, dt, device
+        self._tree = build_tree(specimen)
+        self._body, self._point = place_markers(specimen, markers)
+        tip_body, tip_point = place_markers(specimen, (TIP,))
+        self._pulled, self._pulled_at = int(tip_body[0]), tip_point[0]
+        self._axes = frames.to_matrix(base_pose(specimen)[3:])
+        self._solvers: dict[int, tuple[ArticulationSolver, ArticulationSolver]] = {}
+        self._own: dict[int, tuple[np.ndarray, ...]] = {}
+        self.runs = 0
+        """Candidates run so far."""
+
+    @property
+    def size(self) -> int:
+        """Bodies of one candidate."""
+        return len(self._tree.bodies)
+
+    def pull_axes(self) -> np.ndarray:
+        """World axes [2, 3] along which ``pull_y`` and ``pull_z`` act."""
+        return self._axes[:, 1:].T
+
+    def run(self, candidates: np.ndarray, ticks: np.ndarray, pushed: bool = False) -> Motion:
+        """Let candidates [n, 7] (:data:`COLUMNS`) go from under their pull.
+
+        Args:
+            candidates: [n, 7].
+            ticks: [k] whole numbers of steps after the release, increasing, 0 or more.
+            pushed: the other way round: from rest, the force begins to act at tick 0 and stays.
+        """
+        count = len(candidates)
+        still, moving = self._solvers.get(count) or self._new_solvers(count)
+        self._write(still, candidates, 0.0)
+        self._write(moving, candidates, 1.0)
+        self._settle(still, np.zeros_like(candidates) if pushed else candidates)
+        plants, state = moving, moving.state
+        for name in ("joint_q", "joint_qd"):
+            getattr(state, name)[:] = getattr(still.state, name)
+        plants.wake(np.arange(count))
+        self.runs += count
+        rows = [np.empty((count, len(ticks), len(self.markers), 3), np.float32) for _ in range(3)]
+        at = 0
+        bodies = self._bodies(count)
+        point = np.broadcast_to(self._point, (count, len(self.markers), 3)).astype(np.float32)
+        for place, tick in enumerate(ticks.tolist()):
+            self._advance(plants, tick - at, candidates if pushed else None)
+            if pushed:
+                self._push(plants, candidates)
+            plants.predict()
+            for row, value in zip(rows, _marker_motion(plants, bodies, point), strict=True):
+                row[:, place] = value
+            plants.integrate()
+            at = tick + 1
+        position, velocity, later = rows
+        return Motion(position, velocity, (later - velocity) / np.float32(self.dt))
+
+    def shape(self, candidates: np.ndarray) -> np.ndarray:
+        """Markers [n, marker, 3] m of candidates [n, 7] in equilibrium under their pull."""
+        count = len(candidates)
+        still, _ = self._solvers.get(count) or self._new_solvers(count)
+        self._write(still, candidates, 0.0)
+        self._settle(still, candidates)
+        pose = still.state.body_q[self._bodies(count)].astype(float)
+        return pose[..., :3] + frames.rotate(pose[..., 3:], np.broadcast_to(self._point, (*pose.shape[:-1], 3)))
+
+    # ------------------------------------------------------------------
+
+    def _bodies(self, count: int) -> np.ndarray:
+        """Bodies [n, marker] that carry the markers."""
+        return np.arange(count)[:, None] * self.size + self._body
+
+    def _new_solvers(self, count: int) -> tuple[ArticulationSolver, ArticulationSolver]:
+        """Solvers of so many candidates: one in long steps for the start, one for the motion."""
+        model = assemble([self._tree] * count)
+        common = {"fast_rate": _RATE, "max_rate": _RATE, "substeps": False, "device": self.device}
+        still, moving = (
+            ArticulationSolver(model, State.at_rest(model), dt=dt, phi=phi, **common)
+            for dt, phi in ((STATIC_STEP, 1.0), (self.dt, None))
+        )
+        if len(self._solvers) > 3:  # each holds its own arrays; a fit needs two or three sizes
+            self._solvers.pop(next(iter(self._solvers)))
+        self._solvers[count] = (still, moving)
+        self._own[count] = tuple(x.copy() for x in (moving.body_mass, moving.body_inertia, moving.body_product))
+        return still, moving
+
+    def _write(self, plants: ArticulationSolver, candidates: np.ndarray, damped: float) -> None:
+        """Give each tree its stiffness, damping, masses and slack shape."""
+        model, count = plants.model, len(candidates)
+        modulus, damping, mass = np.exp(candidates[:, :3]).T.repeat(self.size, axis=1)[..., None]
+        plants.joint_stiffness[:] = model.joint_stiffness * modulus
+        plants.joint_damping[:] = model.joint_damping * modulus * damping * damped
+        own_mass, own_inertia, own_product = self._own[count]
+        plants.body_inertia[:], plants.body_product[:] = own_inertia * mass, own_product * mass
+        plants.body_mass[:] = own_mass * mass[:, 0]
+        bends = rest_bends(self.specimen, candidates[:, 3:5])
+        if self.specimen.bow != (0.0, 0.0) or candidates[:, 3:5].any():
+            rest = plants.kernel_arrays()[wp.quat]["body_rest"].reshape(count, self.size, 4)
+            rest[:, : self.specimen.segments] = frames.exp(bends)
+        plants.launches.changed = True
+
+    def _settle(self, plants: ArticulationSolver, candidates: np.ndarray) -> None:
+        """Bring all trees into equilibrium under their pull."""
+        state, count = plants.state, len(candidates)
+        state.joint_q[:] = frames.IDENTITY
+        state.joint_qd[:] = 0.0
+        plants.wake(np.arange(count))
+        plants.forward_kinematics()
+        for _ in range(STATIC_STEPS):
+            self._push(plants, candidates)
+            plants.predict()
+            plants.integrate()
+            state.joint_qd[:] = 0.0
+        plants.forward_kinematics()
+
+    def _push(self, plants: ArticulationSolver, candidates: np.ndarray) -> None:
+        """Apply the pull at the tip, where it is now."""
+        body = np.arange(len(candidates)) * self.size + self._pulled
+        force = (candidates[:, 5:7] * np.exp(candidates[:, :1])) @ self.pull_axes()
+        turn = plants.state.body_q[body, 3:].astype(float)
+        arm = frames.rotate(turn, np.broadcast_to(self._pulled_at, force.shape))
+        plants.body_load[body] = np.concatenate([force, np.cross(arm, force)], -1)
+
+    def _advance(self, plants: ArticulationSolver, steps: int, pushed: np.ndarray | None) -> None:
+        if pushed is None:
+            plants.advance(steps)
+            return
+        for _ in range(steps):
+            self._push(plants, pushed)
+            plants.predict()
+            plants.integrate()
+
+
+def _marker_motion(
+    plants: ArticulationSolver, bodies: np.ndarray, point: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions [n, marker, 3] of markers after a prediction, their velocities, and those at the end of the step."""
+    pose, now, later = (rows[bodies] for rows in (plants.state.body_q, plants.state.body_qd, plants.velocity_free))
+    arm = frames.rotate(pose[..., 3:], point)
+    velocity = now[..., :3] + frames.cross(now[..., 3:], arm)
+    turned = arm + frames.cross(now[..., 3:], arm) * np.float32(plants.dt)
+    return pose[..., :3] + arm, velocity, later[..., :3] + frames.cross(later[..., 3:], turned)

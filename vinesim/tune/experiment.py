@@ -1,0 +1,121 @@
+"""What a laboratory would measure on a specimen, with its noise, and what a fit would then know: to plan a campaign."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from vinesim.errors import UsageError
+from vinesim.scene.plant_parameters import Specimen
+from vinesim.tune.candidates import COLUMNS, Candidates
+from vinesim.tune.specimen import TIP
+from vinesim.tune.trajectory import Trajectory
+
+TRUTH_STEP = 1e-3
+"""[s] Step of the simulation that stands for the plant."""
+Kind = Literal["pull-release", "push"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """How a plant is moved and watched."""
+
+    kind: Kind = "pull-release"
+    """``pull-release``: held aside, then let go at :attr:`hold`. ``push``: at rest, then a steady force on its tip."""
+    displacement: float = 0.1
+    """[m] Of the tip, by the pull; by the push, once it has come to rest."""
+    angle: float = 90.0
+    """[deg] Direction of the force about the base's x axis: 0 along its y, 90 along its z axis."""
+    duration: float = 3.0
+    """[s] After the force begins or ends."""
+    hold: float = 0.2
+    """[s] Before that."""
+    rate: float = 30.0
+    """[1/s] Pictures."""
+    noise: float = 0.002
+    """[m] Standard deviation of a tracked position, in each axis."""
+    force_noise: float | None = None
+    """[1] Standard deviation of the force gauge over its reading; None: no gauge."""
+    markers: tuple[str, ...] = (TIP,)
+    axes: str = "xyz"
+    """Which axes of the world are tracked."""
+    seed: int = 0
+
+    def check(self) -> None:
+        """:class:`UsageError` naming the first number that is out of range."""
+        for name in ("displacement", "duration", "rate"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise UsageError(f"{name} is {getattr(self, name)}; give a finite number above 0")
+        for name in ("hold", "noise", "force_noise"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value < math.inf:
+                raise UsageError(f"{name} is {value}; give a finite number of 0 or more")
+        if not self.axes or set(self.axes) - set("xyz"):
+            raise UsageError(f"axes is {self.axes!r}; give one or more of x, y, z")
+
+
+def measure(specimen: Specimen, experiment: Experiment = Experiment(), *, exact: bool = False) -> Trajectory:
+    """The track of an experiment on a specimen; ``exact``: without noise."""
+    experiment.check()
+    e, rng = experiment, np.random.default_rng(experiment.seed)
+    candidates = Candidates(specimen, e.markers, dt=TRUTH_STEP)
+    row = np.zeros((1, len(COLUMNS)))
+    row[0, 3:5] = specimen.bow
+    row[0, 5:] = pull_for(candidates, e.displacement, math.radians(e.angle))
+    time = np.arange(math.ceil((e.hold + e.duration) * e.rate - 1e-9)) / e.rate
+    after = np.maximum(time - e.hold, 0.0)
+    tick = np.floor(after / TRUTH_STEP + 1e-6).astype(int)
+    ticks, index = np.unique(tick, return_inverse=True)
+    motion = candidates.run(row, ticks, pushed=e.kind == "push")
+    position = motion.at(index, (after - tick * TRUTH_STEP)[None])[0][0].astype(float)
+    held = time <= e.hold
+    force = None
+    if e.force_noise is not None:
+        size = float(np.linalg.norm(row[0, 5:]))
+        force = np.where(held if e.kind == "pull-release" else ~held, size, 0.0)
+        force = force * (1.0 + (0.0 if exact else e.force_noise) * rng.normal())  # a gauge errs in scale
+    if not exact:
+        position += rng.normal(0.0, e.noise, position.shape)
+    for axis in range(3):
+        if "xyz"[axis] not in e.axes:
+            position[..., axis] = np.nan
+    return Trajectory(time, position, e.markers, force, f"{e.kind} of seed {e.seed}")
+
+
+def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.ndarray:
+    """The pull [2] N along the base's y and z that moves the tip by ``displacement`` [m] at ``angle`` [rad].
+
+    :class:`UsageError` if no pull does.
+    """
+    specimen = candidates.specimen
+    tip = Candidates(specimen, (TIP,), dt=candidates.dt)
+    way = np.array([math.cos(angle), math.sin(angle)])
+    row = np.zeros((2, len(COLUMNS)))
+    row[:, 3:5] = specimen.bow
+    size = 0.01 * 3.0 * specimen.modulus.value * math.pi * (0.5 * specimen.base_diameter.value) ** 4
+    size = size / 4.0 / specimen.length.value**2
+    for _ in range(12):
+        row[1, 5:] = size * way
+        rest, moved = tip.shape(row)[:, 0]
+        reached = float(np.linalg.norm(moved - rest))
+        if abs(reached / displacement - 1.0) < 1e-3:
+            return size * way
+        size *= min(max(displacement / max(reached, 1e-9), 0.1), 10.0)
+    reach = specimen.length.value
+    raise UsageError(f"displacement is {displacement} m; no pull does that to a plant of {reach} m, give less")
+
+
+def expected_deviations(
+    specimen: Specimen, experiment: Experiment, parameters: Sequence[str] = ("modulus", "damping")
+) -> dict[str, float]:
+    """Standard deviation of each parameter's posterior, were the specimen the truth: relative, or rad for bows."""
+    from vinesim.tune.tuning import tune
+
+    fit = tune(specimen, measure(specimen, experiment), parameters)
+    if not fit.ok:
+        raise UsageError(f"this experiment cannot be fitted: {fit.faults[0]}")
+    return dict(zip(fit.posterior.names[: fit.posterior.physical], fit.posterior.deviation.tolist(), strict=False))

@@ -1,0 +1,159 @@
+"""What a track tells without a model and without phase: frequency, logarithmic decrement, rest position, release.
+
+A damped sinusoid is fitted to all columns at once; for a given frequency and damping ratio its amplitudes follow by
+linear least squares, so gaps and irregular times do no harm.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from vinesim.tune.trajectory import Trajectory
+
+FREQUENCIES_PER_BIN = 4
+"""Trial frequencies within 1 / duration."""
+DAMPING_RATIOS = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35])
+"""Trial damping ratios."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Features:
+    """A damped sinusoid through a track."""
+
+    frequency: float
+    """[Hz]"""
+    damping_ratio: float
+    """[1]"""
+    release: float
+    """[s] When it was let go, on the track's clock: the turning point at or before the onset of motion."""
+    rest: np.ndarray
+    """[column] m, where it comes to rest."""
+    displacement: np.ndarray
+    """[column] m, of the sinusoid from there at the release."""
+    noise: float
+    """[m] What the sinusoid leaves unexplained: robust standard deviation, no less than the noise."""
+    explained: float
+    """[1] Share of the motion after the release that the sinusoid explains."""
+
+    @property
+    def log_decrement(self) -> float:
+        """[1] Logarithm of the ratio of two maxima that follow each other."""
+        return 2.0 * math.pi * self.damping_ratio / math.sqrt(1.0 - self.damping_ratio**2)
+
+
+def columns_of(track: Trajectory) -> np.ndarray:
+    """The tracked columns [sample, column] m, gross outliers as NaN."""
+    values = track.position[:, track.tracked].copy()
+    for column in values.T:
+        column[_gross_outliers(column)] = np.nan
+    return values
+
+
+def robust_deviation(values: np.ndarray) -> float:
+    """Standard deviation by the median of absolute deviations."""
+    values = values[np.isfinite(values)]
+    return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else math.nan
+
+
+def _gross_outliers(column: np.ndarray) -> np.ndarray:
+    """Samples far off the median of five: swaps of markers, wrong digits [sample] bool."""
+    seen = np.flatnonzero(np.isfinite(column))
+    if len(seen) < 5:
+        return np.zeros(len(column), bool)
+    padded = np.pad(column[seen], 2, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 5)
+    off = np.abs(column[seen] - np.median(windows, 1))
+    spread = max(1.4826 * float(np.median(off)), 0.25 * float(np.quantile(off, 0.9)), 1e-9)
+    bad = np.zeros(len(column), bool)
+    bad[seen[off > 12.0 * spread]] = True
+    return bad
+
+
+def find_onset(track: Trajectory) -> float:
+    """[s] The last time before the motion: the first sample unless the track begins with a hold."""
+    values, time = columns_of(track), track.time
+    noise = max(_hold_noise(values), 1e-9)
+    start = np.nanmedian(values[: max(3, min(5, len(values) // 8))], axis=0)
+    off = np.max(np.abs(np.nan_to_num(values - start)), axis=1)
+    moved = np.flatnonzero(off > 6.0 * noise)
+    return float(time[max(0, int(moved[0]) - 1)]) if len(moved) else float(time[0])
+
+
+def _hold_noise(values: np.ndarray) -> float:
+    """Noise of the first samples, if they hold still [m]."""
+    first = values[: max(4, len(values) // 20)]
+    return float(np.nanmax([robust_deviation(column) for column in np.diff(first, axis=0).T])) / math.sqrt(2.0)
+
+
+def _basis(time: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """[trial, sample, 3]: one, and the damped cosine and sine."""
+    omega = 2.0 * np.pi * frequency[:, None]
+    decay = np.exp(-ratio[:, None] / np.sqrt(1.0 - ratio[:, None] ** 2) * omega * time)
+    return np.stack([np.ones_like(decay), decay * np.cos(omega * time), decay * np.sin(omega * time)], -1)
+
+
+def _misfit(
+    time: np.ndarray, values: np.ndarray, weight: np.ndarray, frequency: np.ndarray, ratio: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted squares left over [trial], and coefficients [trial, 3, column], for trials [trial]."""
+    basis = _basis(time, frequency, ratio)
+    clean = np.where(weight > 0.0, values, 0.0)
+    normal = np.einsum("tsi,sc,tsj->tcij", basis, weight, basis) + 1e-9 * np.eye(3)
+    right = np.einsum("tsi,sc->tci", basis, weight * clean)
+    found = np.linalg.solve(normal, right[..., None])[..., 0]
+    total = (weight * clean**2).sum()
+    return total - np.einsum("tci,tci->t", right, found), found.swapaxes(1, 2)
+
+
+def extract_features(track: Trajectory, onset: float | None = None) -> Features:
+    """Frequency, damping ratio and the rest from the motion after ``onset`` [s], found unless given."""
+    onset = find_onset(track) if onset is None else onset
+    here = track.time >= onset
+    time, values = track.time[here] - onset, columns_of(track)[here]
+    weight = np.isfinite(values).astype(float)
+    duration = float(time[-1] - time[0])
+    step = 1.0 / (FREQUENCIES_PER_BIN * duration)
+    grid = np.arange(0.5 / duration, max(0.45 * track.rate, 1.0 / duration), step)
+    ratio = DAMPING_RATIOS
+    best = (0.0, 0.0)
+    for turn in range(7):  # each finer; outliers weigh less once something is known
+        trials = [x.ravel() for x in np.meshgrid(grid, ratio, indexing="ij")]
+        left, found = _misfit(time, values, weight, *trials)
+        at = int(np.argmin(left))
+        best = (float(trials[0][at]), float(trials[1][at]))
+        off = values - _basis(time, *(np.array([x]) for x in best))[0] @ found[at]
+        noise = max(robust_deviation(off), 1e-9)
+        weight = np.where(np.isfinite(off), 1.0 / np.maximum(1.0, np.abs(np.nan_to_num(off)) / (3.0 * noise)), 0.0)
+        step = step if turn == 0 else 0.3 * step
+        grid = np.maximum(best[0] + step * np.linspace(-1.0, 1.0, 9), 0.05 / duration)
+        ratio = np.clip(best[1] * np.exp(np.linspace(-1.0, 1.0, 9) * 0.9 * 0.45**turn), 1e-3, 0.6)
+    return _describe(onset, best, found[at], off, values, noise, 1.0 / track.rate)
+
+
+def _describe(
+    onset: float,
+    best: tuple[float, float],
+    found: np.ndarray,
+    off: np.ndarray,
+    values: np.ndarray,
+    noise: float,
+    step: float,
+) -> Features:
+    frequency, ratio = best
+    rest, cosine, sine = found
+    strong = int(np.argmax(np.hypot(cosine, sine)))
+    phase = math.atan2(sine[strong], cosine[strong])  # the column with the largest swing is at its maximum there
+    turning = phase - math.pi * round(phase / math.pi)
+    shift = turning / (2.0 * math.pi * frequency)
+    if shift > 1.5 * step:  # the track begins within a swing: it was let go before
+        shift -= 0.5 / frequency
+    basis = _basis(np.array([shift]), np.array([frequency]), np.array([ratio]))[0, 0]
+    moved = np.nanvar(values, axis=0).sum()
+    return Features(
+        frequency=frequency, damping_ratio=ratio, release=onset + shift, rest=rest,
+        displacement=basis[1:] @ found[1:], noise=noise,
+        explained=float(1.0 - np.nanvar(off, axis=0).sum() / max(moved, 1e-18)),
+    )  # fmt: skip

@@ -1,0 +1,273 @@
+"""What a fit found, in words, as JSON, and as a file of plant parameters that scenes load."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import math
+import pathlib
+import re
+from typing import Any
+
+import numpy as np
+
+from vinesim.errors import writing
+from vinesim.scene.data_files import find_data_file
+from vinesim.scene.plant_parameters import Specimen
+from vinesim.tune.features import Features
+from vinesim.tune.posterior import Z90, Posterior, Sample
+from vinesim.tune.priors import Prior
+from vinesim.tune.problem import SOFT
+from vinesim.tune.trajectory import Trajectory
+
+_UNITS = {"modulus": "Pa", "damping": "s", "mass": "1", "bow_y": "rad", "bow_z": "rad"}
+_LOGARITHMIC = ("modulus", "damping", "mass")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Minimum:
+    """Another minimum of the loss."""
+
+    modulus: float
+    """[Pa]"""
+    loss_ratio: float
+    """[1] Its loss over that of the best."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Estimate:
+    """One fitted number."""
+
+    name: str
+    value: float
+    low: float
+    """Lower end of the 90 % interval."""
+    high: float
+    unit: str
+    prior: str
+    """90 % of the prior and where it comes from."""
+    known: bool
+    """Whether the data, not the prior, decide it."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """The result of :func:`vinesim.tune.tune`."""
+
+    specimen: Specimen
+    """As it was given."""
+    track: Trajectory
+    features: Features
+    """Of the track, without a model: frequency and logarithmic decrement to compare with."""
+    posterior: Posterior
+    sample: Sample | None
+    """Draws from the posterior, if they were asked for."""
+    noise: float
+    """[m] Robust standard deviation of what the fit leaves."""
+    frequency: float
+    """[Hz] Of the fitted plant."""
+    damping_ratio: float
+    """[1] Of the fitted plant's swing."""
+    model: np.ndarray
+    """[sample, column] m: the fitted track in the columns of ``track.tracked``; NaN where data are."""
+    jacobian: np.ndarray
+    """[observation, parameter] Derivatives of the fitted track."""
+    minima: tuple[Minimum, ...]
+    """Other minima, the best first."""
+    faults: tuple[str, ...]
+    """Why the fit is not to be believed; empty if nothing speaks against it."""
+    dt: float
+    """[s] Step of the simulation."""
+    force: tuple[float, float] | None
+    """[N] Reading of the gauge and its standard deviation."""
+    priors: dict[str, Prior]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing speaks against the fit."""
+        return not self.faults
+
+    @property
+    def estimates(self) -> tuple[Estimate, ...]:
+        """The plant's fitted numbers, in SI units."""
+        weak = {name for ridge in self.posterior.ridges for name, x in ridge.direction.items() if abs(x) > 0.3}
+        return tuple(self._estimate(name, name not in weak) for name in self.posterior.names[: self.posterior.physical])
+
+    def estimate(self, name: str) -> Estimate:
+        """One of them."""
+        return next(estimate for estimate in self.estimates if estimate.name == name)
+
+    def _estimate(self, name: str, known: bool) -> Estimate:
+        low, high = self.posterior.interval(name)
+        if self.sample is not None:
+            low, high = np.quantile(self.sample.draws[:, self.posterior.names.index(name)], [0.05, 0.95]).tolist()
+        middle = float(self.posterior.mean[self.posterior.names.index(name)])
+        prior = self.priors[name]
+        ends = [prior.mean - Z90 * prior.deviation, prior.mean + Z90 * prior.deviation]
+        own = {"modulus": self.specimen.modulus.value, "damping": self.specimen.damping.value}.get(name, 1.0)
+        if name in _LOGARITHMIC:
+            middle, low, high, *ends = (own * math.exp(x) for x in (middle, low, high, *ends))
+        words = f"{_short(ends[0])} to {_short(ends[1])} {_UNITS[name]}, {prior.source}"
+        return Estimate(name, middle, low, high, _UNITS[name], words, known)
+
+    @property
+    def outliers(self) -> int:
+        """Samples that weigh less than half, or were left out as gross errors."""
+        data = self.track.position[:, self.track.tracked]
+        off = np.abs(self.model - data) / self.noise
+        gross = np.isfinite(data) & ~np.isfinite(self.model)
+        return int((off > math.sqrt(3.0) * SOFT).sum() + gross.sum())
+
+    @property
+    def gaps(self) -> int:
+        """Positions that are missing."""
+        return int(np.isnan(self.track.position[:, self.track.tracked]).sum())
+
+    # ------------------------------------------------------------------ words
+
+    def lines(self) -> list[str]:
+        """The fit in words, one fact a line."""
+        f, lines = self.features, []
+        lines.append(f"{'fitted' if self.ok else 'FAILED'}: {self.track.source}, {len(self.track.time)} samples")
+        for e in self.estimates:
+            note = "" if e.known else "  NOT DECIDED BY THE DATA"
+            lines.append(f"{e.name:8s} {_short(e.value)} {e.unit}, 90 % {_short(e.low)} to {_short(e.high)}{note}")
+            lines.append(f"{'':8s} before: {e.prior}")
+        lines.append(
+            f"swing    {self.frequency:.3f} Hz, damping ratio {self.damping_ratio:.4f}; of the track alone: "
+            f"{f.frequency:.3f} Hz, {f.damping_ratio:.4f} (log decrement {f.log_decrement:.3f})"
+        )
+        lines.append(
+            f"noise    {1e3 * self.noise:.2f} mm; {self.outliers} outliers weigh less, {self.gaps} positions missing"
+        )
+        for ridge in self.posterior.ridges:
+            way = ", ".join(f"{name} {x:+.2f}" for name, x in ridge.direction.items())
+            lines.append(f"ridge    the data hardly change along ({way}): {self._remedy(ridge.direction)}")
+        for minimum in self.minima[:3]:
+            lines.append(
+                f"minimum  another at {_short(minimum.modulus)} Pa, with {minimum.loss_ratio:.1f} times the loss"
+            )
+        return lines + [f"fault    {fault}" for fault in self.faults]
+
+    def _remedy(self, direction: dict[str, float]) -> str:
+        if "modulus" in direction and "mass" in direction and self.force is None:
+            return "a free swing tells modulus over mass only; fix the mass, or add a column 'force [N]' of the pull"
+        return "what is given there is the prior; fix one of them, or measure it otherwise"
+
+    def as_json(self) -> dict[str, Any]:
+        """The fit as plain values."""
+        return {
+            "ok": self.ok,
+            "source": self.track.source,
+            "estimates": [dataclasses.asdict(e) for e in self.estimates],
+            "frequency_hz": self.frequency,
+            "damping_ratio": self.damping_ratio,
+            "track": {
+                "frequency_hz": self.features.frequency,
+                "damping_ratio": self.features.damping_ratio,
+                "log_decrement": self.features.log_decrement,
+                "release_s": self.features.release,
+            },
+            "noise_m": self.noise,
+            "outliers": self.outliers,
+            "gaps": self.gaps,
+            "ridges": [dataclasses.asdict(ridge) for ridge in self.posterior.ridges],
+            "minima": [dataclasses.asdict(minimum) for minimum in self.minima],
+            "faults": list(self.faults),
+        }
+
+    # ------------------------------------------------------------------ file
+
+    def fitted_specimen(self) -> Specimen:
+        """The specimen with the fitted numbers, of grade FITTED."""
+        text = f"{datetime.date.today().isoformat()}, vinesim tune of {self.track.source}"
+        changes: dict[str, Any] = {}
+        bow = list(self.specimen.bow)
+        for e in self.estimates:
+            told = f"{text}: 90 % {_short(e.low)} to {_short(e.high)}"
+            if e.name.startswith("bow"):
+                bow["yz".index(e.name[-1])] = float(_short(e.value))
+            for field in {"modulus": ("modulus",), "damping": ("damping",), "mass": ("density", "tip_mass")}.get(
+                e.name, ()
+            ):
+                number = getattr(self.specimen, field)
+                if number is not None:
+                    value = number.value * e.value if e.name == "mass" else e.value
+                    told = told + " times" * (e.name == "mass")
+                    changes[field] = _replaced(number, float(f"{value:.5g}"), told)
+        return _replace_struct(self.specimen, bow=(bow[0], bow[1]), **changes)
+
+    def write_plant(self, path: str | pathlib.Path, plant: str = "vine") -> None:
+        """Write plant parameters that scenes load (``plants = "FILE"``): those of ``plant`` with the fitted numbers,
+        and the table ``[specimen]``.
+
+        A cane's modulus becomes ``woody_modulus``; ``green_modulus`` keeps its ratio to it.
+        """
+        text = find_data_file("plants", plant, ".toml").read_text("utf-8")
+        text = text.split("\n[specimen]")[0].rstrip() + "\n"
+        fitted = self.fitted_specimen()
+        part = "cane" if fitted.organ == "cane" else "peduncle"
+        keys = {"modulus": "woody_modulus" if part == "cane" else "modulus", "damping": "damping", "density": "density"}
+        for field, key in keys.items():
+            number = getattr(fitted, field)
+            if number.grade == "FITTED" and number is not getattr(self.specimen, field):
+                if key == "woody_modulus":
+                    text = _scale_green(text, number)
+                text = _replace_line(text, part, key, number)
+        if part == "peduncle" and fitted.tip_mass is not None and fitted.tip_mass.grade == "FITTED":
+            text = _replace_line(text, "bunch", "mass", fitted.tip_mass)
+        with writing(path):
+            pathlib.Path(path).write_text(text + "\n" + specimen_toml(fitted), encoding="utf-8")
+
+
+def specimen_toml(specimen: Specimen) -> str:
+    """The table ``[specimen]``."""
+    lines = ["[specimen]", f'organ = "{specimen.organ}"']
+    for name in ("length", "base_diameter", "tip_diameter", "modulus", "density", "damping", "tip_mass"):
+        number = getattr(specimen, name)
+        if number is not None:
+            lines.append(f"{name} = {_number(number)}")
+    if specimen.direction is not None:
+        lines.append(f"direction = {list(specimen.direction)}")
+    lines += [f"bow = {list(specimen.bow)}", f"segments = {specimen.segments}"]
+    if specimen.markers:
+        lines.append("markers = { " + ", ".join(f'"{k}" = {v}' for k, v in specimen.markers.items()) + " }")
+    return "\n".join(lines) + "\n"
+
+
+def _number(number: Any) -> str:
+    source = number.source.replace("\\", "/").replace('"', "'")
+    return (
+        f'{{ value = {float(number.value)!r}, unit = "{number.unit}", grade = "{number.grade}", source = "{source}" }}'
+    )
+
+
+def _replaced(number: Any, value: float, source: str) -> Any:
+    return _replace_struct(number, value=value, grade="FITTED", source=source)
+
+
+def _replace_struct(struct: Any, **changes: Any) -> Any:
+    return type(struct)(**({name: getattr(struct, name) for name in struct.__struct_fields__} | changes))
+
+
+def _replace_line(text: str, table: str, key: str, number: Any) -> str:
+    """The text of a TOML file with the line of one number of one table replaced."""
+    before, head, after = re.split(rf"(^\[{table}\][^\n]*\n)", text, maxsplit=1, flags=re.MULTILINE)
+    after = re.sub(rf"^{key} = [^\n]*", lambda _: f"{key} = {_number(number)}", after, count=1, flags=re.MULTILINE)
+    return before + head + after
+
+
+def _scale_green(text: str, woody: Any) -> str:
+    """Keep the ratio of a shoot's green to its woody modulus."""
+    values = [
+        float(re.search(rf"^{key} = {{ value = ([^,]+),", text, re.MULTILINE)[1])  # pyright: ignore[reportOptionalSubscript]
+        for key in ("woody_modulus", "green_modulus")
+    ]
+    source = f"as far below the woody modulus as before; {woody.source}"
+    return _replace_line(
+        text, "cane", "green_modulus", _replaced(woody, float(f"{woody.value * values[1] / values[0]:.5g}"), source)
+    )
+
+
+def _short(value: float) -> str:
+    return f"{value:.4g}"

@@ -1,0 +1,128 @@
+"""Pictures of a fit: track with band, residuals, held-out release, posterior beside prior."""
+
+from __future__ import annotations
+
+import math
+import pathlib
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vinesim.errors import writing
+from vinesim.tune.fit import Fit
+from vinesim.tune.posterior import Z90
+
+_ORDER = ("modulus", "damping", "mass")
+
+
+def plot_fit(fit: Fit, path: str | pathlib.Path) -> None:
+    """Draw track, residuals and posterior into a file."""
+    matplotlib.use("Agg")
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.3, 1.0])[0]
+    above, below = left.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.0])
+    draw_track(fit, above)
+    draw_residuals(fit, below)
+    count = max(fit.posterior.physical, 1)
+    draw_posterior(fit, right.subplots(count, count, squeeze=False))
+    with writing(path):
+        figure.savefig(path, dpi=130)
+
+
+def strongest_column(fit: Fit) -> int:
+    """The tracked column that swings furthest."""
+    return int(np.argmax(np.nanstd(fit.model, axis=0)))
+
+
+def draw_track(fit: Fit, axes: Axes, column: int | None = None) -> None:
+    """One column of the track, the fitted candidate, and the 90 % band of parameters and noise."""
+    column = strongest_column(fit) if column is None else column
+    seen = np.isfinite(fit.model)
+    spread = np.full(fit.model.shape, np.nan)
+    spread[seen] = np.einsum("oi,ij,oj->o", fit.jacobian, fit.posterior.covariance, fit.jacobian)
+    half = Z90 * np.sqrt(spread[:, column] + fit.noise**2)
+    data = fit.track.position[:, fit.track.tracked][:, column]
+    time, model = fit.track.time, fit.model[:, column]
+    axes.fill_between(time, 1e3 * (model - half), 1e3 * (model + half), color="C0", alpha=0.25, lw=0, label="90 %")
+    axes.plot(time, 1e3 * model, color="C0", lw=1.0, label="fitted")
+    axes.plot(time, 1e3 * data, ".", color="k", ms=3.0, label="track")
+    axes.set_ylabel(f"{column_names(fit)[column]} [mm]")
+    axes.set_title(f"{fit.frequency:.2f} Hz, damping ratio {fit.damping_ratio:.3f}", fontsize="medium")
+    axes.legend(fontsize="small", loc="upper right")
+
+
+def draw_residuals(fit: Fit, axes: Axes) -> None:
+    """What the fit leaves in every column, and the noise."""
+    off = 1e3 * (fit.track.position[:, fit.track.tracked] - fit.model)
+    for column, name in zip(off.T, column_names(fit), strict=True):
+        axes.plot(fit.track.time, column, ".", ms=3.0, label=name)
+    for sign in (-Z90, Z90):
+        axes.axhline(1e3 * sign * fit.noise, color="k", lw=0.6, ls="--")
+    axes.set_ylabel("residual [mm]")
+    axes.set_xlabel("time [s]")
+    axes.legend(fontsize="small", loc="upper right", ncols=3)
+
+
+def draw_posterior(fit: Fit, grid: np.ndarray) -> None:
+    """Posterior of the plant's numbers, one against the other [k, k], with the prior where it fits the picture."""
+    posterior, count = fit.posterior, fit.posterior.physical
+    names = posterior.names[:count]
+    labels = [f"ln {name}" if name in _ORDER else name for name in names]
+    deviation = posterior.deviation
+    for row in range(count):
+        for column in range(count):
+            axes: Axes = grid[row, column]
+            axes.tick_params(labelsize="x-small")
+            if column > row:
+                axes.set_axis_off()
+                continue
+            x = posterior.mean[column] + np.linspace(-4.0, 4.0, 201) * deviation[column]
+            if row == column:
+                prior = fit.priors[names[row]]
+                axes.plot(x, _normal(x, posterior.mean[row], deviation[row]), color="C0", label="posterior")
+                axes.plot(x, _normal(x, prior.mean, prior.deviation), color="C1", label="prior")
+                if fit.sample is not None:
+                    axes.hist(fit.sample.draws[:, row], 40, density=True, color="0.8", label="draws")
+                axes.set_yticks([])
+                axes.legend(fontsize="x-small")
+            else:
+                _draw_ellipses(axes, posterior.mean, posterior.covariance, column, row)
+            if row == count - 1:
+                axes.set_xlabel(labels[column])
+            if column == 0 and row:
+                axes.set_ylabel(labels[row])
+
+
+def draw_held_out(fit: Fit, held_out: Fit, axes: Axes) -> None:
+    """Another release of the same plant, and what the fit of the first says of it."""
+    column = strongest_column(held_out)
+    axes.plot(held_out.track.time, 1e3 * held_out.model[:, column], color="C0", lw=1.0, label="fitted elsewhere")
+    data = held_out.track.position[:, held_out.track.tracked][:, column]
+    axes.plot(held_out.track.time, 1e3 * data, ".", color="k", ms=3.0, label="held out")
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(f"{column_names(fit)[column]} [mm]")
+    axes.legend(fontsize="small")
+
+
+def column_names(fit: Fit) -> list[str]:
+    """Names of the tracked columns: marker and axis."""
+    return [f"{fit.track.markers[marker]} {'xyz'[axis]}" for marker, axis in np.argwhere(fit.track.tracked)]
+
+
+def _normal(x: np.ndarray, mean: float, deviation: float) -> np.ndarray:
+    if not math.isfinite(deviation):
+        return np.zeros_like(x)
+    return np.exp(-0.5 * ((x - mean) / deviation) ** 2) / (deviation * math.sqrt(2.0 * math.pi))
+
+
+def _draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray, i: int, j: int) -> None:
+    """Half and nine tenths of the probability."""
+    part = covariance[np.ix_([i, j], [i, j])]
+    values, vectors = np.linalg.eigh(part)
+    angle = np.linspace(0.0, 2.0 * np.pi, 100)
+    circle = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * np.stack([np.cos(angle), np.sin(angle)]))
+    for share, style in ((0.5, "-"), (0.9, "--")):
+        radius = math.sqrt(-2.0 * math.log(1.0 - share))
+        axes.plot(mean[i] + radius * circle[0], mean[j] + radius * circle[1], style, color="C0", lw=1.0)

@@ -1,0 +1,143 @@
+"""Laplace's approximation of the posterior, what of it the data decide, and importance resampling beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from vinesim.tune.problem import SOFT, Evaluation, Problem
+
+Z90 = 1.6448536269514722
+"""Standard deviations from the middle of a normal distribution to either end of its 90 % interval."""
+DECIDED = 3.0
+"""The data decide a direction if they know it so many times better than the prior, as information (1 / variance)."""
+_CORRELATED = 3.0
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Ridge:
+    """A direction of the fitted parameters along which data say next to nothing."""
+
+    direction: dict[str, float]
+    """Unit vector: by how much each parameter changes along it (logarithms; rad for bows)."""
+    information: float
+    """[1] Information of the data over the prior's, along it."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Posterior:
+    """A normal distribution of all parameters around the best ones."""
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    covariance: np.ndarray
+    physical: int
+    """How many of the first belong to the plant; the others to the experiment."""
+    ridges: tuple[Ridge, ...]
+    correlation_time: float
+    """[sample] Of the residuals, 1 if they are independent; the intervals are widened by its root."""
+
+    @property
+    def deviation(self) -> np.ndarray:
+        """[parameter]"""
+        return np.sqrt(np.diag(self.covariance))
+
+    def interval(self, name: str) -> tuple[float, float]:
+        """The 90 % interval of one parameter."""
+        i = self.names.index(name)
+        half = Z90 * float(self.deviation[i])
+        return float(self.mean[i]) - half, float(self.mean[i]) + half
+
+
+def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: float) -> Posterior:
+    """The posterior around a minimum ``theta`` that was evaluated.
+
+    The covariance is that of an M-estimator (Huber 1981) with the soft L1 loss, so that outliers and heavy tails widen
+    it; residuals that are correlated count as fewer.
+    """
+    residual = (found.model - problem.observed[problem.seen]) / noise
+    z = residual**2 / SOFT**2
+    slope = float(np.mean((1.0 + z) ** -1.5))
+    free = max(len(residual) - len(theta), 1)
+    spread = float((residual**2 / (1.0 + z)).sum()) / free
+    correlation_time = _correlation_time(problem, residual)
+    weight = slope**2 / (spread * correlation_time)
+    data = weight * (found.jacobian / noise).T @ (found.jacobian / noise)
+    readings = sum(math.isfinite(prior.deviation) for prior in problem.priors)
+    data += found.extra_jacobian[readings:].T @ found.extra_jacobian[readings:]  # the force
+    prior = np.array([1.0 / p.deviation**2 for p in problem.priors])  # 0 where nothing is known
+    size = 1.0 / np.sqrt(np.maximum(np.diag(data) + prior, 1e-12))
+    scaled = (data + np.diag(prior)) * size * size[:, None]
+    covariance = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) * size * size[:, None]
+    return Posterior(
+        problem.names, theta.copy(), covariance, len(problem.fitted), _ridges(problem, data, prior), correlation_time
+    )
+
+
+def _correlation_time(problem: Problem, residual: np.ndarray) -> float:
+    """Samples that tell as much as one independent one: 1 unless neighbours are clearly correlated."""
+    table = np.full(problem.observed.shape, np.nan)
+    table[problem.seen] = np.clip(residual, -SOFT, SOFT)
+    pairs = table[:-1] * table[1:]
+    count = int(np.isfinite(pairs).sum())
+    if count < 10:
+        return 1.0
+    rho = float(np.nanmean(pairs) / np.nanmean(table**2))
+    return (1.0 + rho) / (1.0 - rho) if rho > _CORRELATED / math.sqrt(count) and rho < 0.99 else 1.0
+
+
+def _ridges(problem: Problem, data: np.ndarray, prior: np.ndarray) -> tuple[Ridge, ...]:
+    """Directions of the plant's parameters, in units of their priors, that the data do not decide."""
+    k = len(problem.fitted)
+    if k == 0:
+        return ()
+    rest = data[k:, k:] + np.diag(prior[k:])
+    cross = data[:k, k:]
+    alone = data[:k, :k] - cross @ np.linalg.pinv(rest, rcond=1e-12, hermitian=True) @ cross.T
+    width = 1.0 / np.sqrt(prior[:k])
+    values, vectors = np.linalg.eigh(alone * width * width[:, None])
+    ridges = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value < DECIDED:
+            way = vector * width
+            way /= np.linalg.norm(way) * (1.0 if way[np.argmax(np.abs(way))] > 0.0 else -1.0)
+            named = {name: float(x) for name, x in zip(problem.fitted, way, strict=True) if abs(x) > 0.05}
+            ridges.append(Ridge(named, max(float(value), 0.0)))
+    return tuple(ridges)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Sample:
+    """Draws from the posterior itself, by importance resampling of draws from Laplace's."""
+
+    draws: np.ndarray
+    """[n, parameter], equally likely."""
+    effective: float
+    """How many independent draws they are worth (Kish)."""
+
+
+def importance_sample(
+    problem: Problem, posterior: Posterior, noise: float, count: int, seed: int = 0, batch: int = 64
+) -> Sample:
+    """Draw ``count`` candidates around the minimum, run them as trees of few launches, and weigh them by posterior over
+    proposal: a Student t with five degrees of freedom and the covariance of ``posterior``."""
+    rng = np.random.default_rng(seed)
+    size = len(posterior.mean)
+    root = np.linalg.cholesky(posterior.covariance + 1e-15 * np.diag(np.diag(posterior.covariance)))
+    freedom = 5.0
+    normal = rng.normal(size=(count, size))
+    stretch = np.sqrt(freedom / rng.chisquare(freedom, count))
+    thetas = posterior.mean + (normal * stretch[:, None]) @ root.T
+    distance = (normal**2).sum(1) * stretch**2
+    log_weight = 0.5 * (freedom + size) * np.log1p(distance / freedom)
+    for first in range(0, count, batch):
+        some = thetas[first : first + batch]
+        rows = np.array([problem.row(theta) for theta in some])
+        x, _ = problem.samples(some, rows)
+        log_weight[first : first + batch] -= [problem.loss(t, y, noise) for t, y in zip(some, x, strict=True)]
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    chosen = np.searchsorted(np.cumsum(weight), (rng.random() + np.arange(count)) / count)
+    return Sample(thetas[np.minimum(chosen, count - 1)], float(1.0 / (weight**2).sum()))

@@ -1,0 +1,49 @@
+"""What is known before the measurement: ``data/plants``, each number as good as its grade."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from vinesim.scene.plant_parameters import Specimen, load_plant
+
+GRADE_DEVIATIONS = {"READ": 0.5, "DERIVED": 0.7, "GUESSED": 1.0, "FITTED": 0.3}
+"""[1] Standard deviation of the natural logarithm: plants differ, whatever the grade."""
+DENSITY_DEVIATION = 0.15
+"""[1] Of the logarithm of wood's density: 800 to 1050 kg/m^3, the range that ``data/plants`` gives."""
+BOW_DEVIATION = 0.5
+"""[rad]"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Prior:
+    """A normal distribution of one fitted number."""
+
+    mean: float
+    deviation: float
+    """``inf``: nothing is known."""
+    source: str
+
+
+def physical_priors(specimen: Specimen, plant: str = "vine") -> dict[str, Prior]:
+    """Priors of the columns of a candidate that belong to the plant, by name."""
+    known = load_plant(plant)
+    part = known.cane if specimen.organ == "cane" else known.peduncle
+    modulus = known.cane.woody_modulus if specimen.organ == "cane" else known.peduncle.modulus
+    priors = {
+        name: Prior(
+            math.log(number.value / own.value), GRADE_DEVIATIONS[number.grade], f"{number.grade}: {number.source}"
+        )
+        for name, number, own in (
+            ("modulus", modulus, specimen.modulus),
+            ("damping", part.damping, specimen.damping),
+        )
+    }
+    if specimen.organ == "cane":
+        spread, source = DENSITY_DEVIATION, f"{part.density.grade}: {part.density.source}"
+    else:
+        spread, source = known.bunch.mass_variation.value, f"{known.bunch.mass_variation.grade}: variation of bunches"
+    priors["mass"] = Prior(0.0, spread, source)
+    for i, axis in enumerate("yz"):
+        priors[f"bow_{axis}"] = Prior(specimen.bow[i], BOW_DEVIATION, "GUESSED: canes are bent by up to a radian")
+    return priors

@@ -1,0 +1,240 @@
+"""The least-squares problem: parameters of a plant and of the experiment, residuals of a track, their derivatives.
+
+The Jacobian is that of the simulator itself: central differences of candidates that run side by side in one launch, so
+that a residual vector and its Jacobian cost one simulation of nine or so trees (docs/decisions/tuning.md).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from vinesim.scene.plant_parameters import Specimen
+from vinesim.tune.candidates import COLUMNS, Candidates
+from vinesim.tune.features import Features, columns_of
+from vinesim.tune.priors import Prior
+from vinesim.tune.trajectory import Trajectory
+
+PHYSICAL = COLUMNS[:5]
+SOFT = 3.0
+"""[1] Residuals of so many standard deviations begin to weigh less (soft L1)."""
+PHASE_STEP = 0.05
+"""[rad] Change of phase at the end of the track by which derivatives of modulus and mass are taken."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Model and derivatives at one point."""
+
+    model: np.ndarray
+    """[observation] m"""
+    jacobian: np.ndarray
+    """[observation, parameter] m"""
+    extra: np.ndarray
+    """[row] standard deviations: force reading and priors."""
+    extra_jacobian: np.ndarray
+    """[row, parameter]"""
+
+
+class Problem:
+    """Residuals of a track by parameters.
+
+    Args:
+        specimen: the plant with the user's own numbers.
+        track: what was measured.
+        features: of the track.
+        fitted: which of :data:`PHYSICAL` are fitted.
+        priors: of those, by name.
+        dt: step of the simulation [s].
+    """
+
+    def __init__(
+        self, specimen: Specimen, track: Trajectory, features: Features, fitted: tuple[str, ...],
+        priors: dict[str, Prior], dt: float, device: str = "cpu",
+    ) -> None:  # fmt: skip
+        self.specimen, self.track, self.features, self.fitted = specimen, track, features, fitted
+        self.candidates = Candidates(specimen, track.markers, dt=dt, device=device)
+        self.observed = columns_of(track)
+        self.seen = np.isfinite(self.observed)
+        self.axes = np.flatnonzero(track.tracked.any(0))
+        tips = self.candidates.pull_axes()[:, self.axes]
+        self.pulls = tuple(name for name, way in zip(COLUMNS[5:], tips, strict=True) if np.linalg.norm(way) > 0.3)
+        free = "bow_y" not in fitted and "bow_z" not in fitted
+        self.origins = tuple(f"origin_{'xyz'[axis]}" for axis in self.axes) if free else ()
+        self.names = (*fitted, *self.pulls, "release", *self.origins)
+        self.simulated = tuple(name for name in self.names if name in COLUMNS)
+        turn = max(2.0 / track.rate, 0.1 / features.frequency)
+        flat = Prior(0.0, math.inf, "flat")
+        known = priors | {"release": Prior(features.release, turn, "onset of the motion")}
+        self.priors = [known.get(name, flat) for name in self.names]
+        self.force = _force_reading(track, features.release)
+        self.pull_scale = 1.0
+        """[N] Size of the pull, for the step of its derivative."""
+        self.evaluations = 0
+        self.correction = np.zeros(self.observed.shape)
+        """[sample, column] m, what shorter steps would change; see :meth:`refine`."""
+
+    # ------------------------------------------------------------------ parameters
+
+    def row(self, theta: np.ndarray) -> np.ndarray:
+        """The candidate [7] of parameters [parameter]."""
+        candidate = np.zeros(len(COLUMNS))
+        candidate[3:5] = self.specimen.bow
+        for name in self.simulated:
+            candidate[COLUMNS.index(name)] = theta[self.names.index(name)]
+        return candidate
+
+    def step(self, name: str) -> float:
+        """Half the difference by which the derivative by a simulated parameter is taken."""
+        if name in ("modulus", "mass"):
+            swing = math.pi * self.features.frequency * max(self.track.time[-1] - self.features.release, 0.2)
+            return min(0.05, 2.0 * PHASE_STEP / swing)
+        return {"damping": 0.1, "bow_y": 0.01, "bow_z": 0.01}.get(name, 0.05 * self.pull_scale)
+
+    # ------------------------------------------------------------------ model
+
+    def samples(
+        self, thetas: np.ndarray, candidates: np.ndarray, end: float = math.inf
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities [n, sample, column] of candidates [n, 7] whose release and origin ``thetas`` [n,
+        parameter] say, at the samples up to ``end`` [s]."""
+        time = self.track.time[self.track.time <= end]
+        at = self.names.index("release")
+        release = thetas[:, at]
+        after = np.maximum(time - release.mean(), 0.0)
+        tick = np.floor(after / self.candidates.dt + 1e-6).astype(int)
+        ticks, index = np.unique(tick, return_inverse=True)
+        motion = self.candidates.run(candidates, ticks)
+        begun = time > release[:, None]
+        offset = np.where(begun, time - release[:, None] - tick * self.candidates.dt, 0.0)
+        position, velocity = motion.at(index, offset)
+        velocity = velocity * begun[..., None, None]
+        x, v = (rows[:, :, self.track.tracked] for rows in (position, velocity))
+        return x + self._origin(thetas)[:, None] + self.correction[: len(time)], v
+
+    def refine(self, theta: np.ndarray) -> None:
+        """Find the error of the step near ``theta`` and correct all positions by it from now on.
+
+        The scheme is of second order, so what is missing is 4/3 of what half the step changes (Richardson).
+        """
+        coarse, self.correction = self.candidates, np.zeros(self.observed.shape)
+        row = self.row(theta)[None]
+        before, _ = self.samples(theta[None], row)
+        self.candidates = Candidates(self.specimen, self.track.markers, dt=0.5 * coarse.dt, device=coarse.device)
+        after, _ = self.samples(theta[None], row)
+        self.candidates = coarse
+        self.correction = 4.0 / 3.0 * (after[0] - before[0])
+
+    def _origin(self, thetas: np.ndarray) -> np.ndarray:
+        """[n, column] m"""
+        axis = np.nonzero(self.track.tracked)[1]
+        if not self.origins:
+            return np.zeros((len(thetas), len(axis)))
+        first = self.names.index(self.origins[0])
+        return thetas[:, first + np.searchsorted(self.axes, axis)]
+
+    def evaluate(self, theta: np.ndarray, end: float = math.inf) -> Evaluation:
+        """Model, Jacobian and what is not of the track, at one point, for the samples up to ``end`` [s]."""
+        self.evaluations += 1
+        base, steps = self.row(theta), [self.step(name) for name in self.simulated]
+        rows = [base]
+        for name, h in zip(self.simulated, steps, strict=True):
+            for sign in (h, -h):
+                changed = base.copy()
+                changed[COLUMNS.index(name)] += sign
+                rows.append(changed)
+        x, v = self.samples(np.repeat(theta[None], len(rows), 0), np.array(rows), end)
+        seen = self.seen[: x.shape[1]]
+        jacobian = np.zeros((int(seen.sum()), len(self.names)))
+        for i, (name, h) in enumerate(zip(self.simulated, steps, strict=True)):
+            jacobian[:, self.names.index(name)] = ((x[1 + 2 * i] - x[2 + 2 * i]) / (2.0 * h))[seen]
+        jacobian[:, self.names.index("release")] = -v[0][seen]
+        axis = np.broadcast_to(np.nonzero(self.track.tracked)[1], seen.shape)[seen]
+        for i, name in enumerate(self.origins):
+            jacobian[:, self.names.index(name)] = axis == self.axes[i]
+        return Evaluation(x[0][seen], jacobian, *self._extra(theta))
+
+    def _extra(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of priors and of the force reading."""
+        values, rows = [], []
+        for i, prior in enumerate(self.priors):
+            if math.isfinite(prior.deviation):
+                values.append((theta[i] - prior.mean) / prior.deviation)
+                rows.append(np.eye(len(theta))[i] / prior.deviation)
+        if self.force is not None:
+            at = [self.names.index(name) for name in self.pulls]
+            stiff = math.exp(theta[self.names.index("modulus")]) if "modulus" in self.names else 1.0
+            pull = float(np.linalg.norm(theta[at]))
+            row = np.zeros(len(theta))
+            row[at] = stiff * theta[at] / max(pull, 1e-12)
+            if "modulus" in self.names:
+                row[self.names.index("modulus")] = stiff * pull
+            reading, deviation = self.force
+            values.append((stiff * pull - reading) / deviation)
+            rows.append(row / deviation)
+        return np.array(values), np.array(rows).reshape(len(values), len(theta))
+
+    # ------------------------------------------------------------------ minimum
+
+    def minimise(
+        self, theta: np.ndarray, noise: float, end: float = math.inf, most: int = 30, tolerance: float = 1e-5
+    ) -> tuple[np.ndarray, Evaluation]:
+        """The parameters of least loss near ``theta``, evaluated, for a noise [m] and samples up to ``end`` [s]."""
+        known: dict[bytes, Evaluation] = {}
+        data = self.observed[: int((self.track.time <= end).sum())]
+        data = data[np.isfinite(data)]
+
+        def at(point: np.ndarray) -> Evaluation:
+            key = point.tobytes()
+            if key not in known:
+                known[key] = self.evaluate(point, end)
+            return known[key]
+
+        def residuals(point: np.ndarray) -> np.ndarray:
+            found = at(point)
+            return np.concatenate([(found.model - data) / noise, found.extra])
+
+        def jacobian(point: np.ndarray) -> np.ndarray:
+            found = at(point)
+            return np.concatenate([found.jacobian / noise, found.extra_jacobian])
+
+        soft = np.arange(len(data) + len(at(theta).extra)) < len(data)
+
+        def loss(z: np.ndarray) -> np.ndarray:
+            root = np.sqrt(1.0 + z)
+            rows = np.array([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
+            return np.where(soft, rows, np.array([z, np.ones_like(z), np.zeros_like(z)]))
+
+        options: Any = {"jac": jacobian, "loss": loss}  # scipy's stubs know names only
+        found = least_squares(
+            residuals, theta, method="trf", x_scale=self._scales(), f_scale=SOFT, max_nfev=most, ftol=tolerance,
+            xtol=1e-6, gtol=1e-8, **options,
+        )  # fmt: skip
+        return found.x, at(found.x)
+
+    def loss(self, theta: np.ndarray, positions: np.ndarray, noise: float) -> float:
+        """Loss of positions [sample, column], priors and force included: what :meth:`minimise` makes small."""
+        z = ((positions - self.observed)[self.seen] / noise / SOFT) ** 2
+        return float(SOFT**2 * (np.sqrt(1.0 + z) - 1.0).sum() + 0.5 * (self._extra(theta)[0] ** 2).sum())
+
+    def _scales(self) -> np.ndarray:
+        """Typical changes of the parameters."""
+        sizes = {"release": 0.5 / self.track.rate, "modulus": 0.1, "damping": 0.3, "mass": 0.1}
+        sizes |= dict.fromkeys(("bow_y", "bow_z"), 0.1) | dict.fromkeys(self.pulls, 0.2 * self.pull_scale)
+        return np.array([sizes.get(name, 0.02) for name in self.names])
+
+
+def _force_reading(track: Trajectory, release: float) -> tuple[float, float] | None:
+    """Mean and standard deviation [N] of the pull before the release; at least 1 % of the mean."""
+    if track.force is None:
+        return None
+    held = track.force[(track.time <= release) & np.isfinite(track.force)]
+    held = held[held > 0.0]
+    if len(held) == 0:
+        return None
+    mean = float(np.median(held))
+    return mean, max(float(np.std(held)) / math.sqrt(len(held)), 0.01 * mean)

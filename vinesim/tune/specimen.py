@@ -1,0 +1,76 @@
+"""The measured plant as trees of the simulator: a cane, or a bunch on its peduncle, clamped at the origin."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.errors import UsageError
+from vinesim.scene.builder import RodMaterial, TreeBuilder
+from vinesim.scene.cane import CaneBuilder
+from vinesim.scene.ids import Organ
+from vinesim.scene.plant_parameters import Specimen
+
+TIP = "tip"
+"""The marker that every specimen has."""
+_DIRECTIONS = {"cane": (1.0, 0.0, 0.0), "bunch": (0.0, 0.0, -1.0)}
+
+
+def base_pose(specimen: Specimen) -> np.ndarray:
+    """Pose [7] of the base: at the origin, x in the direction of growth."""
+    along = np.array(specimen.direction or _DIRECTIONS[specimen.organ], float)
+    return frames.pose(np.zeros(3), frames.from_x_axis(along / np.linalg.norm(along)))
+
+
+def rest_bends(specimen: Specimen, bow: np.ndarray) -> np.ndarray:
+    """Rotation vectors [..., segments, 3] rad of each segment against the one before, for bows [..., 2] rad.
+
+    The first segment is clamped in the direction of growth; the others share the bow equally.
+    """
+    bends = np.zeros((*np.shape(bow)[:-1], specimen.segments, 3))
+    bends[..., 1:, 1:] = np.asarray(bow, float)[..., None, :] / (specimen.segments - 1)
+    return bends
+
+
+def build_tree(specimen: Specimen) -> TreeBuilder:
+    """One specimen as a tree: the rod's segments, then the bunch if it is one."""
+    radius = (0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value)
+    bends = rest_bends(specimen, np.array(specimen.bow))
+    if specimen.organ == "cane":
+        return CaneBuilder(
+            length=specimen.length.value, radius=radius, youngs_modulus=specimen.modulus.value,
+            density=specimen.density.value, segments=specimen.segments, beta=specimen.damping.value,
+            tip_mass=0.0 if specimen.tip_mass is None else specimen.tip_mass.value, pose=base_pose(specimen),
+            bends=bends,
+        ).tree()  # fmt: skip
+    tree = TreeBuilder(base_pose(specimen))
+    material = RodMaterial(specimen.modulus.value, specimen.density.value, specimen.damping.value)
+    last = tree.add_rod(
+        -1, specimen.length.value, radius, material, specimen.segments, organ=Organ.PEDUNCLE, bends=frames.exp(bends)
+    )[-1]
+    assert specimen.tip_mass is not None  # checked when it was loaded
+    tree.add_bunch(last, specimen.tip_mass.value, clusters=False)
+    return tree
+
+
+def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Body [k] of each marker in the specimen's tree, and its place [k, 3] m in that body's frame.
+
+    :class:`UsageError` for a marker that the specimen does not have.
+    """
+    segment = specimen.length.value / specimen.segments
+    bodies, points = [], []
+    for name in names:
+        if name == TIP and specimen.organ == "bunch":
+            tree = build_tree(specimen)
+            bodies.append(len(tree.bodies) - 1)
+            points.append((float(tree.bodies[-1]["length"]), 0.0, 0.0))
+            continue
+        if name != TIP and name not in specimen.markers:
+            known = ", ".join([TIP, *specimen.markers])
+            raise UsageError(f"marker {name!r} is not in the specimen, which has: {known}; add it to specimen.markers")
+        along = specimen.length.value if name == TIP else specimen.markers[name]
+        body = min(int(along / segment), specimen.segments - 1)
+        bodies.append(body)
+        points.append((along - body * segment, 0.0, 0.0))
+    return np.array(bodies), np.array(points)

@@ -1,0 +1,197 @@
+"""Tracks of markers, as a camera or a tracker gives them: read from CSV with units in the header, checked, written."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import pathlib
+import re
+
+import numpy as np
+
+from vinesim.errors import writing
+from vinesim.tune.specimen import TIP
+
+MIN_SAMPLES = 8
+"""Fewer say nothing about a swing."""
+MAX_MISSING = 0.6
+"""Share of a column that may be missing."""
+_SCALE = {"s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "N": 1.0}
+_UNITS = {"time": ("s", "ms"), "force": ("N",), "position": ("m", "cm", "mm")}
+_HEADER = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
+
+
+class TrajectoryError(ValueError):
+    """A track that cannot be used; one line with file, line, column, value and remedy."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Where markers were while a plant was pulled, let go and swung.
+
+    :class:`TrajectoryError` if shapes or numbers contradict each other.
+    """
+
+    time: np.ndarray
+    """[sample] s, increasing; need not be regular."""
+    position: np.ndarray
+    """[sample, marker, 3] m, world axes (z up); NaN where it was not seen. An axis that was not tracked is all NaN."""
+    markers: tuple[str, ...] = (TIP,)
+    """Names; see :attr:`~vinesim.scene.plant_parameters.Specimen.markers`."""
+    force: np.ndarray | None = None
+    """[sample] N: the pull that a gauge showed at the tip; NaN where there is no reading. None without gauge."""
+    source: str = "data"
+    """Where it comes from: the name of the file."""
+
+    def __post_init__(self) -> None:
+        count, trouble = len(self.time), None
+        if self.position.shape != (count, len(self.markers), 3):
+            trouble = f"position has the shape {self.position.shape}; give [{count}, {len(self.markers)}, 3]"
+        elif self.force is not None and self.force.shape != (count,):
+            trouble = f"force has the shape {self.force.shape}; give [{count}]"
+        elif count < MIN_SAMPLES:
+            trouble = f"{count} samples; give {MIN_SAMPLES} or more"
+        elif not np.isfinite(self.time).all() or (np.diff(self.time) <= 0.0).any():
+            trouble = "time does not increase; sort the samples and remove repeated ones"
+        elif not self.tracked.any():
+            trouble = "no axis of a marker was tracked; give a column such as 'x [mm]'"
+        if trouble:
+            raise TrajectoryError(f"{self.source}: {trouble}")
+
+    @property
+    def tracked(self) -> np.ndarray:
+        """[marker, 3] bool: which axes were tracked."""
+        return np.any(np.isfinite(self.position), axis=0)
+
+    @property
+    def rate(self) -> float:
+        """[1/s] Samples a second, by the median."""
+        return float(1.0 / np.median(np.diff(self.time)))
+
+    def between(self, start: float, end: float) -> Trajectory:
+        """The samples from one time to another [s]."""
+        here = (self.time >= start) & (self.time <= end)
+        force = None if self.force is None else self.force[here]
+        return dataclasses.replace(self, time=self.time[here], position=self.position[here], force=force)
+
+    def write(self, path: str | pathlib.Path) -> None:
+        """Write as CSV that :func:`read_trajectory` reads; positions in mm."""
+        columns = [("time [s]", self.time)]
+        for marker, axis in np.argwhere(self.tracked):
+            name = "xyz"[axis] if self.markers[marker] == TIP else f"{self.markers[marker]} {'xyz'[axis]}"
+            columns.append((f"{name} [mm]", 1e3 * self.position[:, marker, axis]))
+        if self.force is not None:
+            columns.append(("force [N]", self.force))
+        with writing(path), pathlib.Path(path).open("w", newline="", encoding="utf-8") as file:
+            out = csv.writer(file, lineterminator="\n")
+            out.writerow([name for name, _ in columns])
+            for row in zip(*(values.tolist() for _, values in columns), strict=True):
+                out.writerow(["" if math.isnan(value) else f"{value:.6g}" for value in row])
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Column:
+    kind: str
+    scale: float
+    marker: str = ""
+    axis: int = 0
+
+
+def read_trajectory(path: str | pathlib.Path) -> Trajectory:
+    """A track from CSV.
+
+    The first line names columns with units: ``time [s]``, ``x [mm]`` for the tip, ``NAME x [mm]`` for a marker,
+    ``force [N]``; axes x, y, z of the world, z up; s or ms, m, cm or mm. Empty cells and ``nan`` are gaps. Lines that
+    begin with ``#`` are skipped.
+
+    :class:`TrajectoryError` with line, column, value and remedy if a line does not fit.
+    """
+    path = pathlib.Path(path)
+    try:
+        lines = path.read_text("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as bad:
+        raise TrajectoryError(f"{path}: cannot be read: {bad}; give a CSV file in UTF-8") from None
+    rows = [(number, row) for number, row in enumerate(lines, 1) if row.strip() and not row.startswith("#")]
+    if not rows:
+        raise TrajectoryError(f"{path}: is empty; give a header such as 'time [s],x [mm],z [mm]' and samples")
+    cells = [(number, next(csv.reader([row]))) for number, row in rows]
+    columns = _read_header(path, *cells[0])
+    table = np.array([_read_row(path, number, row, columns, cells[0][1]) for number, row in cells[1:]])
+    table = table.reshape(-1, len(columns))
+    clock = next(i for i, column in enumerate(columns) if column.kind == "time")
+    for row in range(1, len(table)):
+        if not table[row, clock] > table[row - 1, clock]:
+            raise TrajectoryError(
+                f"{path}:{cells[row + 1][0]}: column {cells[0][1][clock]!r} does not increase: {table[row, clock]:g} s "
+                f"after {table[row - 1, clock]:g} s; sort the lines and remove repeated ones"
+            )
+    return _assemble(path, columns, table, clock)
+
+
+def _assemble(path: pathlib.Path, columns: list[_Column], table: np.ndarray, clock: int) -> Trajectory:
+    markers = tuple(dict.fromkeys(column.marker for column in columns if column.kind == "position"))
+    position, force = np.full((len(table), len(markers), 3), np.nan), None
+    for i, column in enumerate(columns):
+        if column.kind == "force":
+            force = table[:, i]
+        elif column.kind == "position":
+            missing = float(np.mean(np.isnan(table[:, i]))) if len(table) else 1.0
+            if missing > MAX_MISSING:
+                raise TrajectoryError(
+                    f"{path}: column {column.marker} {'xyz'[column.axis]} is empty in {missing:.0%} of the lines; "
+                    f"remove the column, or track it in more than {1.0 - MAX_MISSING:.0%}"
+                )
+            position[:, markers.index(column.marker), column.axis] = table[:, i]
+    return Trajectory(table[:, clock], position, markers, force, path.name)
+
+
+def _read_header(path: pathlib.Path, line: int, names: list[str]) -> list[_Column]:
+    columns = [_read_name(f"{path}:{line}: column {i} {name!r}", name) for i, name in enumerate(names, 1)]
+    seen: dict[tuple[str, str, int], int] = {}
+    for i, column in enumerate(columns):
+        key = (column.kind, column.marker, column.axis)
+        if key in seen:
+            raise TrajectoryError(f"{path}:{line}: columns {seen[key] + 1} and {i + 1} are the same; remove one")
+        seen[key] = i
+    kinds = [column.kind for column in columns]
+    for kind, example in (("time", "time [s]"), ("position", "x [mm]")):
+        if kind not in kinds:
+            raise TrajectoryError(f"{path}:{line}: no column of {kind}; add one, e.g. '{example}'")
+    return columns
+
+
+def _read_name(place: str, text: str) -> _Column:
+    found = _HEADER.fullmatch(text.strip())
+    if not found:
+        raise TrajectoryError(f"{place} has no unit; name it with its unit, e.g. 'time [s]', 'x [mm]', 'force [N]'")
+    name, unit = found["name"].strip(), found["unit"].strip()
+    words = name.replace(".", " ").replace("_", " ").split()
+    if name.lower() in ("time", "t"):
+        kind, marker, axis = "time", "", 0
+    elif name.lower() in ("force", "f"):
+        kind, marker, axis = "force", "", 0
+    elif words and words[-1].lower() in ("x", "y", "z"):
+        kind, marker, axis = "position", " ".join(words[:-1]) or TIP, "xyz".index(words[-1].lower())
+    else:
+        raise TrajectoryError(f"{place} is not known; name it time, x, y, z, 'MARKER x' or force, with its unit")
+    if unit not in _UNITS[kind]:
+        raise TrajectoryError(f"{place}: unit {unit!r} of a {kind}; give {' or '.join(_UNITS[kind])}")
+    return _Column(kind, _SCALE[unit], marker, axis)
+
+
+def _read_row(path: pathlib.Path, line: int, row: list[str], columns: list[_Column], names: list[str]) -> list[float]:
+    if len(row) != len(columns):
+        raise TrajectoryError(f"{path}:{line}: {len(row)} cells, the header has {len(columns)}; complete the line")
+    values = []
+    for cell, column, name in zip(row, columns, names, strict=True):
+        text = cell.strip()
+        try:
+            value = float(text) if text else math.nan
+        except ValueError:
+            value = math.inf
+        if math.isinf(value) or (column.kind == "time" and math.isnan(value)):
+            remedy = "give a number" + ", or leave the cell empty where there is none" * (column.kind != "time")
+            raise TrajectoryError(f"{path}:{line}: column {name.strip()!r} is {text!r}; {remedy}")
+        values.append(value * column.scale)
+    return values

@@ -1,0 +1,188 @@
+"""``tune``: from a track and a plant to fitted numbers, their uncertainty, and whether to believe them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from vinesim.errors import UsageError
+from vinesim.scene.plant_parameters import Specimen
+from vinesim.tune.candidates import COLUMNS
+from vinesim.tune.features import Features, extract_features, find_onset, robust_deviation
+from vinesim.tune.fit import Fit, Minimum
+from vinesim.tune.posterior import Posterior, importance_sample, laplace
+from vinesim.tune.priors import physical_priors
+from vinesim.tune.problem import Evaluation, Problem
+from vinesim.tune.start import start_values
+from vinesim.tune.trajectory import Trajectory, TrajectoryError
+
+STEP_PHASE = 0.1
+"""[rad] By which the first mode turns in a step of the simulation: errs by 0.2 % in modulus before it is corrected."""
+PARAMETERS = {"modulus": ("modulus",), "damping": ("damping",), "mass": ("mass",), "rest": ("bow_y", "bow_z")}
+"""What can be fitted, and which columns of a candidate that are."""
+UNEXPLAINED = 1.3
+"""A fit that leaves so many times more than a damped sinusoid does has failed."""
+HORIZONS = (1.0, 2.0, 4.0, 8.0)
+"""[period] After the release, when the whole track at once fails."""
+MINIMA = 2.0 ** np.linspace(-2.0, 2.0, 24)
+"""Moduli over the best one at which other minima are looked for."""
+
+
+def tune(
+    specimen: Specimen, track: Trajectory, parameters: Sequence[str] = ("modulus", "damping"), *,
+    release: float | None = None, samples: int = 0, seed: int = 0, device: str = "cpu",
+) -> Fit:  # fmt: skip
+    """Fit a specimen to a track of a pull and release.
+
+    Args:
+        specimen: the plant as far as it is known; modulus and damping may be off by any factor up to 40.
+        track: of one or more markers, from before or after the release on.
+        parameters: of :data:`PARAMETERS`. ``mass`` scales all masses alike and needs a force reading; ``rest`` is the
+            slack shape and needs positions from the base.
+        release: when it was let go [s]; found unless given.
+        samples: so many draws of the posterior beside Laplace's approximation.
+        seed: of those draws.
+        device: ``cpu``, ``cuda`` or ``cuda:N``.
+
+    :class:`~vinesim.tune.trajectory.TrajectoryError` for a track that cannot belong to the specimen,
+    :class:`~vinesim.errors.UsageError` for other parameters. A fit that has failed is returned and says so.
+    """
+    fitted = _columns(parameters)
+    features = extract_features(track, find_onset(track) if release is None else release)
+    if release is not None:
+        features = dataclasses.replace(features, release=release)
+    _check_track(specimen, track, features)
+    dt = float(np.clip(STEP_PHASE / (2.0 * math.pi * features.frequency), 5e-4, 0.01))
+    problem = Problem(specimen, track, features, fitted, physical_priors(specimen), dt, device)
+    theta, _, noise = _minimise(problem, start_values(problem), features.noise)
+    minima: tuple[Minimum, ...] = ()
+    if "modulus" in fitted:
+        theta, noise, minima = _look_for_minima(problem, theta, noise)
+    problem.refine(theta)
+    theta, found, noise = _settle(problem, theta, noise)
+    posterior = laplace(problem, theta, found, noise)
+    sample = importance_sample(problem, posterior, noise, samples, seed) if samples else None
+    model = np.full(problem.observed.shape, np.nan)
+    model[problem.seen] = found.model
+    swing = _fitted_features(problem, theta, model)
+    return Fit(
+        specimen=specimen, track=track, features=features, posterior=posterior, sample=sample, noise=noise,
+        frequency=swing.frequency, damping_ratio=swing.damping_ratio, model=model, jacobian=found.jacobian,
+        minima=minima, faults=_faults(problem, posterior, noise, found.model), dt=dt,
+        force=problem.force, priors=dict(zip(problem.names, problem.priors, strict=True)),
+    )  # fmt: skip
+
+
+def _columns(parameters: Sequence[str]) -> tuple[str, ...]:
+    unknown = [name for name in parameters if name not in PARAMETERS]
+    if unknown or not parameters:
+        given = unknown[0] if unknown else ""
+        raise UsageError(f"{given!r} cannot be fitted; give one or more of: {', '.join(PARAMETERS)}")
+    return tuple(column for name, columns in PARAMETERS.items() if name in parameters for column in columns)
+
+
+def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> None:
+    """Refuse what cannot be a track of this plant."""
+    duration = float(track.time[-1] - features.release)
+    if duration * features.frequency < 1.0:
+        raise TrajectoryError(
+            f"{track.source}: {duration:.2g} s after the release at {features.release:.2f} s are less than one period "
+            f"of {1.0 / features.frequency:.2g} s; track longer, or say when it was let go (--release)"
+        )
+    reach = float(np.nanmax(np.abs(features.displacement)))
+    length = specimen.length.value + 0.3 * (specimen.organ == "bunch")
+    if reach > 1.5 * length:
+        raise TrajectoryError(
+            f"{track.source}: the swing is {reach:.3g} m wide, the plant {length:.3g} m long; correct the unit in the "
+            "header (m, cm or mm) or specimen.length"
+        )
+    if reach < 3.0 * features.noise or features.explained < 0.3:
+        raise TrajectoryError(
+            f"{track.source}: no swing stands out: {1e3 * reach:.3g} mm of it, {1e3 * features.noise:.3g} mm of noise; "
+            "check the unit and the columns, cut the track to one release, or pull further"
+        )
+    if reach < 0.002 * length:
+        raise TrajectoryError(
+            f"{track.source}: the swing is {1e3 * reach:.3g} mm wide, 0.2 % of the plant's length of {length:.3g} m; "
+            "correct the unit in the header (m, cm or mm)"
+        )
+
+
+def _minimise(problem: Problem, theta: np.ndarray, noise: float) -> tuple[np.ndarray, Evaluation, float]:
+    """The minimum near some start and the noise there; by growing horizons where the whole track at once fails."""
+    best = _settle(problem, theta, noise)
+    if best[2] <= UNEXPLAINED * problem.features.noise:
+        return best
+    features = problem.features
+    grown = start_values(problem)
+    for periods in HORIZONS:
+        end = features.release + periods / features.frequency
+        if end < problem.track.time[-1]:
+            grown, _ = problem.minimise(grown, features.noise, end, 15, 1e-3)
+    found = _settle(problem, grown, features.noise)
+    return found if found[2] < best[2] else best
+
+
+def _settle(problem: Problem, theta: np.ndarray, noise: float) -> tuple[np.ndarray, Evaluation, float]:
+    """Minimise, estimate the noise [m] from what is left, and once more if that changes the weights."""
+    for _ in range(2):
+        theta, found = problem.minimise(theta, noise)
+        left = max(robust_deviation(found.model - problem.observed[problem.seen]), 1e-7)
+        if abs(math.log(left / noise)) < 0.3:
+            break
+        noise = left
+    return theta, found, left
+
+
+def _look_for_minima(
+    problem: Problem, theta: np.ndarray, noise: float
+) -> tuple[np.ndarray, float, tuple[Minimum, ...]]:
+    """Scan the modulus for other minima of the loss; go to one that is better."""
+    at = problem.names.index("modulus")
+    thetas = np.repeat(theta[None], len(MINIMA) + 1, 0)
+    thetas[1:, at] += np.log(MINIMA)
+    x, _ = problem.samples(thetas, np.array([problem.row(t) for t in thetas]))
+    losses = np.array([problem.loss(t, y, noise) for t, y in zip(thetas, x, strict=True)])
+    here, scan = losses[0], losses[1:]
+    lower = np.flatnonzero((scan[1:-1] < scan[:-2]) & (scan[1:-1] < scan[2:])) + 1
+    lower = lower[np.abs(np.log(MINIMA[lower])) > 0.1]
+    if len(lower) and scan[lower].min() < here:
+        start = thetas[1 + lower[np.argmin(scan[lower])]]
+        other, _, left = _settle(problem, start, noise)
+        if left < 0.95 * noise:
+            return other, left, ()
+    own = problem.specimen.modulus.value
+    minima = [Minimum(own * math.exp(thetas[1 + i, at]), float(scan[i] / here)) for i in lower]
+    return theta, noise, tuple(sorted(minima, key=lambda minimum: minimum.loss_ratio))
+
+
+def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> Features:
+    """Frequency and damping ratio of the fitted candidate, noise-free, at the track's own times."""
+    position = np.full(problem.track.position.shape, np.nan)
+    position[:, problem.track.tracked] = model
+    release = theta[problem.names.index("release")]
+    return extract_features(dataclasses.replace(problem.track, position=position), float(release))
+
+
+def _faults(problem: Problem, posterior: Posterior, noise: float, model: np.ndarray) -> tuple[str, ...]:
+    """Why the fit is not to be believed; empty if nothing speaks against it."""
+    faults = []
+    features = problem.features
+    if noise > UNEXPLAINED * features.noise:
+        faults.append(
+            f"the fit leaves {1e3 * noise:.3g} mm, a damped sinusoid only {1e3 * features.noise:.3g} mm: another "
+            "minimum, or a plant that the specimen does not describe (length, diameters, direction, tip mass)"
+        )
+    if posterior.correlation_time > 4.0:
+        faults.append(
+            f"neighbouring residuals are alike over {posterior.correlation_time:.1f} samples: the model misses some of "
+            "the motion (a second plane or mode, a slipping clamp, wind)"
+        )
+    for name, (low, high) in {"modulus": (-3.7, 3.7), "damping": (-5.0, 5.0)}.items():
+        if name in problem.names and not low < posterior.mean[problem.names.index(name)] < high:
+            faults.append(f"{name} went {math.exp(posterior.mean[problem.names.index(name)]):.3g} times off its start")
+    assert set(problem.fitted) <= set(COLUMNS)
+    return tuple(faults)
