@@ -136,7 +136,9 @@ def test_scenes_load_what_was_fitted(track: Trajectory, tmp_path, capsys) -> Non
     (tmp_path / "cane.toml").write_text(specimen_toml(cane(8e9)))
     out = tmp_path / "fitted.toml"
     plot = tmp_path / "fit.png"
-    code = run(tmp_path / "pull.csv", tmp_path / "cane.toml", "modulus,damping", out, True, plot, None, 0, 0, "cpu")
+    code = run(
+        tmp_path / "pull.csv", tmp_path / "cane.toml", "modulus,damping", out, True, plot, None, False, 0, 0, "cpu"
+    )
     said = json.loads(capsys.readouterr().out)
     assert code == 0
     assert said["ok"]
