@@ -6,7 +6,7 @@ OUT = out
 JOBS = 2
 PYTEST = .venv/bin/python -m pytest -n $(JOBS) --dist loadgroup
 
-.PHONY: demo test check lint validation setup clean
+.PHONY: demo test check lint docs validation setup clean
 demo:
 	@PYTHON=$(PYTHON) tools/setup run
 	@.venv/bin/vinesim demo --seconds $(SECONDS) --seed $(SEED) --out $(OUT) $(ARGS)
@@ -25,6 +25,9 @@ lint: setup
 
 setup:
 	@PYTHON=$(PYTHON) tools/setup test
+
+docs: setup # the documentation site, into build/site
+	@NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --strict --quiet
 
 validation: setup # figures and pictures of docs/validation.md, by the tests' own code
 	@.venv/bin/python -m tests.laws.plots

@@ -18,7 +18,7 @@ skipped."""
 
 
 SLOW = (
-    "tests/cli/test_", "tests/laws/", "tests/story/", "tests/bench/", "tests/client/test_humans.py",
+    "tests/cli/test_", "tests/docs/", "tests/laws/", "tests/story/", "tests/bench/", "tests/client/test_humans.py",
     "tests/client/test_domain_randomizer.py", "tests/client/test_task_registry.py", "tests/net/test_replicator.py",
     "tests/net/test_faults.py", "tests/net/test_replication_laws.py", "tests/net/test_wire.py",
     "tests/net/test_zenoh_bus.py", "tests/robot/test_pick.py", "tests/robot/test_push.py",

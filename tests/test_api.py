@@ -364,3 +364,39 @@ def test_a_client_without_peers_drives_its_robot():
         assert client.actor_pose("ada")[0] > -1.85
         with pytest.raises(KeyError, match="no actor 'bob'; there are: ada"):
             client.actor_pose("bob")
+
+
+# ---------------------------------------------------------------- robots
+
+
+def test_a_push_on_a_robot_acts_in_one_call_of_step_and_is_felt_in_its_joints():
+    simulation = vinesim.Simulation([])
+    robot = simulation.add_robot("vinebot")
+    (joint,) = robot.joint_indices(["arm_left_4_joint"])
+    simulation.step(50)
+
+    def felt():
+        return robot.sample(simulation.time).joints.effort[joint]
+
+    free, link = felt(), "arm_left_7_link"
+    centre = simulation.physics.rigid.link_centre(robot.name, link)
+    simulation.push_robot(robot.name, link, (0.0, 0.0, 10.0))
+    simulation.step(100)
+    pushed = felt()
+    assert abs(pushed - free) > 0.5
+    simulation.push_robot(robot.name, link, (0.0, 0.0, 10.0), at=centre)  # the same, in other words
+    simulation.step(100)
+    assert felt() == pytest.approx(pushed, abs=0.02)
+    simulation.step(100)  # the push has ended
+    assert felt() == pytest.approx(free, abs=0.02)
+
+
+def test_a_push_on_what_is_not_there_is_refused():
+    simulation = vinesim.Simulation([])
+    with pytest.raises(UsageError, match="no robot 'bob'; there are: none"):
+        simulation.push_robot("bob", "hand", (0.0, 0.0, 1.0))
+    simulation.add_robot("vinebot", name="bob")
+    with pytest.raises(ValueError, match="force"):
+        simulation.push_robot("bob", "arm_left_7_link", (0.0, 1.0))
+    with pytest.raises(Exception, match="no_such_link"):
+        simulation.push_robot("bob", "no_such_link", (0.0, 0.0, 1.0))

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from vinesim.api.client import Client as Client
     from vinesim.api.energy import Energy as Energy
     from vinesim.api.energy import Momentum as Momentum
+    from vinesim.api.picking import Grasp as Grasp
+    from vinesim.api.picking import PickAttempt as PickAttempt
+    from vinesim.api.picking import attempt_pick as attempt_pick
+    from vinesim.api.picking import reachable_grasps as reachable_grasps
     from vinesim.api.recording import RecordedMessage as RecordedMessage
     from vinesim.api.recording import Recording as Recording
     from vinesim.api.sensors import Camera as Camera
@@ -46,11 +50,13 @@ _MODULES = {
     "Camera": "api.sensors",
     "Client": "api.client",
     "Energy": "api.energy",
+    "Grasp": "api.picking",
     "Lidar": "api.sensors",
     "Model": "scene.model",
     "Momentum": "api.energy",
     "Organ": "scene.ids",
     "PhysicsParameters": "scene.physics_parameters",
+    "PickAttempt": "api.picking",
     "RecordedMessage": "api.recording",
     "Recording": "api.recording",
     "Robot": "robot.drives.controlled_robot",
@@ -60,11 +66,13 @@ _MODULES = {
     "State": "scene.state",
     "UsageError": "errors",
     "assemble": "scene.cane",
+    "attempt_pick": "api.picking",
     "cane": "scene.cane",
     "frames": "frames",
     "generate": "scene.generation.vineyard",
     "load_scene": "scene.spec",
     "look_at": "api.sensors",
+    "reachable_grasps": "api.picking",
 }
 """Module of each public name, below this package."""
 
@@ -73,11 +81,13 @@ __all__ = [
     "CaneBuilder",
     "Client",
     "Energy",
+    "Grasp",
     "Lidar",
     "Model",
     "Momentum",
     "Organ",
     "PhysicsParameters",
+    "PickAttempt",
     "RecordedMessage",
     "Recording",
     "Robot",
@@ -88,11 +98,13 @@ __all__ = [
     "UsageError",
     "__version__",
     "assemble",
+    "attempt_pick",
     "cane",
     "frames",
     "generate",
     "load_scene",
     "look_at",
+    "reachable_grasps",
 ]
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from vinesim.bench.picking import Attempt, attempt, class_name, success_measurements
+from vinesim.api.picking import Grasp, PickAttempt, attempt_pick
+from vinesim.bench.picking import class_name, success_measurements
 from vinesim.client.tasks import pick_planning
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
 
@@ -25,9 +25,9 @@ def test_every_clearance_has_one_class(clearance, name):
 
 def test_success_is_counted_over_all_and_by_class():
     tries = [
-        Attempt(1, 0.02, True, "", 0),
-        Attempt(2, 0.01, False, "advance: no", 1),
-        Attempt(3, -0.01, False, "cut: no", 0),
+        PickAttempt(1, 0.02, True, "", 0),
+        PickAttempt(2, 0.01, False, "advance: no", 1),
+        PickAttempt(3, -0.01, False, "cut: no", 0),
     ]
     values = {m.case: m.value for m in success_measurements(tries)}
     assert values["all in reach (3 tried)"] == pytest.approx(100.0 / 3.0)
@@ -43,6 +43,6 @@ def test_narrow_bunches_are_tried_as_well_and_the_freest_is_the_one_that_a_job_t
     found = list(pick_planning.freest_bases(model, near, 3.0))
     assert len({bunch for bunch, *_ in found}) == len(found) > 5
     assert min(clearance for *_, clearance in found) < 0.0
-    result = attempt(model, load_description("vinebot"), *found[0])
+    result = attempt_pick(model, Grasp(*found[0]))
     assert result.picked, result.reason
     assert result.others == 0

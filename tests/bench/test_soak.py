@@ -45,11 +45,21 @@ def test_processes_that_end_or_get_another_name_while_memory_settles_are_no_erro
     """An hour's figures are not lost for a process that was there for its first minutes only."""
     steady, brief = history([50.0] * 30), history([50.0] * 3)
     found, ended = settle(
-        {("client", 1): steady, ("python", 2): brief, ("standby", 2): steady, ("helper", 3): brief}, 700.0, 1840.0
-    )
+        {("client", 1): steady, ("python", 2): brief, ("standby", 2): steady, ("helper", 3): brief},
+        100.0, 700.0, 1840.0,
+    )  # fmt: skip
     assert list(found) == [("client", 1), ("standby", 2)]
     assert ended == {"helper 3 ended": 1}
     assert len(list(measurements(SoakResult(found, ended, 100.0)))) == 10
+
+
+def test_a_process_that_is_started_again_settles_from_its_own_start() -> None:
+    """What it takes while it starts is no growth: 20 MB a minute for five minutes, then nothing."""
+    late = history([20.0 * min(i, 5) for i in range(30)])
+    late = ProcessHistory([time + 900.0 for time in late.times], late.samples)
+    found, _ = settle({("standby", 1): late}, 100.0, 700.0, 2700.0)
+    assert found["standby", 1].growth() == pytest.approx(0.0, abs=1e-9)
+    assert found["standby", 1].times[0] == 1600.0
 
 
 def test_samples_follow_what_a_process_takes() -> None:
@@ -79,9 +89,11 @@ def test_samples_follow_what_a_process_takes() -> None:
         assert (after.handles - before.handles, after.threads) == (7, 1)
         sampler = ProcessSampler([("parent", child.pid)])
         sampler.sample(1.0)
+        assert sampler.memory() > after.own
         assert sorted(kind for kind, _ in sampler.histories) == ["parent", "resource tracker"]
         child.stdin.close()
     sampler.sample(2.0)
+    assert sampler.memory() == 0.0, "a process that has ended takes nothing"
     assert [one.times for one in sampler.histories.values()] == [[1.0], [1.0]]
 
 

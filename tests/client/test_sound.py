@@ -9,41 +9,16 @@ from tests.audio.test_microphone import amplitude
 from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, SAMPLE_RATE, Codec, to_pcm
-from vinesim.audio.microphone import Microphone
 from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.bench.sound_delay import AS_WAVEFORM, LIGHT, TONE_OF_LIGHTS, VOICE, sound
+from vinesim.bench.support.ear import Ear
 from vinesim.client.client import Client
-from vinesim.client.sound.exchange import SoundStep
-from vinesim.client.sound.microphone_step import at_place
 from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import LightPattern
-
-
-class Ear:
-    """Records what an actor hears, as the process of a robot does."""
-
-    is_open, decodes_opus = True, True
-
-    def __init__(self, client, name):
-        self._client, self._name, self._microphone = client, name, Microphone()
-        self.blocks = []
-        client.sound.listen(name, self)
-
-    def hear(self, step: SoundStep):
-        here = at_place(step, self._client.sound.place_of(self._name))
-        for frame in here.frames:
-            self._microphone.hear(frame)
-        for tone in here.tones:
-            self._microphone.sound(*tone, here.now)
-        self.blocks += self._microphone.blocks(here.now)
-
-    def take(self):
-        """Samples since the last call."""
-        blocks, self.blocks = self.blocks, []
-        return np.concatenate([block.samples for block in blocks])
 
 
 class World:
@@ -142,6 +117,28 @@ def test_robots_are_deaf_to_spectators_unless_the_server_says_otherwise():
     heard = world.hear(0.2, "guest")
     assert all(np.abs(samples).max() == 0.0 for samples in heard.values())
     assert not world.clients["guest"].sound.voice_of("guest").may_speak
+
+
+def test_a_page_that_stood_still_is_not_heard_twice_at_once():
+    world = World(anna=("human", 0.0), bot=("robot", 1.0))
+    world.hear(0.2, "anna")
+    world.run(0.4)
+    sound = to_pcm(0.5 * np.sin(2.0 * np.pi * 500.0 * np.arange(FRAME_SAMPLES) / SAMPLE_RATE))
+    for _ in range(20):
+        world.clients["anna"].sound.speak("anna", Codec.PCM16, sound)
+    world.run(0.4)
+    heard = world.ears["bot"].take()
+    assert 0.4 < np.abs(heard).max() < 0.51
+    assert np.mean(np.abs(heard) > 0.01) < 0.25, "what was too much was dropped"
+    assert world.clients["anna"].sound.dropped >= 14
+
+
+def test_an_alarm_is_heard_with_its_light_and_a_voice_later_than_states_but_within_its_budget():
+    """F94, F98; ``vinesim bench sound`` has the figures."""
+    took = {row.case.split(": ")[1].split(",")[0]: row.value for row in sound((0.02,), 2) if "largest" in row.case}
+    assert took[TONE_OF_LIGHTS] == took[LIGHT]
+    assert took[LIGHT] <= took[AS_WAVEFORM] <= took[LIGHT] + 60.0
+    assert took[LIGHT] < took[VOICE] <= 150.0
 
 
 def test_frames_of_a_socket_that_jitters_follow_each_other_without_gaps():

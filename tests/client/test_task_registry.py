@@ -82,7 +82,7 @@ def test_a_client_runs_the_exchange_task():
 
 def test_an_unknown_task_is_refused_with_the_known_ones():
     scene = load_scene("harvest")
-    with pytest.raises(UnknownTask, match="no job 'dance'; give pick or exchange"):
+    with pytest.raises(UnknownTask, match="no job 'dance'; give pick, exchange or meet"):
         plan_task("dance", generate(scene), start_poses.spawn_pose(scene, 0))
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 
@@ -61,6 +63,41 @@ def test_a_process_that_hangs_is_killed_and_started_again(start, caplog):
     assert not former.is_alive()
     assert worker.current().process.pid != former.pid
     assert "the test process failed: it hung: nothing came from it for 2 s; starting it again" in caplog.messages
+
+
+def test_a_process_that_waits_for_a_cpu_does_not_hang(start, monkeypatch):
+    """On a busy machine it is silent for longer than that, and is left alone; it goes on afterwards."""
+    looks: list[int] = []
+    monkeypatch.setattr(worker_process, "cpu_use", lambda pid: (looks.append(pid) or 0.1 * len(looks), True))
+    worker = start(0.0)
+    wait(lambda: worker.is_ready, "the process to be ready")
+    former = worker.current().process
+    os.kill(former.pid, signal.SIGSTOP)
+    wait(lambda: len(looks) == 2 * HANG_TIMEOUT, "silence")
+    os.kill(former.pid, signal.SIGCONT)
+    assert set(looks) == {former.pid}
+    assert worker.restarts == 0
+    assert former.is_alive()
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="needs /proc of Linux")
+def test_what_a_process_asks_of_the_cpu():
+    """One that computes asks for it, one that waits for input does not; both use the time that they say."""
+    code = "import sys; print(flush=True); sys.stdin.readline(); print(flush=True)\nwhile True: pass"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as child:
+        assert child.stdin is not None
+        assert child.stdout is not None
+        child.stdout.readline()
+        wait(lambda: not worker_process.cpu_use(child.pid)[1], "a process that waits")
+        before, _ = worker_process.cpu_use(child.pid)
+        child.stdin.write("\n")
+        child.stdin.flush()
+        wait(lambda: worker_process.cpu_use(child.pid)[0] > before + 0.1, "CPU time")
+        assert worker_process.cpu_use(child.pid)[1]
+        child.kill()
+    assert worker_process.cpu_use(child.pid) == (0.0, False)
 
 
 @pytest.mark.slow

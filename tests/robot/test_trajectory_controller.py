@@ -9,6 +9,7 @@ import pytest
 
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.trajectory_controller import (
+    MAX_SPLINES,
     GoalHandle,
     Outcome,
     Tolerance,
@@ -184,12 +185,13 @@ def test_a_trajectory_may_start_later_but_not_be_over() -> None:
     plan = swing(arm)
     later = Trajectory(TWO, plan.times, plan.positions, plan.velocities, start_time=0.5)
     run = arm.controller.start(later, 0.0)
-    arm.run(0.5)
+    arm.run(0.4)
     np.testing.assert_allclose(arm.at(), arm.home, atol=1e-4)
-    arm.run(1.4)
-    run = arm.controller.start(dataclasses.replace(later, start_time=arm.time + 0.5), arm.time)
-    assert not arm.controller.state(arm.time).desired_velocity.any()  # it waits, and its start is no jump in speed
+    assert not arm.controller.state(arm.time).desired_velocity.any()  # it waits
     np.testing.assert_allclose(arm.controller.state(arm.time).desired, arm.robot.setpoint[arm.controller.indices])
+    arm.run(1.5)
+    run = arm.controller.start(dataclasses.replace(later, start_time=arm.time + 0.5), arm.time)
+    assert arm.controller.state(arm.time).desired_velocity.any()  # the older one goes on
     arm.run(0.45)
     arm.rows.clear()
     arm.run(4.0, until=run)
@@ -198,6 +200,63 @@ def test_a_trajectory_may_start_later_but_not_be_over() -> None:
     with pytest.raises(TrajectoryError, match=r"ended at 3\.50 s, now is 9\.00 s") as error:
         arm.controller.start(later, 9.0)
     assert error.value.code is Outcome.OLD_HEADER_TIMESTAMP
+
+
+def test_a_trajectory_that_starts_later_replaces_the_older_one_at_its_start() -> None:
+    """Until then the joints follow the older one exactly; there they have its place and speed, and it is continuous."""
+    arm, alone = ControlledArm(), ControlledArm()
+    older = swing(arm)
+    first, whole = arm.controller.start(older, 0.0), alone.controller.start(older, 0.0)
+    arm.run(0.5)
+    there = arm.home[[0, 3]] + [0.1, -0.1]
+    newer = Trajectory(TWO, np.array([1.2]), there[None], np.zeros((1, 2)), start_time=1.5)
+    second = arm.controller.start(newer, arm.time)
+    assert first.outcome is Outcome.PREEMPTED  # its goal ends at once, as in joint_trajectory_controller
+    arm.run(4.0, until=second)
+    alone.run(4.0, until=whole)
+    assert second.outcome is Outcome.SUCCESSFUL
+    assert arm.time == pytest.approx(1.5 + 1.2, abs=0.03)
+    np.testing.assert_allclose(arm.at(TWO), there, atol=3e-3)
+    same, rows = np.array(alone.rows), np.array(arm.rows)
+    assert rows[:149].tobytes() == same[:149].tobytes()
+    assert np.abs(same[148, 1, 0]) > 0.05  # it is on its way then
+    assert np.abs(rows[200:, 0, 0] - same[200 : len(rows), 0, 0]).max() > 0.1
+    assert np.abs(np.diff(rows[20:, 1, [0, 3]], axis=0)).max() < 0.04, "a step in speed"
+
+
+def test_joints_that_a_newer_trajectory_does_not_name_follow_the_older_one() -> None:
+    arm, alone = ControlledArm(), ControlledArm()
+    plan = swing(arm)
+    arm.controller.start(plan, 0.0)
+    alone.controller.start(plan, 0.0)
+    arm.run(0.5)
+    newer = Trajectory(TWO[:1], np.array([0.4]), arm.home[:1][None] + 0.3, start_time=0.8)
+    goal = arm.controller.start(newer, arm.time)
+    arm.run(1.0, until=goal)
+    assert goal.outcome is Outcome.SUCCESSFUL
+    assert arm.time < 1.25
+    arm.run(2.5)
+    alone.run(arm.time)
+    wrist = ARM.index(TWO[1])
+    np.testing.assert_allclose(
+        np.array(arm.rows)[:, 0, wrist], np.array(alone.rows)[: len(arm.rows), 0, wrist], atol=2e-3
+    )
+    assert arm.at(TWO[:1]) == pytest.approx(arm.home[:1] + 0.3, abs=3e-3)  # the older one, which ends later, is over
+    assert not arm.controller.is_moving
+
+
+def test_trajectories_that_wait_are_bounded() -> None:
+    """Each of them replaces the one before only for the last part of its time, so that all are kept."""
+    arm = ControlledArm()
+    one, here = np.array([1.0]), arm.at(TWO)[None]
+    for i in range(MAX_SPLINES):
+        arm.controller.start(Trajectory(TWO, one, here, start_time=1.0 + i), 0.0)
+    with pytest.raises(TrajectoryError, match="32 trajectories are executed or wait"):
+        arm.controller.start(Trajectory(TWO, one, here, start_time=100.0), 0.0)
+    now = arm.controller.start(Trajectory(TWO, one, here), 0.0)  # replaces all
+    arm.run(2.0, until=now)
+    assert now.outcome is Outcome.SUCCESSFUL
+    assert not arm.controller.is_moving
 
 
 def test_invalid_trajectories_are_refused_without_effect() -> None:

@@ -21,17 +21,23 @@ from rclpy.action import ActionClient
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tests.support.contact_scenes import cane
-from tests.support.stock_node import StockNode, wait_until
+from tests.support.stock_node import TIMEOUT, StockNode, wait_until
+from vinesim.bench.goal_sender import wait_until_forgotten
 from vinesim.client.client import Client
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
+from vinesim.ros.commands import actions
+from vinesim.ros.commands.actions import ControllerActions
+from vinesim.ros.commands.subscriptions import CommandQueue
+from vinesim.ros.commands.types import GoalResult
+from vinesim.ros.commands.types import GoalStatus as StatusOfGoal
 from vinesim.ros.messages import message_packages
 from vinesim.ros.robot_node import RobotNode
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import JointReference
+from vinesim.scene.values import ControllerKind, ControllerSpec, JointReference
 
 HEAD = ("head_1_joint", "head_2_joint")
 
@@ -214,3 +220,28 @@ def test_many_goals_leave_no_handle_behind(world: RobotInRos, head: ActionClient
             assert world.result(handle)[0] == GoalStatus.STATUS_SUCCEEDED
             np.testing.assert_allclose(world.head(), target, atol=0.02)
     assert not world.node.has_goals
+
+
+def test_servers_forget_every_goal_that_has_ended(world: RobotInRos, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reached, cancelled and aborted goals are unknown to the server some time after their end."""
+    from control_msgs.action import FollowJointTrajectory
+
+    monkeypatch.setattr(actions, "RESULT_TIMEOUT", 1)
+    spec = ControllerSpec("short_memory_controller", ControllerKind.JOINT_TRAJECTORY, HEAD)
+    with StockNode() as server:
+        served = ControllerActions(server.node, [spec], CommandQueue())
+        client = ActionClient(server.node, FollowJointTrajectory, f"/{spec.name}/follow_joint_trajectory")
+
+        def done(future):
+            wait_until(future.done, lambda: server.spin(0.05), "an answer")
+            return future.result()
+
+        wait_until(client.server_is_ready, lambda: server.spin(0.05), spec.name)
+        handles = [done(client.send_goal_async(swing([0.1 * i, 0.0]))) for i in range(6)]
+        assert len(done(handles[0].cancel_goal_async()).goals_canceling) == 1
+        ends = [StatusOfGoal.CANCELED, StatusOfGoal.ABORTED, *[StatusOfGoal.SUCCEEDED] * 4]
+        for handle, end in zip(handles, ends, strict=True):
+            served.finish(GoalResult(bytes(handle.goal_id.uuid), end, 0))
+        assert not served.goals
+        known, _ = wait_until_forgotten(lambda handle: done(handle.get_result_async()).status, handles, TIMEOUT)
+        assert known == 0

@@ -27,7 +27,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from vinesim.ros.commands import convert as commands
-from vinesim.ros.messages import convert, message_packages
+from vinesim.ros.messages import convert, message_packages, serialized
 from vinesim.ros.messages.transforms import SerializedTransforms, split_time
 from vinesim.scene.values import (
     CameraFrame,
@@ -269,6 +269,46 @@ def test_wrench_and_imu_keep_their_frames():
     message = over_the_wire(convert.imu(unit))
     assert (message.orientation.z, message.orientation.w, message.angular_velocity.z) == (0.6, 0.8, 0.5)
     assert message.linear_acceleration.z == 9.81
+
+
+def test_messages_of_a_step_are_written_as_stock_serialisation_does():
+    """Numbers and stamps of any value, whatever the texts' lengths; other numbers than those of the first message."""
+    random = np.random.default_rng(3)
+
+    def joints(names: tuple[str, ...], time: float) -> JointSample:
+        position, velocity, effort = random.normal(size=(3, len(names)))
+        return JointSample(time, names, position, velocity, effort, effort)
+
+    def robot(time: float) -> RobotSample:
+        numbers = [random.normal(size=n) for n in (7, 6, 7, 6)]
+        return RobotSample("r", joints(("a",), time), *numbers, random.normal(size=(2, 3, 3)), (), np.zeros((0, 7)))
+
+    def wrench(time: float) -> Wrench:
+        return Wrench(time, "wrist", "wrist_link", *random.normal(size=(2, 3)))
+
+    def imu(time: float) -> Imu:
+        return Imu(time, "imu", "link", random.normal(size=4), *random.normal(size=(2, 3)))
+
+    def check(written: bytes, message) -> None:
+        assert len(written) == len(serialize_message(message))  # the padding may have any bytes
+        assert deserialize_message(written, type(message)) == message
+
+    for names in ((), ("a",), ("b_joint", "another_joint", "c")):
+        write = serialized.joint_state_writer(joints(names, 0.0))
+        for one in (joints(names, 3.25), joints(names, 1234567.000000001)):
+            check(write(one), convert.joint_state(one))
+    write_odometry = serialized.odometry_writer(robot(0.0), "base_footprint")
+    write_wrench, write_imu = serialized.wrench_writer(wrench(0.0)), serialized.imu_writer(imu(0.0))
+    write_clock = serialized.stamp_writer(convert.clock)
+    for time in (0.0, 7.75, 98765.4321):
+        check(write_odometry(base := robot(time)), convert.odometry(base, "base_footprint"))
+        check(write_wrench(read := wrench(time)), convert.wrench(read))
+        check(write_imu(unit := imu(time)), convert.imu(unit))
+        check(write_clock(time), convert.clock(time))
+    with pytest.raises(ValueError, match="6 numbers, expected 9"):
+        write(joints(("a", "b"), 0.0))
+    with pytest.raises(ValueError, match="0 of 1 numbers and 0 stamps found"):
+        serialized.SerializedMessage(lambda *_: convert.clock(0.0), 1)
 
 
 def test_transforms_equal_stock_serialisation_field_for_field():

@@ -3,8 +3,11 @@
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
 
+import copy
+import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -27,12 +30,15 @@ from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
+from vinesim.client.sensing import ros_worker
 from vinesim.client.sensing.robot_processes import RobotProcesses
+from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, RosWorker
 from vinesim.client.sensing.step_record import MAX_CONTACTS, StepRecords
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
+from vinesim.ros.commands.types import GoalResult, GoalStatus
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Contact
@@ -221,3 +227,77 @@ def test_a_record_holds_a_sample_exactly(robot):
     assert [u.linear_acceleration.tolist() for u in copy.imus] == [u.linear_acceleration.tolist() for u in sample.imus]
     many = client.robot.sample(client.physics.time, contacts[:1] * (MAX_CONTACTS + 5))
     assert records.write(row, client.physics.time, many) == 5
+
+
+class RecordingNode:
+    """Takes the place of the robot's node, and notes what it is told, in order."""
+
+    set_parameters: dict[str, Any] = {}  # noqa: RUF012 (constant)
+    has_goals, environment_rate = False, 10.0
+
+    def __init__(self, *_, **__) -> None:
+        self.told: list[tuple[str, Any]] = []
+        self.sent: dict[str, int] = {}
+        self.dropped: dict[str, int] = {}
+
+    def publish_clock(self, time: float) -> None:
+        self.told.append(("clock", time))
+
+    def finish_goal(self, result: GoalResult) -> None:
+        self.told.append(("end", result.goal))
+
+    def publish_environment_static(self, *_) -> None:
+        pass
+
+    def has_subscribers(self, _: str) -> bool:
+        return True
+
+    def commands(self) -> list:
+        return []
+
+    def __enter__(self) -> RecordingNode:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+
+def test_a_result_is_sent_after_the_steps_that_led_to_it(monkeypatch):
+    """However long the steps have waited for the process, and when the result overtakes them on the way to it."""
+    monkeypatch.setattr("vinesim.ros.robot_node.RobotNode", RecordingNode)
+    monkeypatch.setattr(middleware, "configure", lambda **_: None)
+    monkeypatch.setattr(ros_worker, "report_ready", lambda *_: None)  # it lowers the priority of its process
+    description, context = load_description("vinebot"), multiprocessing.get_context("spawn")
+    records = StepRecords("robot", description, np.zeros(len(description.joints)))
+    config = RosConfig(
+        "robot", "", description.base, "", False, (), np.zeros((0, 7)), records, 0, np.zeros(0, np.int32), (), (), ()
+    )
+    channel, (ours, theirs) = RosChannel(config, context), context.Pipe()
+    read_end = copy.copy(channel)
+    read_end.steps = copy.copy(channel.steps)  # each end counts for itself, as in two processes
+    worker = RosWorker(config, read_end, theirs)
+    assert isinstance(worker.node, RecordingNode)
+    told = worker.node.told
+    thread = threading.Thread(target=worker.run, daemon=True)
+    try:
+        for time in (1.0, 2.0, 3.0):
+            with channel.steps.put() as record:
+                assert record is not None
+                record["time"], record["has_state"] = time, False
+            if time == 2.0:
+                ours.send(("finish", (channel.steps.put_count, GoalResult(b"1", GoalStatus.SUCCEEDED, 0))))
+        ours.send(("finish", (channel.steps.put_count + 1, GoalResult(b"2", GoalStatus.SUCCEEDED, 0))))
+        channel.steps.wake()
+        thread.start()
+        wait_until(lambda: len(told) >= 4)
+        with channel.steps.put() as record:
+            assert record is not None
+            record["time"], record["has_state"] = 4.0, False
+        channel.steps.wake()
+        wait_until(lambda: len(told) >= 6)
+        assert told == [("clock", 1.0), ("clock", 2.0), ("end", b"1"), ("clock", 3.0), ("clock", 4.0), ("end", b"2")]
+    finally:
+        ours.send(("stop", None))
+        thread.join()
+        channel.close()
+        ours.close()

@@ -81,13 +81,13 @@ class Page:
 
 
 @contextlib.contextmanager
-def browser_page() -> Iterator[Page]:
-    """A page of a browser that ends with the block."""
+def browser_page(*options: str) -> Iterator[Page]:
+    """A page of a browser, started with these further options, that ends with the block."""
     path = program()
     assert path is not None, "a browser is needed: install chromium"
     profile = tempfile.mkdtemp()
     child = subprocess.Popen(
-        [path, *OPTIONS, f"--user-data-dir={profile}", "about:blank"], stderr=subprocess.PIPE, text=True
+        [path, *OPTIONS, *options, f"--user-data-dir={profile}", "about:blank"], stderr=subprocess.PIPE, text=True
     )
     loop = asyncio.new_event_loop()
     try:

@@ -75,6 +75,7 @@ def open_page(page, live, before=""):
     page.open(live.server.address + "?triangles=30000", before=before)
     wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
     assert page.run("vinesim.failure") is None
+    page.run("vinesim.viewer.shadowAt = Infinity, 0")  # no shadows
     assert page.errors == []
 
 
@@ -151,6 +152,11 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
         )
         wait(lambda: np.linalg.norm(physics.state.body_q[body, :3] - here) > 2e-3, "the bunch gives way")
         wait(lambda: physics.hand("viewer", "right").held is not None, "the hand holds the bunch")
+        for code in ("KeyC", "KeyO"):
+            page.key(code, down=True)
+            page.key(code, down=False)
+        wait(lambda: page.run("vinesim.viewer.overlays.forces.geometry.drawRange.count") >= 6, "its force is drawn")
+        wait(lambda: ": viewer" in page.run("document.getElementById('names').textContent"), "its tree is the person's")
         page.key("KeyS", down=True)
         wait(lambda: not physics.state.bunch_attached[BUNCH], "who walks away with it in the hand picks it")
         page.key("KeyS", down=False)

@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 
 from vinesim import frames
+from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import FOLLOW_YAW, Spectator, standing_view
+from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import INTENTIONS
+from vinesim.scene.values import INTENTIONS, LightPattern
 from vinesim.web.array_message import decode
 from vinesim.web.page_input import PageInput, TrackedHand, TrackedPerson
 
@@ -166,6 +168,81 @@ def test_only_the_first_page_moves_the_person():
             client.tick()
         np.testing.assert_allclose(client.humans["anna"].pose.head[:3], mine[:3], atol=1e-9)
         assert client.humans["anna"].intention == ""
+
+
+def test_a_flash_of_a_light_reloads_no_body_of_a_page():
+    """What a page knows after flashes, from states alone, is what one that loads everything now is told."""
+    with MemoryHub().bus("bot") as bus:
+        scene = load_scene("demo")
+        client = Client(
+            scene, generate(scene), load_description("vinebot"), bus, name="bot", pose=frames.pose(np.zeros(3))
+        )
+        world = PageWorld(client)
+        client.post_step.append(lambda _: world.collect(OnePage()))
+        world.scene()
+        client.tick()
+        header, _ = decode(world.state(-1)[1])
+        loaded = {name: values.copy() for name, values in decode(world.rigid())[1].items()}
+        client.robot.command_lights(LightPattern.ALARM)
+        seen = set()
+        for _ in range(60):
+            client.tick()
+            after, arrays = decode(world.state(-1)[1])
+            assert after["rigid"] == header["rigid"]
+            loaded["surface"].reshape(-1, 4)[arrays["lamp"]] = arrays["lamp_surface"].reshape(-1, 4)
+            loaded["material"][arrays["lamp"]] = arrays["lamp_material"]
+            seen.add(arrays["lamp_surface"].tobytes())
+        assert len(seen) >= 2, "it has flashed"
+        assert 0 < arrays["lamp"].size < 20, "a small change"
+        later = PageWorld(client)
+        client.post_step.append(lambda _: later.collect(OnePage()))
+        later.scene()
+        client.tick()
+        later.state(-1)
+        _, newest = decode(world.state(-1)[1])
+        loaded["surface"].reshape(-1, 4)[newest["lamp"]] = newest["lamp_surface"].reshape(-1, 4)
+        loaded["material"][newest["lamp"]] = newest["lamp_material"]
+        for name, values in decode(later.rigid())[1].items():
+            if name != "ball":  # around clusters where they were then
+                np.testing.assert_array_equal(loaded[name], values, err_msg=name)
+
+
+def test_contacts_and_owners_are_told_to_pages_that_show_them():
+    with MemoryHub().bus("anna") as bus:
+        scene = load_scene("demo")
+        model = generate(scene)
+        hangs = bunch_centres(model)[10]
+        human = ScriptedHuman(frames.pose(np.array([hangs[0] - 0.55, hangs[1], 0.0])))
+        client = Client(scene, model, None, bus, name="anna", pose=human.root, source=human)
+        world = PageWorld(client)
+        client.post_step.append(lambda _: world.collect(OnePage()))
+        world.scene()
+        human.do(human.reach("right", lambda: hangs))
+        eyes = (0.0, 0.0, 1.6, 0.0, 0.0, 0.0, 1.0)
+        for _ in range(400):
+            client.tick()
+            if client.physics.hand("anna", "right").held is not None:
+                break
+        header, arrays = decode(world.state(-1)[1])
+        assert "owners" not in header
+        assert arrays["contact_force"].size == 0, "nothing shows them"
+        world.take(0, PageInput(1, eyes, overlays=True))
+        client.tick()
+        header, arrays = decode(world.state(-1)[1])
+        tree = int(model.body_tree[model.bunch_body[10]])
+        assert header["owners"][f"tree/{tree}"] == "anna"
+        own = [contact for contact in client.physics.contacts if contact.actor == "anna"]
+        np.testing.assert_allclose(
+            arrays["contact_force"].reshape(-1, 3).sum(0),
+            -np.sum([c.force for c in client.physics.contacts], 0),
+            atol=1e-3,
+        )
+        palm = client.physics.hand("anna", "right").pose[:3]
+        assert own
+        assert np.linalg.norm(arrays["contact_place"].reshape(-1, 3) - palm, axis=1).min() < 0.15
+        world.leave(0)
+        client.tick()
+        assert "owners" not in decode(world.state(-1)[1])[0]
 
 
 def test_the_page_of_a_robot_far_away_looks_over_its_shoulder_to_the_vines():

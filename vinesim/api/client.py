@@ -28,6 +28,7 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, load_scene
+from vinesim.scene.state import State
 
 
 class Client:
@@ -89,6 +90,19 @@ class Client:
     def physics(self) -> Physics:
         """This client's copy of the world."""
         return self._client.physics
+
+    @property
+    def state(self) -> State:
+        """State of the plants in this client's copy, at the current time."""
+        self._client.physics.update_kinematics()
+        return self._client.physics.state
+
+    @property
+    def received_bytes(self) -> int:
+        """[B] Received since it joined of plants and objects: their motion, events and what lasts. Not poses of
+        actors."""
+        counters = self._client.replicator.counters
+        return sum(family.bytes_in for family in (counters.environment, counters.event, counters.retained))
 
     @property
     def time(self) -> float:

@@ -92,6 +92,7 @@ class Simulation:
         if self.scene is not None:
             self.physics.wind = wind_of(self.scene)
         self._loads: dict[int, np.ndarray] = {}
+        self._pushed: set[tuple[str, str]] = set()
         self._detachments: list[Detachment] = []
         self._primitives: Primitives | None = None
         self._sway = Sway(model)
@@ -114,6 +115,9 @@ class Simulation:
         if self._loads:  # a tree that fell asleep under its load moves again
             self.physics.wake(np.unique(self.model.body_tree[list(self._loads)]))
         self._loads.clear()
+        for robot, link in self._pushed:
+            self.physics.rigid.apply_wrench(robot, link, np.zeros(3))
+        self._pushed.clear()
 
     @property
     def time(self) -> float:
@@ -224,6 +228,31 @@ class Simulation:
         self._loads.setdefault(body, load[body].copy())
         load[body] += np.concatenate([force, torque + np.cross(point - pose[:3], force)]).astype(load.dtype)
         self.wake(int(self.model.body_tree[body]))
+
+    def push_robot(
+        self,
+        robot: str,
+        link: str,
+        force: Sequence[float] | np.ndarray,
+        torque: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+        at: Sequence[float] | np.ndarray | None = None,
+    ) -> None:
+        """Push a link of a robot during the next call of :meth:`step`, as a person's hand would.
+
+        Args:
+            robot: name of the robot.
+            link: of its URDF; ``RobotError`` if there is none of that name.
+            force: [3] N, world axes; replaces that of an earlier call for this link.
+            torque: [3] N m, world axes.
+            at: [3] m in the world, the point where the force acts; the link's centre of mass unless given.
+        """
+        if robot not in self.robots:
+            raise UsageError(f"no robot {robot!r}; there are: {', '.join(self.robots) or 'none'}")
+        force, torque = _vector("force", force, "N"), _vector("torque", torque, "N m")
+        if at is not None:
+            torque = torque + np.cross(_vector("at", at, "m") - self.physics.rigid.link_centre(robot, link), force)
+        self.physics.rigid.apply_wrench(robot, link, force, torque)
+        self._pushed.add((robot, link))
 
     def cut(self, body: int) -> None:
         """Cut a cane at the base of a body: what grows on it falls. The cut is the body's joint, not within a

@@ -109,6 +109,10 @@ class Microphone:
             self.lost += step - 1
             if abs(start - voice.end) <= 2:
                 start = voice.end
+            if 0 < voice.end - start < SAMPLE_RATE:  # a voice does not add to itself
+                self.late += 1
+                self._voices[frame.speaker] = dataclasses.replace(voice, number=frame.number, decoder=decoder)
+                return
             missing = start - voice.end
             if 1 < step <= 1 + MAX_CONCEALED and missing > 0:
                 self._conceal(voice, missing)

@@ -76,7 +76,7 @@ class Gestures:
                 raise GestureError(f"{path}: buttons.{button}: no pose {name!r}; give one of {', '.join(poses)}")
         return cls(poses, {button: poses[name] for button, name in buttons.items()})
 
-    def name_of(self, fingers: FingerBend) -> str:
+    def name_of(self, fingers: tuple[float, ...]) -> str:
         """Name of the pose that ``fingers`` make, empty if none is near."""
         away = {name: max(abs(a - b) for a, b in zip(fingers, pose, strict=True)) for name, pose in self.poses.items()}
         nearest = min(away, key=lambda name: away[name])

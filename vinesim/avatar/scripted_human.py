@@ -20,6 +20,8 @@ from vinesim.scene.values import HumanPose
 
 WALK_SPEED = 1.1
 """[m/s] GUESSED."""
+BACK_SPEED = 0.5
+"""[m/s] GUESSED."""
 TURN_RATE = 2.5
 """[rad/s] GUESSED."""
 REACH_SPEED = 0.5
@@ -80,6 +82,15 @@ class ScriptedHuman:
             self._place += way * min(1.0, WALK_SPEED * self.dt / left)
             yield
 
+    def back(self, until: Callable[[], bool], most: float = 1.5) -> Iterator[None]:
+        """Walk backwards until a condition holds, at most so far [m]."""
+        for _ in range(round(most / (BACK_SPEED * self.dt))):
+            if until():
+                return
+            ahead = np.array([np.cos(self._heading), np.sin(self._heading)])
+            self._place -= BACK_SPEED * self.dt * ahead
+            yield
+
     def face(self, to: tuple[float, float]) -> Iterator[None]:
         """Turn to a point (x, y) [m]."""
         way = np.asarray(to, float)[:2] - self._place
@@ -128,6 +139,11 @@ class ScriptedHuman:
             yield
 
     # ------------------------------------------------------------------ inside
+
+    @property
+    def place(self) -> np.ndarray:
+        """Where the person stands [2] m."""
+        return self._place.copy()
 
     def _standing_frame(self) -> np.ndarray:
         """Pose [7] of the body: on the ground, below the hips."""

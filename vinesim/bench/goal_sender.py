@@ -43,11 +43,15 @@ TOLERANCE = 0.01
 """Of the goals, for each joint [rad, m]."""
 DELAY = 0.8
 """From now to the start of a trajectory [s]."""
-RESULT_TIMEOUT = 10.0
-"""A server keeps a result for so long [s]; later it knows nothing of the goal."""
+FORGOTTEN = 60.0
+"""[s] A goal that a server still knows so long after its end is kept for good.
+
+A server keeps a result for 10 s and, like any of rcl_action, forgets it within 20: whenever a goal ends, the timer
+starts anew with the period that it had before.
+"""
 MOMENT = 0.4
 """After a trajectory's start, when it is cancelled or preempted [s]."""
-SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+UNKNOWN, SUCCEEDED, CANCELED, ABORTED = 0, 4, 5, 6
 INVALID_GOAL = -1
 
 
@@ -213,6 +217,19 @@ class GoalSender:
         return answer.status, answer.result.error_code, answer.result.error_string
 
 
+def wait_until_forgotten(status: Callable[[Any], int], handles: list[Any], longest: float) -> tuple[int, float]:
+    """Ask for the ``status`` of goals that have ended until none is known, for ``longest`` [s] at most.
+
+    The number that still are, and the time that it took [s].
+    """
+    begin = time.monotonic()
+    while handles := [handle for handle in handles if status(handle) != UNKNOWN]:
+        if time.monotonic() > begin + longest:
+            break
+        time.sleep(0.1)
+    return len(handles), time.monotonic() - begin
+
+
 def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, int, str]) -> dict[str, Any]:
     """Whether a goal that ran to its end did what it says."""
     columns = [sender.names.index(name) for name in one.joints]
@@ -299,9 +316,8 @@ def main(arguments: list[str] | None = None) -> int:
             row, sent = preempt(sender, draw(), draw())
         handles += sent
         _print(row)
-    sender.wait(RESULT_TIMEOUT + 1.0)
-    known = sum(sender.result(handle)[0] != 0 for handle in handles)
-    _print({"kind": "end", "sent": len(handles), "known": known})
+    known, seconds = wait_until_forgotten(lambda handle: sender.result(handle)[0], handles, FORGOTTEN)
+    _print({"kind": "end", "sent": len(handles), "known": known, "s": seconds})
     sender.node.destroy_node()
     rclpy.shutdown()
     return 0

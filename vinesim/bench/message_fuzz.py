@@ -22,6 +22,7 @@ import msgspec
 import numpy as np
 
 from vinesim import frames
+from vinesim.audio.frame import Codec
 from vinesim.bench.support.fake_client import FakeClient, swinging_state, tree_row
 from vinesim.bench.support.fuzz_world import ATTACKER, DT, WORLD, FuzzWorld
 from vinesim.client.client import Client
@@ -29,6 +30,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.couplings import MAX_COUPLINGS, CouplingMessage, encode_couplings
 from vinesim.net.codec.human import encode_pose
 from vinesim.net.codec.messages import Hello, RetainedRecord
+from vinesim.net.codec.voice import VoiceFrame, encode_voice
 from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
@@ -61,10 +63,16 @@ class Sender(Protocol):
 
 def valid_message(model: Model, actor: Sender, now: float, chance: random.Random) -> tuple[str, bytes]:
     """A family of keys and a well-formed message as ``actor`` might send it; what it says may be impossible."""
-    kind = chance.choice(("a", "tree", "things", "own", "fact", "force", "control"))
+    kind = chance.choice(("a", "tree", "things", "own", "fact", "force", "voice", "control"))
     claim = Claim(chance.randrange(3), chance.randrange(1 << 16), actor.name)
     if kind == "a":
         return kind, encode_pose(actor.pose(now))
+    if kind == "voice":
+        codec = chance.choice(tuple(Codec))
+        sound = (
+            chance.randbytes(640) if codec is Codec.PCM16 else bytes((72,)) + chance.randbytes(chance.randint(0, 90))
+        )
+        return kind, encode_voice(VoiceFrame(chance.randrange(1 << 16), now + chance.uniform(-0.1, 0.1), codec, sound))
     if kind == "force" and chance.random() < 0.5:
         return kind, _couplings_message(model, now, chance)
     if kind == "force":
@@ -166,7 +174,7 @@ _PARENTS = (
 def key_of(family: str, name: str, cells: list[interest.Cell], chance: random.Random) -> str:
     """Key of a message of ``name``; one in ten is of another family, of another cell, too short or too long."""
     if chance.random() < 0.1:
-        family = chance.choice(("a", "c", "tree", "near", "own", "fact", "force"))
+        family = chance.choice(("a", "c", "tree", "near", "own", "fact", "force", "voice"))
     x, y = chance.choice(cells)
     if chance.random() < 0.05:
         odd = (
@@ -183,6 +191,8 @@ def key_of(family: str, name: str, cells: list[interest.Cell], chance: random.Ra
         return chance.choice(odd)
     if family == "a":
         return chance.choice((f"a/{name}", f"a/{name}/far"))
+    if family == "voice":
+        return chance.choice((f"voice/{name}", f"voice/{name}", f"voice/{name}/pcm"))
     return f"force/ada/{name}" if family == "force" else f"{family}/{x}/{y}/{name}"
 
 
@@ -304,7 +314,7 @@ def run_storm(
 def received_count(fake_client: FakeClient | Client) -> int:
     """Messages that arrived."""
     counters = fake_client.replicator.counters
-    families = (counters.actor, counters.environment, counters.event, counters.retained, counters.force)
+    families = (counters.actor, counters.environment, counters.event, counters.retained, counters.force, counters.voice)
     return sum(family.messages_in for family in families)
 
 

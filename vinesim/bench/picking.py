@@ -8,20 +8,14 @@ simulation: what is measured is arm, hand, blade and canopy, not perception. Job
 from __future__ import annotations
 
 import collections
-import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
 
+from vinesim.api.picking import Grasp, PickAttempt, attempt_pick
 from vinesim.client.tasks import pick_planning
 from vinesim.client.tasks.start_poses import bunch_centres, spawn_pose
-from vinesim.physics.step import Physics
-from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.tasks.pick import PickBunch, PickPlan
 from vinesim.scene.generation.vineyard import generate
-from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
@@ -30,39 +24,6 @@ REACH = 3.0
 """[m] Bunches this near to the start place are tried; the base may move."""
 CLASSES = (-np.inf, 0.0, 0.005, 0.015, pick_planning.FULL_CLEARANCE, np.inf)
 """[m] Bounds of the classes of clearance: planned picks have 5 mm at least."""
-END_PHASE = "drive"
-"""The task's first phase after the bunch has been cut and drawn back."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Attempt:
-    """One bunch that was tried."""
-
-    bunch: int
-    clearance: float
-    """[m] Of the open hand to anything but its bunch."""
-    picked: bool
-    reason: str
-    """Why not; empty if picked."""
-    others: int
-    """Bunches beside it that came off their vines."""
-
-
-def attempt(
-    model: Model, robot: RobotDescription, bunch: int, side: str, base: np.ndarray, clearance: float
-) -> Attempt:
-    """Pick one bunch of a vineyard at rest from a base pose [7], as far as back to the robot."""
-    physics = Physics(model)
-    picker = Robot(physics.rigid, robot, "picker", pose=base)
-    picker.fit_cutters(physics)
-    plan = PickPlan(bunch, side, base, 0, base[None, :2], 0.0)  # box and path are those of phases that are not reached
-    task = PickBunch(physics, picker, plan)
-    while not task.is_done and task.phase != END_PHASE:
-        task.control(physics.time)
-        picker.control(physics.time)
-        physics.step()
-    cut = ~physics.state.bunch_attached
-    return Attempt(bunch, clearance, not task.is_done, task.reason, int(cut.sum() - cut[bunch]))
 
 
 def class_name(clearance: float) -> str:
@@ -76,17 +37,17 @@ def class_name(clearance: float) -> str:
 
 def picking() -> Iterator[Measurement]:
     """Success over all bunches in reach, by clearance, for the freest, and how many cannot be tried."""
-    scene, robot = load_scene(SCENE), load_description("vinebot")
+    scene = load_scene(SCENE)
     model, near = generate(scene), spawn_pose(scene, 0)[:2]
     around = int((np.linalg.norm(bunch_centres(model)[:, :2] - near, axis=1) < REACH).sum())
-    tries = [attempt(model, robot, *base) for base in pick_planning.freest_bases(model, near, REACH)]
+    tries = [attempt_pick(model, Grasp(*one)) for one in pick_planning.freest_bases(model, near, REACH)]
     case = f"{SCENE}, bunches within {REACH:g} m of start place 0"
     yield Measurement("picking", case, float(around), "bunches")
     yield Measurement("picking", f"{case}, that a base can stand before and a hand fits", float(len(tries)), "bunches")
     yield from success_measurements(tries)
 
 
-def success_measurements(tries: list[Attempt]) -> Iterator[Measurement]:
+def success_measurements(tries: list[PickAttempt]) -> Iterator[Measurement]:
     """Success of all, of each class, and of the freest; why the others failed; what else came off."""
     by_class = collections.defaultdict(list)
     for one in sorted(tries, key=lambda one: one.clearance):

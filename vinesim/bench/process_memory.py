@@ -112,9 +112,15 @@ class ProcessSampler:
         self._roots = roots
         self.histories: dict[tuple[str, int], ProcessHistory] = {}
         """By kind and id; the kind of a descendant is its name."""
+        self._sampled_at = 0.0
+
+    def memory(self) -> float:
+        """Of all processes that ran at the last sample [MB]."""
+        return sum(one.samples[-1].memory for one in self.histories.values() if one.times[-1] == self._sampled_at)
 
     def sample(self, time: float) -> None:
         """Add a sample of each process that runs at ``time`` [s]."""
+        self._sampled_at = time
         for kind, root in self._roots:
             for name, pid in ((kind, root), *((name, pid) for pid, name in process_tree(root))):
                 with contextlib.suppress(OSError):  # it has ended meanwhile

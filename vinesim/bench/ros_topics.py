@@ -163,7 +163,9 @@ def action_rows(rows: list[dict[str, Any]]) -> Iterator[Measurement]:
     yield Measurement("ros", "goals: fastest joint", max(row["fastest"] for row in kinds["goal"]), "rad/s, m/s")
     yield at_most("cancels: motion in the second half of a second after", max(r["drift"] for r in kinds["cancel"]),
                   "rad, m", 0.005)  # fmt: skip
-    yield at_most("goals whose handles a server still knows after 11 s", kinds["end"][0]["known"], "goals", 0.0)
+    end = kinds["end"][0]
+    yield at_most("goals whose handles a server knows for good", end["known"], "goals", 0.0)
+    yield Measurement("ros", "goals: all handles forgotten after the end of the last goal", end["s"], "s")
 
 
 def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Measurement]:

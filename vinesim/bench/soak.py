@@ -120,22 +120,23 @@ def run_soak(cast: Cast, minutes: float, announce: Callable[[str], None]) -> Soa
                 said = now
                 announce(f"{(now - start) / 60.0:.0f} of {minutes:g} minutes; {run.progress()}")
             time.sleep(POLL_PERIOD)
-        histories, ended = settle(run.sampler.histories, settled, end)
+        histories, ended = settle(run.sampler.histories, start, settled, end)
         return SoakResult(histories, run.end() | ended, run.least_rate())
 
 
 def settle(
-    histories: dict[tuple[str, int], ProcessHistory], settled: float, end: float
+    histories: dict[tuple[str, int], ProcessHistory], start: float, settled: float, end: float
 ) -> tuple[dict[tuple[str, int], ProcessHistory], dict[str, int]]:
     """Histories from the time ``settled`` [s] on, and which processes had ended a minute before the ``end`` [s].
 
-    A process that has got another name meanwhile, as one that stood by, is there under both, and has not ended.
+    A process that was started later, as one that stands by for another, settles for as long from its own start. One
+    that has got another name meanwhile is there under both, and has not ended.
     """
     last: dict[int, float] = {}
     for (_, pid), history in histories.items():
         last[pid] = max(last.get(pid, -np.inf), history.times[-1])
     ended = {f"{kind} {pid} ended": 1 for kind, pid in histories if last[pid] < end - 60.0}
-    later = {key: history.since(settled) for key, history in histories.items()}
+    later = {key: history.since(history.times[0] - start + settled) for key, history in histories.items()}
     return {key: history for key, history in later.items() if history.times}, ended
 
 
@@ -226,7 +227,7 @@ class _Run:
 
     def progress(self) -> str:
         """One line: memory of all, rates of the clients, faults so far."""
-        memory = sum(history.samples[-1].memory for history in self.sampler.histories.values())
+        memory = self.sampler.memory()
         rates = " ".join(f"{values['tick_hz']:.0f}" for values in self._newest.values())
         faults: dict[str, int] = {}
         for values in self._newest.values():

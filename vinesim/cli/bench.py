@@ -121,6 +121,12 @@ def _live(rows: Sequence[str] = ()) -> Iterator[Measurement]:
     return live(rows, _announce)
 
 
+def _sound() -> Iterator[Measurement]:
+    from vinesim.bench.sound_delay import sound
+
+    return sound()
+
+
 def _page() -> Iterator[Measurement]:
     from vinesim.bench.page_latency import page
 
@@ -178,6 +184,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "live": _live,
     "ros": _ros,
     "page": _page,
+    "sound": _sound,
     "sync": _sync,
     "link": _link,
     "traffic": _traffic,

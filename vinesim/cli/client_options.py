@@ -12,7 +12,7 @@ ROLES = ("robot", "human", "spectator")
 
 ROLES_OF_OPTION = {
     **dict.fromkeys(("robot", "approach", "namespace", "params_file", "ros", "push", "job", "watch"), ("robot",)),
-    **dict.fromkeys(("walk", "reach", "height", "gestures"), ("human",)),
+    **dict.fromkeys(("walk", "reach", "into", "height", "gestures"), ("human",)),
     "jitter_buffer": ("robot", "human"),
     "sensor_hz": ("robot", "spectator"),
     "renderer": ("robot", "spectator"),
@@ -52,6 +52,8 @@ class ClientOptions:
     """x, y [m]."""
     reach: int | None
     """Bunch."""
+    into: int | None
+    """Box."""
     height: float
     """[m]"""
     watch: int | None

@@ -119,20 +119,21 @@ class ClientSession:
                 return
             port = 0
         page_files.check()
+        from vinesim.client.page_sound import PageSound
         from vinesim.client.page_world import PageWorld
         from vinesim.web.page_server import PageServer
 
-        world = PageWorld(client, person)
+        world, sound = PageWorld(client, person), PageSound(client)
         if self.options.page_lan:
             from vinesim.client.page_access import network_access, print_code
 
             access = network_access()
             server = self.enter(
-                PageServer(world, port, access.host, tls=access.tls, token=access.token)
+                PageServer(world, port, access.host, tls=access.tls, token=access.token, sound=sound)
             )  # fmt: skip
             print_code(server.address)
         else:
-            server = self.enter(PageServer(world, port))
+            server = self.enter(PageServer(world, port, sound=sound))
         print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
         client.post_step.append(lambda _: world.collect(server))
         client.faults_elsewhere.append(lambda: {"page_messages_refused": server.refused})

@@ -6,17 +6,22 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from vinesim import frames
 from vinesim.avatar.gestures import Gestures
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
+from vinesim.client.tasks.meet_planning import REACH
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch
 from vinesim.errors import writing
+from vinesim.physics.step import Physics
 
-REACH = 0.55
-"""Horizontal distance from a bunch at which a human stands to take hold of it [m]. GUESSED."""
+GIVING_HEIGHT = 0.70
+"""Height of the hand above the bottom of a box when it lets a bunch go [m]. GUESSED."""
+LIFTED, STILL_SPEED, HOLDS_STILL = 0.08, 0.03, 1.0
+"""A box that is raised by so much [m], and slower than this [m/s] for so long [s], is held out. GUESSED."""
 
 
 def run(options: ClientOptions) -> int:
@@ -43,7 +48,11 @@ def run(options: ClientOptions) -> int:
             trace = session.trace(client, options.reach)
             if options.walk is None:
                 human.do(human.walk(standing_place(bunch_centres(session.model)[options.reach], start)))
-            human.do(pull_repeatedly(human, trace.centre, client.humans[session.name].indicate))
+            indicate = client.humans[session.name].indicate
+            if options.into is None:
+                human.do(pull_repeatedly(human, trace.centre, indicate))
+            else:
+                human.do(pick_and_give(human, client.physics, options.reach, options.into, indicate))
         session.show_page(client, human if isinstance(human, TrackedHuman) else None)
         status = session.run(client)
         if options.out is not None:
@@ -73,9 +82,49 @@ def pull_repeatedly(
         yield from human.wait(1.5)
 
 
-def standing_place(bunch: np.ndarray, start: np.ndarray) -> tuple[float, float]:
-    """A point (x, y) [m] within reach of a bunch [3] m, on the side of the pose ``start`` [7]."""
-    way = bunch[:2] - start[:2]
+def pick_and_give(
+    human: ScriptedHuman, physics: Physics, bunch: int, box: int, indicate: Callable[[str], None] = lambda _: None
+) -> Iterator[None]:
+    """Pick a bunch in reach, wait until a box was lifted and holds still, lay the bunch into it, and step back.
+
+    ``indicate`` is told what the person intends.
+    """
+    body, middle = int(physics.model.bunch_body[bunch]), 0.5 * float(physics.model.bunch_length[bunch])
+
+    def centre() -> np.ndarray:
+        physics.update_kinematics()
+        return frames.compose(physics.state.body_q[body].astype(float), frames.pose([middle, 0.0, 0.0]))[:3]
+
+    def box_place() -> np.ndarray:
+        names = [visual.name for visual in physics.rigid.visuals()]
+        return physics.rigid.visual_q()[names.index(f"box/{box}"), :3]
+
+    indicate("pick")
+    yield from human.reach("right", centre)
+    yield from human.wait(0.5)
+    yield from human.back(lambda: not physics.state.bunch_attached[bunch])
+    yield from human.back(lambda: False, 0.3)
+    indicate("hand over")
+    low, before, still = box_place()[2], box_place(), 0.0
+    while still < HOLDS_STILL:
+        yield
+        here = box_place()
+        is_still = np.linalg.norm(here - before) < STILL_SPEED * human.dt and here[2] > low + LIFTED
+        before, still = here, still + human.dt if is_still else 0.0
+    yield from human.walk(standing_place(box_place(), human.place))
+    yield from human.face((float(before[0]), float(before[1])))
+    yield from human.reach("right", lambda: box_place() + np.array([0.0, 0.0, GIVING_HEIGHT]))
+    yield from human.wait(0.5)
+    yield from human.release("right")
+    yield from human.wait(0.5)
+    indicate("")
+    yield from human.withdraw("right")
+    yield from human.back(lambda: False, 0.5)
+
+
+def standing_place(goal: np.ndarray, start: np.ndarray) -> tuple[float, float]:
+    """A point (x, y) [m] within reach of a ``goal`` [3] m, on the side of the place ``start`` [2 or 7]."""
+    way = goal[:2] - start[:2]
     length = float(np.linalg.norm(way))
-    x, y = bunch[:2] - way * min(1.0, REACH / max(length, 1e-9))
+    x, y = goal[:2] - way * min(1.0, REACH / max(length, 1e-9))
     return float(x), float(y)

@@ -10,11 +10,12 @@ import numpy as np
 from vinesim import frames
 from vinesim.avatar.gestures import OPEN_HAND
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
+from vinesim.client import page_overlays
 from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator, follow_view
 from vinesim.physics.plants.sway import Sway
 from vinesim.scene.model import Model
-from vinesim.scene.values import INTENTIONS, Haptic, Snapshot
+from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, Snapshot
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.static_primitives import row_layout
@@ -53,12 +54,21 @@ class PageWorld:
         self._lock = threading.Lock()
         self._snapshot: Snapshot | None = None
         self._rigid_version, self._rigid = 0, b""
+        self._lamps: dict[str, np.ndarray] = {}
+        """Rows of primitives that have shone, counted from those of the rigid bodies; their surfaces and materials."""
+        self._laid_out: dict[str, np.ndarray] = {}
+        """Values of the rigid primitives as pages load them."""
+        self._has_shone = np.zeros(0, bool)
+        """[row] Whether it was ever other than that."""
         self._visuals: tuple[Any, ...] | None = None
         client.after_reset.append(self._follow_reset)
         self._driver: int | None = None
         """The page that moves the spectator's eyes or the person: the first that sends anything."""
         self._eyes: np.ndarray | None = None
         self._intention = ""
+        self._overlay_pages: set[int] = set()
+        """Pages that show contacts and owners."""
+        self._contacts: tuple[Contact, ...] = ()
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
 
@@ -79,6 +89,7 @@ class PageWorld:
                     self._haptics[haptic.hand] = haptic
         if self._sway is None or not server.has_viewers:
             return
+        self._contacts = physics.contacts if self._overlay_pages else ()
         snapshot = physics.snapshot()
         swayed = self._sway.apply(snapshot, np.flatnonzero(self._moved_at == physics.tick))
         self._moved_at[swayed.moved_trees] = physics.tick
@@ -109,6 +120,7 @@ class PageWorld:
             {
                 "scene": scene.name, "seed": scene.seed, "sun": list(sun), "rows": list(row_layout(model)),
                 "bodies": len(model.body_mass), "dt": self._client.physics.dt,
+                "interest": self._client.replicator.interest_radius,
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
                 "person": None if self._person is None else self._client.name,
@@ -118,7 +130,8 @@ class PageWorld:
             },
             _nearest(primitives, self._start_view()[:3], self._most)
             | {
-                "poses": self._at_rest.astype(np.float32), "outline": outline, "hull": hull,
+                "tree_first": model.tree_first.astype(np.uint32), "poses": self._at_rest.astype(np.float32),
+                "outline": outline, "hull": hull,
                 "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(self._start_view(), np.float32),
             },
         )  # fmt: skip
@@ -134,27 +147,44 @@ class PageWorld:
         if snapshot is None or self._primitives is None or snapshot.tick <= since:
             return None
         if snapshot.visuals is not self._visuals:
-            self._lay_out_rigid(self._primitives, snapshot)
+            self._follow_visuals(self._primitives, snapshot)
         body = self._bodies(np.flatnonzero(self._moved_at > since))
         pose, rigid = snapshot.body_q[body], np.asarray(snapshot.visual_q).reshape(-1, 7)
         haptics, self._haptics = self._haptics, {}
+        shown = {"owners": page_overlays.owners(self._client)} if self._overlay_pages else {}
         state = array_message.encode(
             {
-                "tick": snapshot.tick, "time": snapshot.time, "rigid": self._rigid_version,
+                **shown, "tick": snapshot.tick, "time": snapshot.time, "rigid": self._rigid_version,
                 "haptics": {hand: [one.amplitude, one.duration] for hand, one in haptics.items()},
             },
             {
                 "body": body.astype(np.uint32), "place": pose[:, :3].astype(np.float32), "turn": _turns(pose),
                 "rigid_place": rigid[:, :3].astype(np.float32), "rigid_turn": _turns(rigid),
-                "picked": np.flatnonzero(~snapshot.bunch_attached).astype(np.uint32),
+                "picked": np.flatnonzero(~snapshot.bunch_attached).astype(np.uint32), **self._lamps,
+                **page_overlays.contact_arrays(self._contacts),
             },
         )  # fmt: skip
         return snapshot.tick, state
 
-    def _lay_out_rigid(self, primitives: Primitives, snapshot: Snapshot) -> None:
+    def _follow_visuals(self, primitives: Primitives, snapshot: Snapshot) -> None:
+        """Lay the rigid bodies out for pages, unless only lights have changed: those are part of every state."""
         primitives.update(snapshot)
-        self._visuals, self._rigid_version = snapshot.visuals, self._rigid_version + 1
+        before, self._visuals = self._visuals, snapshot.visuals
         rows = slice(primitives.plant_count, primitives.count)
+        columns = _columns(primitives, rows)
+        if before is None or not _differ_in_lights_only(before, snapshot.visuals):
+            self._lay_out_rigid(primitives, snapshot, rows)
+            self._laid_out, self._has_shone = columns, np.zeros(len(columns["material"]), bool)
+        self._has_shone |= (columns["surface"] != self._laid_out["surface"]).any(1)
+        self._has_shone |= columns["material"] != self._laid_out["material"]
+        lamps = np.flatnonzero(self._has_shone)
+        self._lamps = {
+            "lamp": lamps.astype(np.uint32), "lamp_surface": columns["surface"][lamps],
+            "lamp_material": columns["material"][lamps],
+        }  # fmt: skip
+
+    def _lay_out_rigid(self, primitives: Primitives, snapshot: Snapshot, rows: slice) -> None:
+        self._rigid_version += 1
         clusters = slice(len(primitives.cluster_first) - len(primitives.rigid_clusters), None)
         self._rigid = array_message.encode(
             {"version": self._rigid_version, "names": [visual.name for visual in snapshot.visuals]},
@@ -163,6 +193,7 @@ class PageWorld:
 
     def take(self, page: int, said: PageInput) -> None:
         """Take over where a page looks from and what its person does; only the first page's."""
+        (self._overlay_pages.add if said.overlays else self._overlay_pages.discard)(page)
         if self._driver is None:
             self._driver = page
         if page != self._driver:
@@ -175,6 +206,7 @@ class PageWorld:
 
     def leave(self, page: int) -> None:
         """A page is gone: another one may move the person."""
+        self._overlay_pages.discard(page)
         if page == self._driver:
             self._driver = None
 
@@ -204,6 +236,21 @@ def _towards_plants(root: np.ndarray, model: Model) -> np.ndarray:
         return root
     x, y = ways[np.argmin(distances)]
     return frames.pose(root[:3], frames.from_yaw(np.arctan2(y, x)))
+
+
+def _differ_in_lights_only(before: tuple[RigidVisual, ...], now: tuple[RigidVisual, ...]) -> bool:
+    """Whether two lists of rigid bodies have the same shapes but for the colours of indicator lights."""
+    return len(before) == len(now) and all(
+        one is other
+        or (
+            (one.name, one.organ, one.index, len(one.shapes))
+            == (other.name, other.organ, other.index, len(other.shapes))
+            and all(
+                a is b or (a.is_indicator and b.is_indicator) for a, b in zip(one.shapes, other.shapes, strict=True)
+            )
+        )
+        for one, other in zip(before, now, strict=True)
+    )
 
 
 def _tracked(person: TrackedPerson) -> TrackedPoints:

@@ -41,6 +41,8 @@ class PageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Tick of the newest state that the page has drawn."""
     view: Pose
     person: TrackedPerson | None = None
+    overlays: bool = False
+    """Whether it shows contact forces or owners."""
 
     def poses(self) -> list[Pose]:
         """All poses in it."""

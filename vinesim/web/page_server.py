@@ -21,6 +21,7 @@ from vinesim.errors import UsageError
 from vinesim.web import page_files
 from vinesim.web.page_files import PAGE
 from vinesim.web.page_input import PageInput, decode_input
+from vinesim.web.voice_socket import Sound, VoiceSocket
 
 log = logging.getLogger(__name__)
 
@@ -67,15 +68,18 @@ class PageServer:
 
     def __init__(
         self, world: World, port: int = 0, host: str = "127.0.0.1", *, tls: ssl.SSLContext | None = None,
-        token: str | None = None,
+        token: str | None = None, sound: Sound | None = None,
     ) -> None:  # fmt: skip
-        """``port`` 0: any that is free; ``tls``: by https; ``token``: only who has it in the address is let in.
+        """``port`` 0: any that is free; ``tls``: by https; ``token``: only who has it in the address is let in;
+        ``sound``: what pages hear and say.
 
         Raises :class:`UsageError` if the page lacks anything or the port is taken.
         """
         page_files.check()
         self._world, self._host, self._asked = world, host, port
         self._tls, self._token = tls, token
+        self.voice = None if sound is None else VoiceSocket(sound)
+        """The socket of sound."""
         self.port = 0
         self._pages = 0
         self.states_sent = 0
@@ -134,6 +138,8 @@ class PageServer:
         app.router.add_get("/scene", self._scene)
         app.router.add_get("/rigid", self._rigid)
         app.router.add_get("/state", self._state)
+        if self.voice is not None:
+            app.router.add_get("/voice", self.voice.serve)
         app.router.add_static("/", PAGE)
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
@@ -148,6 +154,8 @@ class PageServer:
         finally:
             for event in self._fresh:
                 event.set()
+            if self.voice is not None:
+                await self.voice.close()
             await runner.cleanup()
 
     def _wake(self) -> None:

@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 
 from vinesim import frames
+from vinesim.bench.support.ear import Ear
 from vinesim.bench.support.fake_client import FakeClient
 from vinesim.client.client import Client
 from vinesim.net.codec import messages
@@ -93,6 +94,7 @@ class FuzzWorld:
             clock=lambda: self.now,
         )  # fmt: skip
         self.client.physics.wind = None
+        self.ear = Ear(self.client, "ada")
         self.bob = FakeClient(
             self.hub.bus("bob"), self.model, (float(BOB[0]), float(BOB[1])), kind="human", digest=self.model.digest()
         )
@@ -217,6 +219,8 @@ class FuzzWorld:
         """What is wrong now."""
         physics, client = self.client.physics, self.client
         state, data = physics.state, physics.rigid.mj_data
+        if self.ear.blocks and not np.isfinite(self.ear.take()).all():
+            yield "what the microphone hears is not finite"
         for name in ("joint_q", "joint_qd", "joint_x", "joint_xd"):
             if not np.isfinite(getattr(state, name)).all():
                 yield f"{name} of the plants is not finite"

@@ -32,7 +32,7 @@ Ros = Annotated[bool, typer.Option(help="Of a robot: run a ROS 2 node, if ROS 2 
 ParamsFile = Annotated[
     pathlib.Path | None, typer.Option(help="Of a robot: a ROS 2 parameter file for its nodes (YAML).")
 ]
-Job = Annotated[str | None, typer.Option(help="Of a robot: do a job and stop: pick or exchange.")]
+Job = Annotated[str | None, typer.Option(help="Of a robot: do a job and stop: pick, exchange or meet.")]
 Height = Annotated[float, typer.Option(min=1.0, max=2.5, help="Of a human [m].")]
 InterestRadius = Annotated[
     float, typer.Option(min=0.1, max=5.0, help="Actors nearer than this to an object receive its motion [m].")
@@ -76,13 +76,18 @@ Reach = Annotated[
     int | None, typer.Option(hidden=True, help="Of a human: walk to this bunch, hold it, pull, let go, repeatedly.")
 ]
 
+Into = Annotated[
+    int | None, typer.Option(hidden=True, help="Of a human: pick the bunch of --reach, and lay it into this box.")
+]
+
 
 def client(
     ctx: typer.Context, role: Role = "robot", name: Name = None, connect: Server = None, tls: Certificates = None,
     scene: Scene = "demo", seed: Seed = None, robot: Robots = None, spawn: Spawn = 0, pose: StartPose = None,
     approach: Approach = 0.0, namespace: Namespace = "", params_file: ParamsFile = None, ros: Ros = True,
     push: Push = None,
-    job: Job = None, walk: Walk = None, reach: Reach = None, height: Height = 1.75, watch: Watch = None,
+    job: Job = None, walk: Walk = None, reach: Reach = None, into: Into = None,
+    height: Height = 1.75, watch: Watch = None,
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
     sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,

@@ -13,7 +13,10 @@ from vinesim.cli.commands.options import Device, Seed
 def demo(
     job: Annotated[
         str,
-        typer.Option(help="push: on and on. pick: a bunch into a box. exchange: a full box for an empty one."),
+        typer.Option(
+            help="push: on and on. pick: a bunch into a box. exchange: a full box for an empty one. meet: a person "
+            "picks into a box that a robot holds."
+        ),
     ] = "push",
     seconds: Annotated[
         float | None, typer.Option(min=6.0, help="How long the robots push, 20; or how long a job may take, 120 [s].")
@@ -35,7 +38,8 @@ def demo(
 
     Starts a server, two robot clients (one for a job) and a plain rclpy subscriber, each a process of its own, on free
     ports. The seconds of a push begin when server, clients, sensors and subscriber are all ready. summary.json holds
-    the measurements; of a job whether it was done ("picked", "exchanged") and if not, why.
+    the measurements; of a job whether it was done ("picked", "exchanged", "handed_over") and if not, why.
+    To meet, a carrier brings a box to a person of another client, who picks a bunch and lays it in.
 
     \b
     Examples:
@@ -44,6 +48,7 @@ def demo(
       vinesim demo --scene my-block.toml --robot my-robot.urdf --headless
       vinesim demo --job pick --seed 5
       vinesim demo --job exchange
+      vinesim demo --job meet
     """
     if job == "push":
         from vinesim.cli.demo.push_demo import run_push

@@ -32,7 +32,8 @@ def bench(
     simulated time). Of sensors: camera and lidar (speed),
     sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
     beside budgets). Of ROS: ros (topics of every step in another process, one subscriber stopped; actions). Of
-    browsers: page (input of a person to the state that shows it). Of the
+    browsers: page (input of a person to the state that shows it), sound (how
+    late alarms are seen and heard, and voices, in simulated time). Of the
     network: sync (what delay does, in simulated time), link (real clients over emulated links;
     needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz
     (broken messages and well-formed lies), kill (programs killed at random moments, while all others go on).

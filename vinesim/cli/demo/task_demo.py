@@ -1,8 +1,9 @@
-"""``vinesim demo --job``: one robot does a job, and a visitor watches."""
+"""``vinesim demo --job``: one robot does a job, and a visitor watches or a person takes part."""
 
 from __future__ import annotations
 
 import json
+import math
 import pathlib
 
 from rich.console import Console
@@ -12,13 +13,18 @@ from vinesim.cli.demo.placement import visitor_pose
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, process_group
+from vinesim.client.tasks.meet_planning import plan_meeting
+from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.client.tasks.task_registry import UnknownTask
 from vinesim.errors import writing
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
-from vinesim.scene.spec import load_scene, with_seed
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import Scene, load_scene, with_seed
 
-JOBS = {"pick": ("vinebot", "picked"), "exchange": ("logistic", "exchanged")}
+JOBS = {
+    "pick": ("vinebot", "picked"), "exchange": ("logistic", "exchanged"), "meet": ("logistic", "handed_over"),
+}  # fmt: skip
 """Jobs: the robot that does them unless another is named, and the key of ``summary.json`` for whether it was done."""
 TIME_LIMIT = 120.0
 """Simulated time that a job may take unless given [s]."""
@@ -30,7 +36,7 @@ def run_job(
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
     if job not in JOBS:
-        raise UnknownTask(f"no job {job!r}; give push, {' or '.join(JOBS)}")
+        raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
     console = Console(stderr=True)
     check_device(device)
     default_robot, done_key = JOBS[job]
@@ -43,14 +49,19 @@ def run_job(
     with process_group() as group:
         server, endpoint = group.start_server()
         console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
-        common = ["-m", "vinesim.cli", "client", "--role", "robot", "--connect", endpoint, "--scene", scene]
-        common += ["--seed", str(plan.seed), "--robot", robot, "--device", device, "--status", "json"]
+        client = ["-m", "vinesim.cli", "client", "--connect", endpoint, "--scene", scene, "--seed", str(plan.seed)]
+        client += ["--device", device, "--status", "json"]
+        common = [*client, "--role", "robot", "--robot", robot]
         visitor, newest = None, Statuses()
-        if (place := visitor_pose(plan)) is not None:
+        if job == "meet":
+            person = [*client, "--role", "human", *_person_options(plan), "--out", str(out / VISITOR)]
+            visitor = group.start(VISITOR, *person, "--name", VISITOR)
+        elif (place := visitor_pose(plan)) is not None:
             visitor = group.start(
                 VISITOR, *common, "--name", VISITOR, *place, "--namespace", VISITOR, "--out", str(out / VISITOR),
                 "--sensor-hz", "0.5",
             )  # fmt: skip
+        if visitor is not None:
             newest[VISITOR] = json.loads(visitor.next_line(START_TIMEOUT))
         picker = group.start(
             PICKER, *common, "--name", PICKER, "--job", job, "--seconds", str(seconds or TIME_LIMIT),
@@ -75,3 +86,13 @@ def run_job(
         )
     console.print(f"pictures and summary.json are in {out}/")
     return 0 if done else 5
+
+
+def _person_options(scene: Scene) -> list[str]:
+    """Of the person of a meeting: where it begins, which bunch it picks, and into which box it lays it."""
+    model = generate(scene)
+    meeting = plan_meeting(model, start_pose(scene, 0))
+    bunch = bunch_centres(model)[meeting.bunch]
+    x, y = meeting.stand
+    yaw = math.atan2(bunch[1] - y, bunch[0] - x)
+    return ["--pose", f"{x:.4f}", f"{y:.4f}", f"{yaw:.4f}", "--reach", str(meeting.bunch), "--into", str(meeting.box)]

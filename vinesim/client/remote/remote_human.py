@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.scene.values import HumanSpec, HumanUpdate
+from vinesim.scene.values import HumanPose, HumanSpec, HumanUpdate
 
 
 class RemoteHuman:
@@ -15,11 +15,13 @@ class RemoteHuman:
         self.rigid, self.name = rigid, name
         self.intention = ""
         """What the person indicates to do."""
+        self.pose: HumanPose | None = None
+        """As last received; its fingers tell the gesture."""
 
     def follow(self, update: HumanUpdate) -> None:
         """Be where ``update`` says at the end of the coming step."""
         self.rigid.move_human(self.name, update.pose)
-        self.intention = update.intention
+        self.intention, self.pose = update.intention, update.pose
 
     def remove(self) -> None:
         """Remove the copy."""

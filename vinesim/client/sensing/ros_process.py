@@ -28,7 +28,7 @@ from vinesim.client.tasks.simulation_control import SimulationControl
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import series_stiffness
-from vinesim.ros.commands.types import Command
+from vinesim.ros.commands.types import Command, GoalResult
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import ComponentStatus, JointReference, RigidVisual
@@ -101,7 +101,7 @@ class RosProcess:
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
         self.handler = RosCommandHandler(
-            self.robot, self._take_commands, lambda result: self.worker.send("finish", result), client.world_time,
+            self.robot, self._take_commands, self._finish, client.world_time,
             lambda pcm: client.sound.play(self.robot.name, pcm),
         )  # fmt: skip
         client.sound.listen(self.robot.name, _Microphone(self))
@@ -119,6 +119,11 @@ class RosProcess:
             self._is_restarted = False
             self.handler.cancel_all(time)
         self.handler(time)
+
+    def _finish(self, result: GoalResult) -> None:
+        """Tell the process how a goal ended; its client hears of it after the steps that led there."""
+        run = self.worker.current()
+        run.send("finish", (run.shared.steps.put_count, result))
 
     def _begin_anew(self) -> None:
         """After a reset: obey no earlier command, and publish the new robot."""

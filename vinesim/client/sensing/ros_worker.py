@@ -6,10 +6,12 @@ the rate of the topics of every step whatever the sensors do.
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import pathlib
 import queue
+import sys
 import time
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -25,7 +27,7 @@ from vinesim.client.sensing.shared_queue import SharedQueue
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import report_ready, serve
 from vinesim.client.sound.microphone_step import MicrophoneStep
-from vinesim.ros.commands.types import SimulationRequest
+from vinesim.ros.commands.types import GoalResult, SimulationRequest
 from vinesim.ros.names import ros_name
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import ControllerKind, ControllerSpec, RigidVisual
@@ -40,6 +42,10 @@ QUEUE_CAPACITY = 100
 """Steps that may wait for the process, a second of them; later ones are lost, and counted."""
 STATISTICS_PERIOD = 0.2
 """Wall time between two reports to the client [s]."""
+COUNT_PERIOD = 0.05
+"""Wall time between two looks at what has subscribers [s]; the node counts them half as often."""
+SWITCH_INTERVAL = 5e-4
+"""[s] The thread that receives gives way to the one that publishes after so long; Python's default is half a step."""
 POLL_PERIOD = 0.02
 """Longest time without a look at commands and requests [s]."""
 
@@ -110,6 +116,7 @@ class RosChannel:
 
 def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
     """Entry of the process: publish until told to stop."""
+    sys.setswitchinterval(SWITCH_INTERVAL)
     serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run())
 
 
@@ -142,8 +149,10 @@ class RosWorker:
         self._truth_names: tuple[str, ...] = ()
         self._named: tuple[int, bytes] = 0, b""
         """Version of the list of rigid bodies, and attached bunches, that :attr:`_truth_names` belong to."""
+        self._ends: collections.deque[tuple[int, GoalResult]] = collections.deque()
+        """Goals that have ended, each after how many records of steps."""
         self._microphone = Microphone()
-        self._next_statistics = 0.0
+        self._next_count = self._next_statistics = 0.0
         self._reported_parameters = self.node.set_parameters
 
     def run(self) -> None:
@@ -156,6 +165,8 @@ class RosWorker:
                     self.node.publish_clock(float(record["time"]))
                     if record["has_state"]:
                         self.node.publish_robot_state(self.config.records.read(record))
+                while self._ends and self._ends[0][0] <= self.channel.steps.taken_count:
+                    self.node.finish_goal(self._ends.popleft()[1])
                 if self.channel.truth.wait(0.0):
                     self._publish_truth()
                 while not self._requests.empty():
@@ -180,7 +191,7 @@ class RosWorker:
             elif kind == "truth":
                 self._rigid.take(value)
             elif kind == "finish":
-                self.node.finish_goal(value)
+                self._ends.append(value)
             elif kind == "simulated" and self.simulation is not None:
                 self.simulation.answer(value)
         return True
@@ -210,15 +221,16 @@ class RosWorker:
 
     def _report(self) -> None:
         """Tell the client what is subscribed to, and now and then what was sent."""
-        wanted = self.channel.wanted
-        wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
+        wanted, now = self.channel.wanted, time.monotonic()
         wanted["goals"][0] = self.node.has_goals
-        wanted["sound"][0] = any(map(self.node.has_subscribers, SOUND_TOPICS))
-        wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
+        if now >= self._next_count:
+            self._next_count = now + COUNT_PERIOD
+            wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
+            wanted["sound"][0] = any(map(self.node.has_subscribers, SOUND_TOPICS))
+            wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
         if (parameters := self.node.set_parameters) is not self._reported_parameters:
             self._reported_parameters = parameters
             self.pipe.send(("parameters", parameters))
-        now = time.monotonic()
         if now >= self._next_statistics:
             self._next_statistics = now + STATISTICS_PERIOD
             self._send_statistics()

@@ -22,6 +22,10 @@ class SharedQueue:
     def __init__(self, record: np.dtype, capacity: int, context: BaseContext) -> None:
         self.lost = 0
         """Records that found no room."""
+        self.put_count = 0
+        """Records that were put; the writer's."""
+        self.taken_count = 0
+        """Records that were taken; the reader's."""
         self._capacity = capacity
         self._memory = SharedArrays({"records": ((capacity,), record)})
         self._free = context.Semaphore(capacity)
@@ -44,6 +48,7 @@ class SharedQueue:
             raise
         self._next = (self._next + 1) % self._capacity
         self._unannounced += 1
+        self.put_count += 1
 
     def wake(self) -> None:
         """Let the reader take what was put."""
@@ -58,6 +63,7 @@ class SharedQueue:
         record = self._memory["records"][self._next].copy()
         self._next = (self._next + 1) % self._capacity
         self._free.release()
+        self.taken_count += 1
         return record
 
     def close(self) -> None:

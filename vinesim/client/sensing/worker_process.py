@@ -34,7 +34,8 @@ STANDBY_DELAY = 2.0
 """A process has been ready for so long before another one stands by [s]."""
 HANG_TIMEOUT = 15
 """A process that was ready and then sends nothing for this long hangs, and is started again [s]. It reports to the
-client five times a second, unless it renders a picture or writes files."""
+client five times a second, unless it renders a picture or writes files. Time in which it waits for a CPU does not
+count: to start it again would only load a busy machine more."""
 START_TIMEOUT = 300
 """The same for a process that is not ready: a first run may compile kernels [s]."""
 LONGEST_PAUSE = 60.0
@@ -45,6 +46,20 @@ class WorkerError(RuntimeError):
     """A process of the client could not start; the text says why."""
 
     exit_code = 3
+
+
+def cpu_use(pid: int) -> tuple[float, bool]:
+    """CPU time of a process [s], and whether any of its threads runs or waits for a CPU now; 0 and False if it has
+    ended, and where there is no /proc."""
+    try:
+        place = pathlib.Path("/proc") / str(pid)
+        # The name, in brackets, may hold blanks; behind it come state, ..., user time, system time (proc_pid_stat(5)).
+        fields = (place / "stat").read_text().rpartition(")")[2].split()
+        used = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        threads = [(task / "stat").read_text().rpartition(")")[2] for task in (place / "task").iterdir()]
+    except OSError:
+        return 0.0, False
+    return used, any(thread.split()[0] == "R" for thread in threads)
 
 
 def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
@@ -286,10 +301,16 @@ class WorkerProcess(Generic[S]):
     def _serve(self, run: Run[S]) -> str:
         """Take the messages of a run until it ends or hangs; why it did."""
         reason = ""
-        silent = 0  # seconds, counted one by one: when both processes were stopped for long, only one has passed
+        silent = 0.0  # seconds, counted one by one: when both processes were stopped for long, only one has passed
+        before = 0.0
         while silent < (START_TIMEOUT if run.ready_since is None else HANG_TIMEOUT):
             self._keep_standby(run)
-            silent = 0 if connection.wait([run.pipe, run.process.sentinel], 1.0) else silent + 1
+            if connection.wait([run.pipe, run.process.sentinel], 1.0):
+                silent = 0.0
+            else:
+                used, wants_cpu = cpu_use(run.process.pid or 0)
+                silent += min(used - before, 1.0) if wants_cpu else 1.0
+                before = used
             try:
                 while run.pipe.poll():
                     kind, value = run.pipe.recv()
@@ -308,4 +329,4 @@ class WorkerProcess(Generic[S]):
             if not run.process.is_alive():
                 return reason or f"it ended with exit code {run.process.exitcode}"
         run.process.kill()
-        return reason or f"it hung: nothing came from it for {silent} s"
+        return reason or f"it hung: nothing came from it for {silent:.0f} s"

@@ -26,7 +26,10 @@ MAX_WAITING = 100
 """Frames of one actor that wait for the next step: two seconds; older ones are dropped."""
 
 RESTART = 0.08
-"""[s] A voice whose frames come this much before or after their time begins anew; below it they follow each other."""
+"""[s] A voice whose frames come this much after their time begins anew, what comes this much before it is dropped."""
+
+RESET = 2.0
+"""[s] By this much the clock was set, and the voice begins anew."""
 
 
 class Spoken(NamedTuple):
@@ -95,9 +98,14 @@ class _Speaker:
         """[s] When the next frame begins if the voice goes on, of each kind."""
         self.number = 0
 
-    def stamp(self, now: float, is_main: bool) -> float:
-        """When a frame that has just arrived began [s]; frames of one voice follow each other without gaps."""
-        began, expected = now - FRAME, self.next_time.get(is_main, np.inf)
+    def stamp(self, now: float, is_main: bool) -> float | None:
+        """When a frame that has just arrived began [s]; frames of one voice follow each other without gaps or overlap.
+
+        None: it is one too many, of a page that stood still and sends all at once.
+        """
+        began, expected = now - FRAME, self.next_time.get(is_main, -np.inf)
+        if RESTART <= expected - began < RESET:
+            return None
         time = expected if abs(expected - began) < RESTART else began
         self.next_time[is_main] = time + FRAME
         return time
@@ -112,6 +120,8 @@ class SoundExchange:
         self._speakers: dict[str, _Speaker] = {}
         self._loudspeakers: dict[str, Loudspeaker] = {}
         self._voices: dict[str, Voice] = {}
+        self.dropped = 0
+        """Frames of pages that came all at once."""
         client.post_step.append(lambda _: self._exchange())
 
     # ------------------------------------------------------------------ from any thread
@@ -181,7 +191,9 @@ class SoundExchange:
             self._voices[name] = Voice(voices.may_speak, voices.is_heard, voices.is_heard_plain)
             for _ in range(len(speaker.waiting)):
                 codec, data, is_main = speaker.waiting.popleft()
-                time = speaker.stamp(now, is_main)
+                if (time := speaker.stamp(now, is_main)) is None:
+                    self.dropped += 1
+                    continue
                 voices.say(time, codec, data, is_main=is_main)
                 if is_main and len(self._client.replicators) > 1:
                     said.append(Spoken(name, VoiceFrame(speaker.number, time, codec, data), self.place_of(name)))

@@ -28,7 +28,7 @@ def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) ->
         raise PlacementError(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
     here, legs = start[:2], []
     for box in (empty, full):
-        ways = [find_path(model, here, place, TURNING_RADIUS) for place in _turning_places(model, box)]
+        ways = [find_path(model, here, place, TURNING_RADIUS) for place in turning_places(model, box)]
         ways = [points for points in ways if points is not None]
         if not ways:
             raise PlacementError(
@@ -40,7 +40,7 @@ def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) ->
     return SwapPlan(start, full, empty, *legs)
 
 
-def _turning_places(model: Model, box: int) -> list[np.ndarray]:
+def turning_places(model: Model, box: int) -> list[np.ndarray]:
     """Places [2] m straight before the long sides of a box, with room to turn and a free lane to the box."""
     pose, size = model.box_pose[box].astype(float), model.box_size[box].astype(float)
     across = np.array([0.0, 1.0, 0.0]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.0])

@@ -7,15 +7,16 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim.client.tasks import pick_planning, swap_planning
+from vinesim.client.tasks import meet_planning, pick_planning, swap_planning
 from vinesim.physics.step import Physics
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.tasks.meet_person import MeetPerson
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.model import Model
 
-TASKS = ("pick", "exchange")
+TASKS = ("pick", "exchange", "meet")
 """Names of the tasks that :func:`plan_task` plans."""
 
 
@@ -26,7 +27,7 @@ class UnknownTask(ValueError):
 def validate_task_name(job: str | None) -> str | None:
     """The name ``job``, or None; :class:`UnknownTask` if there is no such task."""
     if job is not None and job not in TASKS:
-        raise UnknownTask(f"no job {job!r}; give {' or '.join(TASKS)}")
+        raise UnknownTask(f"no job {job!r}; give {', '.join(TASKS[:-1])} or {TASKS[-1]}")
     return job
 
 
@@ -39,6 +40,8 @@ def plan_task(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physi
     if validate_task_name(job) == "pick":
         plan = next(pick_planning.plan_picks(model, near[:2]))
         return functools.partial(PickBunch, plan=plan), plan.base_pose
+    if job == "meet":
+        return functools.partial(MeetPerson, plan=meet_planning.plan_meeting(model, near)), near
     boxes = swap_planning.plan_swap(model, near)
     return functools.partial(_begin_swap, swap=boxes), near
 

@@ -193,7 +193,7 @@ class ControllerManager:
         """Command the set-points of the step that starts at ``time`` [s]; call it before :meth:`Robot.control`."""
         for name, controller in self._trajectories.items():
             active = self._goals.get(name)
-            if controller.active_goal is not None:
+            if controller.is_moving:
                 controller(time)
                 state = controller.state(time)
                 joints = self._indices[name]

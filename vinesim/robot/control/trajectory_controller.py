@@ -7,7 +7,9 @@
     if goal.outcome is Outcome.PATH_TOLERANCE_VIOLATED: ...
 
 Between waypoints the splines are cubic if velocities are given, else linear. Where the drives cannot follow, the limits
-of the URDF hold, and the tolerances detect the error.
+of the URDF hold, and the tolerances detect the error. A newer trajectory replaces the older one from its start time on,
+which may lie ahead, and begins with the position and velocity that the older one has then; joints that it does not name
+follow the older one to its end (``allow_trajectory_replacement`` of joint_trajectory_controller 6.8).
 """
 
 from __future__ import annotations
@@ -120,8 +122,43 @@ class GoalHandle:
         return self.outcome is not None
 
 
+@dataclasses.dataclass(slots=True, eq=False)
+class _Spline:
+    """The path of some joints of a controller."""
+
+    start: float
+    """Simulation time [s]"""
+    order: np.ndarray
+    """[k] its joints among those of the controller"""
+    times: np.ndarray
+    """[knot] s after the start"""
+    positions: np.ndarray
+    """[knot, k]"""
+    velocities: np.ndarray | None
+    """[knot, k]; None: linear interpolation"""
+
+    def sample(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities [k] at ``elapsed`` [s]; at rest beyond its end."""
+        knots, points = self.times, self.positions
+        if elapsed >= knots[-1]:
+            return points[-1], np.zeros(points.shape[1])
+        i = max(int(np.searchsorted(knots, elapsed, side="right")) - 1, 0)
+        span = knots[i + 1] - knots[i]
+        s, change = (elapsed - knots[i]) / span, points[i + 1] - points[i]
+        if self.velocities is None:
+            return points[i] + s * change, change / span
+        first, last = span * self.velocities[i], span * self.velocities[i + 1]
+        square, cube = 3.0 * change - 2.0 * first - last, first + last - 2.0 * change
+        place = points[i] + s * (first + s * (square + s * cube))
+        return place, (first + s * (2.0 * square + 3.0 * s * cube)) / span
+
+
+MAX_SPLINES = 32
+"""Trajectories of one controller that are executed or wait for their start; further ones are refused."""
+
+
 class TrajectoryController:
-    """Moves some joints of a robot along trajectories, one at a time; a newer one preempts the one that is executed."""
+    """Moves some joints of a robot along trajectories; a newer one preempts the goal of the older."""
 
     def __init__(
         self,
@@ -141,58 +178,78 @@ class TrajectoryController:
         self.goal_time_tolerance = goal_time_tolerance
         self.active_goal: GoalHandle | None = None
         """The goal that is executed, None if there is none."""
-        self._knot_times = np.zeros(0)
-        self._knot_positions = np.zeros((0, 0))
-        self._knot_velocities: np.ndarray | None = None
-        self._active = self.indices
-        self._order = np.arange(len(self.joints))
+        self._splines: list[_Spline] = []
+        """Oldest first; each joint follows the newest that has begun. The last is that of the active goal."""
         self._desired = robot.setpoint[self.indices].copy()
         self._desired_velocity = np.zeros(len(self.joints))
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether joints follow a trajectory, or one waits for its start."""
+        return bool(self._splines)
 
     # ------------------------------------------------------------------ commands
 
     def start(self, trajectory: Trajectory, time: float) -> GoalHandle:
         """Follow a trajectory from ``time`` [s], or from its own start; the goal before it is preempted.
 
-        Joints that it does not name keep their positions. Raises :class:`TrajectoryError` and changes nothing if the
+        Joints that it does not name go on as before. Raises :class:`TrajectoryError` and changes nothing if the
         trajectory is invalid.
         """
         order = self._validate(trajectory, time)
         began = max(trajectory.start_time, time) if trajectory.start_time > 0.0 else time
-        self._end(Outcome.PREEMPTED, "a newer trajectory took over")
+        before = self._splines_before(order, began, time)
         active = self.indices[order]
         by_servo = np.isin(self.robot.interface[active], (CommandInterface.POSITION, CommandInterface.VELOCITY))
         here = np.where(
             by_servo, self.robot.setpoint[active], self.robot.rigid.joint_measurements(self.robot.name)[0][active]
         )
-        moving = (
-            self._desired_velocity[order] if self.active_goal is not None and began <= time else np.zeros(len(order))
-        )
-        self._desired[order], self._desired_velocity[order] = here, moving
-        self._knot_times, self._knot_positions, self._knot_velocities = (
-            trajectory.times,
-            trajectory.positions,
-            trajectory.velocities,
-        )
-        if trajectory.times[0] > 0.0:  # from the present set-points, or positions
-            self._knot_times = np.concatenate([[0.0], self._knot_times])
-            self._knot_positions = np.concatenate([here[None], self._knot_positions])
-            if self._knot_velocities is not None:
-                self._knot_velocities = np.concatenate([moving[None], self._knot_velocities])
-        self._active, self._order = active, order
+        moving = np.zeros(len(order))
+        if began <= time:
+            if self._splines:
+                moving = self._desired_velocity[order]
+            self._desired[order], self._desired_velocity[order] = here, moving
+        else:
+            resting = ~self._sample(time)[2][order]
+            self._desired[order[resting]], self._desired_velocity[order[resting]] = here[resting], 0.0
+            position, velocity, moved = self._sample(began)
+            here = np.where(moved[order], position[order], here)
+            moving = np.where(moved[order], velocity[order], 0.0)
+        self._end(Outcome.PREEMPTED, "a newer trajectory took over")
+        times, positions, velocities = trajectory.times, trajectory.positions, trajectory.velocities
+        if times[0] > 0.0:
+            times = np.concatenate([[0.0], times])
+            positions = np.concatenate([here[None], positions])
+            velocities = None if velocities is None else np.concatenate([moving[None], velocities])
+        self._splines = [*before, _Spline(began, order, times, positions, velocities)]
         self.active_goal = GoalHandle(trajectory, began)
         return self.active_goal
 
+    def _splines_before(self, order: np.ndarray, began: float, time: float) -> list[_Spline]:
+        """The splines that some joints follow after ``time`` [s] yet, when joints ``order`` [k] have a new one from
+        ``began`` [s] on."""
+        kept: list[_Spline] = []
+        taken = np.full(len(self.joints), np.inf)  # [joint] when a newer spline takes over [s]
+        taken[order] = began
+        for spline in reversed(self._splines):
+            if (taken[spline.order] > max(time, spline.start)).any():
+                kept.insert(0, spline)
+                taken[spline.order] = np.minimum(taken[spline.order], spline.start)
+        if len(kept) >= MAX_SPLINES:
+            text = f"{len(kept)} trajectories are executed or wait for their start; cancel them, or wait"
+            raise TrajectoryError(Outcome.INVALID_GOAL, f"{self.robot.name}: {text}")
+        return kept
+
     def cancel(self) -> None:
-        """Cancel the goal and hold the present positions."""
-        if self.active_goal is not None:
+        """Cancel the goal, and what joints follow yet of earlier ones, and hold the present positions."""
+        if self._splines:
             self._end(Outcome.CANCELED, "it was cancelled")
             self._hold()
 
     def release(self, text: str) -> None:
         """End the goal, as another controller moves its joints from now on; ``text`` says which."""
         self._end(Outcome.PREEMPTED, text)
-        self.active_goal = None
+        self.active_goal, self._splines = None, []
 
     def _validate(self, trajectory: Trajectory, time: float) -> np.ndarray:
         """Indices [joint] of the trajectory's joints among the controller's; :class:`TrajectoryError` if invalid."""
@@ -236,37 +293,45 @@ class TrajectoryController:
 
         The desired state is that of the end of the step, where the joints will be measured.
         """
-        goal = self.active_goal
-        if goal is None:
+        if not self._splines:
             return
-        elapsed = time - goal.start_time
-        if elapsed < 0.0:
+        goal, dt = self.active_goal, self.robot.rigid.dt
+        wanted, rate, _ = self._sample(time)
+        ahead, ahead_rate, moved = self._sample(time, dt)
+        self._desired[moved] = ahead[moved]
+        self._desired_velocity[:] = np.where(moved, ahead_rate, 0.0)
+        if goal is not None and time >= goal.start_time and not self._judge(goal, time, wanted, rate):
             return
+        self.robot.command_position(ahead[moved], self.indices[moved])
+        # From the oldest on: one that a newer has replaced must not come back when that has ended.
+        while self._splines and time + dt >= self._splines[0].start + self._splines[0].times[-1]:
+            if len(self._splines) == 1 and self.active_goal is not None:
+                break
+            self._splines.pop(0)
+
+    def _judge(self, goal: GoalHandle, time: float, wanted: np.ndarray, rate: np.ndarray) -> bool:
+        """Check the errors of a goal against the ``wanted`` positions and velocities [joint]; False if it failed."""
         position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
-        wanted, rate = self._sample(elapsed)
-        ahead = self._sample(elapsed + self.robot.rigid.dt)
-        self._desired[self._order], self._desired_velocity[self._order] = ahead
-        error, slip = wanted - position[self._active], rate - velocity[self._active]
-        if elapsed < self._knot_times[-1]:
-            tolerance = goal.trajectory.path_tolerance or _reordered(self.path_tolerance, self._order)
+        spline, elapsed = self._splines[-1], time - goal.start_time
+        order, active = spline.order, self.indices[spline.order]
+        error, slip = wanted[order] - position[active], rate[order] - velocity[active]
+        if elapsed < spline.times[-1]:
+            tolerance = goal.trajectory.path_tolerance or _reordered(self.path_tolerance, order)
             if len(off := tolerance.violated(error, slip)):
                 self._fail(goal, Outcome.PATH_TOLERANCE_VIOLATED, off[0], error, slip, f"{elapsed:.2f} s on the way")
-                return
-        else:
-            tolerance = goal.trajectory.goal_tolerance or _reordered(self.goal_tolerance, self._order)
-            off = tolerance.violated(error, slip)
-            late = (
-                self.goal_time_tolerance
-                if goal.trajectory.goal_time_tolerance is None
-                else goal.trajectory.goal_time_tolerance
-            )
-            if not len(off):
-                self._end(Outcome.SUCCESSFUL, "")
-                self.active_goal = None
-            elif late > 0.0 and elapsed > self._knot_times[-1] + late:
-                self._fail(goal, Outcome.GOAL_TOLERANCE_VIOLATED, off[0], error, slip, f"{late:.2f} s after the end")
-                return
-        self.robot.command_position(ahead[0], self._active)
+                return False
+            return True
+        tolerance = goal.trajectory.goal_tolerance or _reordered(self.goal_tolerance, order)
+        off = tolerance.violated(error, slip)
+        given = goal.trajectory.goal_time_tolerance
+        late = self.goal_time_tolerance if given is None else given
+        if not len(off):
+            self._end(Outcome.SUCCESSFUL, "")
+            self.active_goal = None
+        elif late > 0.0 and elapsed > spline.times[-1] + late:
+            self._fail(goal, Outcome.GOAL_TOLERANCE_VIOLATED, off[0], error, slip, f"{late:.2f} s after the end")
+            return False
+        return True
 
     def state(self, time: float) -> ControllerState:
         """Desired and actual joint states at ``time`` [s]."""
@@ -276,20 +341,15 @@ class TrajectoryController:
             velocity[self.indices],
         )  # fmt: skip
 
-    def _sample(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [joint] of the spline at ``elapsed`` [s]; at rest beyond its end."""
-        knots, points = self._knot_times, self._knot_positions
-        if elapsed >= knots[-1]:
-            return points[-1], np.zeros(points.shape[1])
-        i = max(int(np.searchsorted(knots, elapsed, side="right")) - 1, 0)
-        span = knots[i + 1] - knots[i]
-        s, change = (elapsed - knots[i]) / span, points[i + 1] - points[i]
-        if self._knot_velocities is None:
-            return points[i] + s * change, change / span
-        first, last = span * self._knot_velocities[i], span * self._knot_velocities[i + 1]
-        square, cube = 3.0 * change - 2.0 * first - last, first + last - 2.0 * change
-        place = points[i] + s * (first + s * (square + s * cube))
-        return place, (first + s * (2.0 * square + 3.0 * s * cube)) / span
+    def _sample(self, time: float, ahead: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions, velocities [joint] so far ``ahead`` of ``time`` [s], and whether each joint follows a spline."""
+        position, velocity = self._desired.copy(), np.zeros(len(self.joints))
+        moved = np.zeros(len(self.joints), bool)
+        for spline in self._splines:
+            if (elapsed := time - spline.start + ahead) >= 0.0:
+                position[spline.order], velocity[spline.order] = spline.sample(elapsed)
+                moved[spline.order] = True
+        return position, velocity, moved
 
     def _fail(
         self, goal: GoalHandle, outcome: Outcome, joint: int, error: np.ndarray, slip: np.ndarray, when: str
@@ -299,10 +359,12 @@ class TrajectoryController:
         self._hold()
 
     def _hold(self) -> None:
-        position = self.robot.rigid.joint_measurements(self.robot.name)[0][self._active]
-        self.robot.command_position(position, self._active)
-        self._desired[self._order], self._desired_velocity[self._order] = position, 0.0
-        self.active_goal = None
+        order = np.unique(np.concatenate([spline.order for spline in self._splines]))
+        active = self.indices[order]
+        position = self.robot.rigid.joint_measurements(self.robot.name)[0][active]
+        self.robot.command_position(position, active)
+        self._desired[order], self._desired_velocity[order] = position, 0.0
+        self.active_goal, self._splines = None, []
 
     def _end(self, outcome: Outcome, text: str) -> None:
         if self.active_goal is not None:

@@ -20,27 +20,13 @@ from typing import Any
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.physics.step import Physics
-from vinesim.robot.control.waypoint_follower import WaypointFollower
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.tasks.task import Task, TaskFailed
+from vinesim.robot.tasks.box_handling import CLAMP_TIME, LIFT_HEIGHT, BoxHandling
+from vinesim.robot.tasks.task import TaskFailed
 
-LIFT_HEIGHT = 0.15
-"""[m] Height above the ground at which boxes are carried. GUESSED"""
 RELEASE_HEIGHT = 0.004
 """[m] Height above the ground at which a box is released: it stands on the ground, however the clamp sags."""
-MIN_CLAMP_FORCE = 100.0
-"""[N] Contact force of each paddle from which on it has clamped something. GUESSED"""
-CLAMP_TIME = 1.5
-"""[s] In which the paddles close or open. GUESSED"""
-LIFT_TIMEOUT = 6.0
-"""[s] In which a lift must reach its height. GUESSED"""
-LIFT_TOLERANCE = 0.003
-"""[m] A lift this near to its height has reached it. GUESSED"""
-APPROACH_SPEED = 0.2
-"""[m/s] Speed of the base close to a box. GUESSED"""
 PLACEMENT_TOLERANCE = 0.05
 """[m] Largest distance between the empty box and where the full one stood. GUESSED"""
 
@@ -59,15 +45,14 @@ class SwapPlan:
     """[n, 2] m, from there to such a place before the full box."""
 
 
-class SwapBoxes(Task):
+class SwapBoxes(BoxHandling):
     """Replaces a full box by an empty one; ``succeeded`` and ``reason`` give the result."""
 
+    GROUPS = ("lift_front", "clamp_front", "lift_rear", "clamp_rear")
+
     def __init__(self, physics: Physics, robot: Robot, plan: SwapPlan, *, timeout: float = 180.0) -> None:
-        super().__init__(robot, timeout=timeout)
-        self.physics, self.plan = physics, plan
-        for group in ("lift_front", "clamp_front", "lift_rear", "clamp_rear"):
-            if group not in robot.description.groups:
-                raise CommandError(f"{robot.name} has no group {group!r}; give a robot with a clamp at either end")
+        super().__init__(physics, robot, timeout=timeout)
+        self.plan = plan
         self._target_pose = self.box_pose(plan.full_box)
         """Pose [7] at which the full box stood."""
         self._contents = self._bunches_in(plan.full_box)
@@ -81,11 +66,6 @@ class SwapBoxes(Task):
         """See :class:`Task`."""
         return self.box_pose(self.plan.full_box)[:3]
 
-    def box_pose(self, box: int) -> np.ndarray:
-        """Pose [7] of a box: the middle of its underside."""
-        rigid = self.physics.rigid
-        return rigid.visual_q()[[link.name for link in rigid.visuals()].index(f"box/{box}")]
-
     # ------------------------------------------------------------------ the task
 
     def run(self) -> Iterator[str]:
@@ -94,36 +74,16 @@ class SwapBoxes(Task):
         yield from self._follow_path(
             "to the empty box", swap.path_to_empty, self._away_from(swap.empty_box, swap.path_to_empty[-1])
         )
-        yield from self._take("rear", swap.empty_box)
+        yield from self._take("take the empty box", "rear", swap.empty_box)
         yield from self._follow_path(
             "to the full box", swap.path_to_full, self._away_from(swap.full_box, swap.path_to_full[-1]) + math.pi
         )
-        yield from self._take("front", swap.full_box)
+        yield from self._take("take the full box", "front", swap.full_box)
         yield from self._follow_path(
             "turn", np.zeros((0, 2)), self._away_from(swap.full_box, swap.path_to_full[-1], self._target_pose)
         )
         yield from self._put_down("rear", swap.empty_box)
         self._check_result()
-
-    def _take(self, end: str, box: int) -> Iterator[str]:
-        """Approach a box with the clamp at ``end``, clamp it, lift it, and return to where the base can turn."""
-        phase, group = f"take the {'full' if box == self.plan.full_box else 'empty'} box", f"clamp_{end}"
-        here = self._base_pose()[:2].copy()
-        fingers = self.robot.description.joint_indices(group)
-        self.robot.command_position(self.robot.upper_limit[fingers], fingers)
-        yield from self._move_lift(phase, end, 0.0)
-        yield from self._align_clamp(phase, end, self.box_pose(box))
-        self.robot.command_position(np.zeros(len(fingers)), fingers)
-        yield from self.wait(CLAMP_TIME, phase)
-        felt = np.abs(self.robot.rigid.joint_measurements(self.robot.name)[3][fingers])
-        if (felt < MIN_CLAMP_FORCE).any():
-            raise TaskFailed(f"the {end} paddles feel {felt.min():.0f} N: nothing between them")
-        low = float(self.box_pose(box)[2])
-        yield from self._move_lift(phase, end, LIFT_HEIGHT)
-        risen = float(self.box_pose(box)[2]) - low
-        if risen < 0.8 * LIFT_HEIGHT:
-            raise TaskFailed(f"the box has slipped: lifted by {LIFT_HEIGHT} m it has risen by {risen:.2f} m")
-        yield from self._drive_straight(phase, here, backwards=end == "front")
 
     def _put_down(self, end: str, box: int) -> Iterator[str]:
         """Put the box in the clamp at ``end`` down where the full box stood, and return to where the base can turn."""
@@ -148,63 +108,3 @@ class SwapBoxes(Task):
             raise TaskFailed("the full box has been lost on the way")
         if lost := sorted(set(self._contents) - set(self._bunches_in(swap.full_box))):
             raise TaskFailed(f"{len(lost)} of {len(self._contents)} bunches fell out of the full box: {lost}")
-
-    # ------------------------------------------------------------------ motions
-
-    def _follow_path(self, phase: str, points: np.ndarray, heading: float) -> Iterator[str]:
-        yield from self._follow(phase, WaypointFollower(self.robot, points, heading, speed=0.5, turn_rate=0.3))
-
-    def _drive_straight(self, phase: str, place: np.ndarray, *, backwards: bool) -> Iterator[str]:
-        yield from self._follow(
-            phase, WaypointFollower(self.robot, place, None, speed=APPROACH_SPEED, reverse=backwards)
-        )
-
-    def _align_clamp(self, phase: str, end: str, box: np.ndarray) -> Iterator[str]:
-        """Drive straight until the clamp at ``end`` is at a box of pose ``box`` [7]."""
-        clamp = self.robot.frame_pose(f"clamp_{end}_link")[:2]
-        base = self._base_pose()[:2]
-        reach = float(np.linalg.norm(clamp - base))
-        ahead = (clamp - base) / reach
-        # along the base only: the heading was aligned before
-        place = base + ahead * (float((box[:2] - base) @ ahead) - reach)
-        yield from self._drive_straight(phase, place, backwards=end == "rear")
-
-    def _follow(self, phase: str, follower: WaypointFollower) -> Iterator[str]:
-        while not follower.is_done:
-            follower.control(self.time)
-            if follower.is_stuck:
-                raise TaskFailed("something keeps the base from going on")
-            yield phase
-
-    def _move_lift(self, phase: str, end: str, height: float) -> Iterator[str]:
-        """Move the lift at ``end`` to ``height`` [m]."""
-        index = self.robot.description.joint_indices(f"lift_{end}")
-        self.robot.command_position([height], index)
-        until = self.time + LIFT_TIMEOUT
-        while abs(self.robot.rigid.joint_measurements(self.robot.name)[0][index[0]] - height) > LIFT_TOLERANCE:
-            if self.time > until:
-                raise TaskFailed(f"the {end} lift does not come to {height:.2f} m")
-            yield phase
-
-    def _lift_index(self, end: str) -> int:
-        return int(self.robot.description.joint_indices(f"lift_{end}")[0])
-
-    def _base_pose(self) -> np.ndarray:
-        """Pose [7] of the base in the world."""
-        return self.robot.rigid.base_state(self.robot.name)[0]
-
-    def _away_from(self, box: int, place: np.ndarray, pose: np.ndarray | None = None) -> float:
-        """Heading [rad] of a base at ``place`` [2] m with its back to a box, or to ``pose`` [7]."""
-        pose = self.box_pose(box) if pose is None else pose
-        return math.atan2(place[1] - pose[1], place[0] - pose[0])
-
-    def _bunches_in(self, box: int) -> tuple[int, ...]:
-        """The free bunches in a box."""
-        rigid, size = self.physics.rigid, self.physics.model.box_size[box].astype(float)
-        back, found = frames.inverse(self.box_pose(box)), []
-        for bunch in rigid.free_bunches:
-            middle = frames.pose([0.5 * float(self.physics.model.bunch_length[bunch]), 0.0, 0.0])
-            at = frames.compose(back, frames.compose(rigid.bunch_pose(bunch), middle))[:3]
-            if (np.abs(at[:2]) < 0.5 * size[:2]).all() and 0.0 < at[2] < 2.0 * size[2]:
-                found.append(bunch)
-        return tuple(found)

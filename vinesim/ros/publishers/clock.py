@@ -14,6 +14,7 @@ import rclpy.node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from vinesim.ros.messages import convert
+from vinesim.ros.messages.serialized import stamp_writer
 from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage, Topic
 
 CLOCK = "/clock"
@@ -29,6 +30,7 @@ class ClockPublisher:
     def __init__(self, node: rclpy.node.Node, advertise: Advertise, withdraw: Callable[[Topic], None]) -> None:
         self._node, self._advertise, self._withdraw = node, advertise, withdraw
         self._topic: Topic | None = None
+        self._write = stamp_writer(convert.clock)
         self._free_since = wall.monotonic()
         self._next_look = 0.0
 
@@ -63,4 +65,4 @@ class ClockPublisher:
         """The message of a time [s], if this node publishes it."""
         topic = self._topic
         if topic is not None:
-            yield topic, partial(convert.clock, time)
+            yield topic, partial(self._write, time)

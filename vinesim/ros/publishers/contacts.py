@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -12,6 +13,7 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from vinesim.ros.messages import convert
+from vinesim.ros.messages.serialized import stamp_writer
 from vinesim.ros.publishers.robot import MAP_FRAME
 from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
 from vinesim.scene.values import Contact, RobotSample
@@ -31,6 +33,7 @@ class ContactPublisher:
         self._markers = advertise(MarkerArray, "vine/markers", RELIABLE)
         self._bunch_of_body, self._links = bunch_of_body, links or {}
         self._steps = 0
+        self._write_none: Callable[[float], bytes] | None = None
 
     def mute(self, is_muted: bool) -> None:
         """Whether nothing is sent."""
@@ -39,10 +42,21 @@ class ContactPublisher:
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """All messages of one step."""
-        yield self._contacts, partial(convert.contact_cloud, sample, self._links, self._bunch_of_body, MAP_FRAME)
+        yield self._contacts, partial(self._cloud, sample)
         self._steps += 1
         if self._steps % MARKER_PERIOD == 0:
             yield self._markers, partial(_arrows, sample)
+
+    def _cloud(self, sample: RobotSample) -> PointCloud2 | bytes:
+        if not sample.contacts:
+            if self._write_none is None:
+                self._write_none = stamp_writer(partial(self._no_contacts, sample))
+            return self._write_none(sample.joints.time)
+        return convert.contact_cloud(sample, self._links, self._bunch_of_body, MAP_FRAME)
+
+    def _no_contacts(self, sample: RobotSample, time: float) -> PointCloud2:
+        at_time = dataclasses.replace(sample, joints=dataclasses.replace(sample.joints, time=time))
+        return convert.contact_cloud(at_time, self._links, self._bunch_of_body, MAP_FRAME)
 
 
 def _arrows(sample: RobotSample) -> MarkerArray:

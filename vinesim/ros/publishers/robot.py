@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -11,10 +11,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from vinesim import frames
-from vinesim.ros.messages import convert
+from vinesim.ros.messages.serialized import joint_state_writer, odometry_writer
 from vinesim.ros.messages.transforms import SerializedTransforms
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
-from vinesim.scene.values import RobotSample
+from vinesim.scene.values import JointSample, RobotSample
 
 MAP_FRAME, ODOM_FRAME = "map", "odom"
 
@@ -35,6 +35,10 @@ class RobotPublisher:
         """Whether ``tf`` holds the true pose of ``odom`` in the map, which else a localisation publishes."""
         self._pairs: tuple[bool, tuple[tuple[str, str], ...]] | None = None
         self._transforms = SerializedTransforms([])
+        self._names: tuple[str, ...] | None = None
+        """Joints of the writers of messages."""
+        self._write_joints: Callable[[JointSample], bytes]
+        self._write_odometry: Callable[[RobotSample], bytes]
 
         self._joints = advertise(JointState, "joint_states", RELIABLE)
         self._tf = advertise(tf_message, "tf", RELIABLE)
@@ -47,9 +51,13 @@ class RobotPublisher:
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """All messages of one step."""
-        yield self._joints, partial(convert.joint_state, sample.joints)
+        if sample.joints.names is not self._names:  # the same tuple every step
+            self._names = sample.joints.names
+            self._write_joints = joint_state_writer(sample.joints)
+            self._write_odometry = odometry_writer(sample, self._base)
+        yield self._joints, partial(self._write_joints, sample.joints)
         yield self._tf, partial(self._frames, sample)
-        yield self._odometry, partial(convert.odometry, sample, self._base)
+        yield self._odometry, partial(self._write_odometry, sample)
 
     def _frames(self, sample: RobotSample) -> bytes:
         has_map = self.publishes_map_to_odom

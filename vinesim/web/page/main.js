@@ -5,7 +5,9 @@ import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
 import { Headset } from "./headset.js";
 import { Absence, say } from "./notices.js";
+import { Overlays } from "./overlays.js";
 import { DeskHand, WalkingEyes } from "./person.js";
+import { Voice } from "./voice.js";
 import { World } from "./world.js";
 
 const RETRY = 1000; // ms
@@ -33,6 +35,7 @@ class Viewer {
     this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons);
     this.offerHeadset();
     this.absence = new Absence();
+    this.overlays = new Overlays(world);
     this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
     this.help.hidden = false;
     this.intention = "";
@@ -103,6 +106,7 @@ class Viewer {
     // poses of trees come once: those of a state that is overtaken before it is drawn count, too
     this.world.apply(state);
     this.newest = state;
+    this.overlays.take(state);
     this.heardAt = performance.now();
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
     this.headset.pulse(state.haptics);
@@ -115,6 +119,7 @@ class Viewer {
   }
 
   press(code) {
+    this.overlays.press(code);
     if (code === "KeyF") {
       const actors = this.actors();
       this.followed = actors.length ? (this.followed + 2) % (actors.length + 1) - 1 : -1;
@@ -147,7 +152,9 @@ class Viewer {
     else this.look(this.eyes.pose);
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
     const eye = new THREE.Vector3(...pose.slice(0, 3));
+    page.voice.listen(pose);
     this.world.list(eye);
+    this.overlays.draw(actors, this.camera);
     this.renderer.info.reset();
     if (now - this.shadowAt > SHADOW_PERIOD) {
       this.shadowAt = now;
@@ -175,7 +182,7 @@ class Viewer {
 
   /** What the client is told: the state that was drawn, where the eyes are, and the person's head and hands. */
   message(pose) {
-    const message = { drawn: page.tick, view: pose };
+    const message = { drawn: page.tick, view: pose, overlays: this.overlays.areShown };
     if (!this.isPerson) return message;
     if (this.headset.isWorn) return { ...message, person: { head: pose, ...this.headset.hands(), intention: this.intention } };
     const ray = new THREE.Vector3(...this.hand.cursor, 0.5).unproject(this.camera).sub(this.camera.position).normalize();
@@ -233,6 +240,7 @@ addEventListener("unhandledrejection", (event) => fail(event.reason));
 addEventListener("error", (event) => { if (event.message) fail(event.message); });
 
 if (window.pageMisses) throw new Error(window.pageMisses);
+page.voice = new Voice();
 const header = await load("scene");
 const world = new World(header);
 const budget = Number(new URLSearchParams(location.search).get("triangles"));

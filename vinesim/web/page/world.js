@@ -143,6 +143,7 @@ export class World {
     this.hidden = new Set();
     this.names.forEach((name, k) => { if (own.has(name)) this.hidden.add(this.bodies + 1 + k); });
     this.rigidVersion = header.version;
+    this.surfaces.clearUpdateRanges(); // all of it
     this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
     this.listedAt = null;
   }
@@ -153,9 +154,23 @@ export class World {
     for (let k = 0; k < body.length; ++k) this.pose(body[k], place, turn, k);
     for (let k = 0; k < rigid_place.length / 3; ++k) this.pose(this.bodies + 1 + k, rigid_place, rigid_turn, k);
     this.poses.needsUpdate = true;
+    if (state.rigid === this.rigidVersion) this.light(state.arrays);
     if (picked.length !== this.picked.size || picked.some((bunch) => !this.picked.has(bunch))) {
       this.picked = new Set(picked);
       this.listedAt = null;
+    }
+  }
+
+  /** Colours of indicator lights; only rows that have changed go to the graphics card. */
+  light({ lamp, lamp_surface, lamp_material }) {
+    const surface = this.surfaces.image.data, colour = new Uint32Array(lamp_surface.slice().buffer);
+    for (let k = 0; k < lamp.length; ++k) {
+      const at = 4 * (this.plants + lamp[k]);
+      if (surface[at] === colour[k] && surface[at + 1] === lamp_material[k]) continue;
+      surface[at] = colour[k];
+      surface[at + 1] = lamp_material[k];
+      this.surfaces.addUpdateRange(at, 4);
+      this.surfaces.needsUpdate = true;
     }
   }
 

@@ -1,0 +1,43 @@
+"""Every notebook runs to its end without a screen, uses the public interface alone, and ends with a check."""
+
+import ast
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
+PAGE = ROOT / "docs/tutorials/notebooks.md"
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_uses_the_public_interface_and_ends_with_a_check(path):
+    text = path.read_text()
+    assert text.startswith("# %% [markdown]\n# # ")
+    cells = re.split(r"^# %%", text, flags=re.M)
+    checks = [node for node in ast.walk(ast.parse("# " + cells[-1])) if isinstance(node, ast.Assert)]
+    assert checks, "the last cell has no check"
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom):
+            assert not (node.module or "").startswith("vinesim."), f"{node.module} is not public"
+        if isinstance(node, ast.Import):
+            assert not [alias.name for alias in node.names if alias.name.startswith("vinesim.")]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs_and_its_check_holds(path, tmp_path):
+    done = subprocess.run(
+        [sys.executable, str(path)], cwd=tmp_path, capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "Warning" not in done.stderr, done.stderr
+
+
+def test_the_page_lists_every_notebook():
+    assert sorted(re.findall(r"`notebooks/(\w+)\.py`", PAGE.read_text())) == [path.stem for path in NOTEBOOKS]

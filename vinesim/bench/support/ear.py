@@ -1,0 +1,37 @@
+"""Records what an actor of a client hears, in the client's own process: as a robot's process does it, for tests."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.audio.microphone import Block, Microphone
+from vinesim.client.client import Client
+from vinesim.client.sound.exchange import SoundStep
+from vinesim.client.sound.microphone_step import at_place
+
+
+class Ear:
+    """Listens for an actor of a client from now on."""
+
+    is_open = True
+
+    def __init__(self, client: Client, name: str, *, decodes_opus: bool = True) -> None:
+        self._client, self._name, self.decodes_opus = client, name, decodes_opus
+        self.microphone = Microphone()
+        self.blocks: list[Block] = []
+        """What was recorded since the last :meth:`take`."""
+        client.sound.listen(name, self)
+
+    def hear(self, step: SoundStep) -> None:
+        """Mix what has arrived."""
+        here = at_place(step, self._client.sound.place_of(self._name))
+        for frame in here.frames:
+            self.microphone.hear(frame)
+        for tone in here.tones:
+            self.microphone.sound(*tone, here.now)
+        self.blocks += self.microphone.blocks(here.now)
+
+    def take(self) -> np.ndarray:
+        """Samples [n] since the last call."""
+        blocks, self.blocks = self.blocks, []
+        return np.concatenate([block.samples for block in blocks])

@@ -1,0 +1,82 @@
+// In the thread of sound: cuts the microphone into frames, and plays the frames of one speaker at an even pace.
+
+const FRAME = 960; // samples of 20 ms at 48 kHz
+const START = 2 * FRAME, LARGEST = 12 * FRAME, SPARE = 4 * FRAME; // samples that wait before a voice begins; at most; beyond
+const RAMP = 96; // samples of a fade, 2 ms
+
+class Capture extends AudioWorkletProcessor {
+  constructor() {
+    super();
+    this.frame = new Float32Array(FRAME);
+    this.filled = 0;
+  }
+
+  process(inputs) {
+    const samples = inputs[0][0];
+    if (!samples) return true;
+    let taken = 0;
+    while (taken < samples.length) {
+      const count = Math.min(FRAME - this.filled, samples.length - taken);
+      this.frame.set(samples.subarray(taken, taken + count), this.filled);
+      taken += count;
+      this.filled += count;
+      if (this.filled === FRAME) {
+        this.port.postMessage(this.frame, [this.frame.buffer]);
+        this.frame = new Float32Array(FRAME);
+        this.filled = 0;
+      }
+    }
+    return true;
+  }
+}
+
+/** Waits for a few frames, then plays; an empty queue makes it wait for more of them, a long one is cut. */
+class Player extends AudioWorkletProcessor {
+  constructor() {
+    super();
+    this.frames = [];
+    this.waiting = 0; // samples
+    this.at = 0; // in the first frame
+    this.target = START;
+    this.plays = false;
+    this.level = 0; // of the fade, 0 to 1
+    this.last = 0;
+    this.counts = { stalls: 0, cut: 0 };
+    this.port.onmessage = ({ data }) => {
+      this.frames.push(data);
+      this.waiting += data.length;
+      while (this.waiting > this.target + SPARE) {
+        this.waiting -= this.frames.shift().length - this.at;
+        this.at = 0;
+        this.counts.cut += 1;
+        this.port.postMessage(this.counts);
+      }
+    };
+  }
+
+  process(_, outputs) {
+    const out = outputs[0][0];
+    if (!this.plays && this.waiting >= this.target) this.plays = true;
+    for (let i = 0; i < out.length; ++i) {
+      if (this.plays && this.frames.length) {
+        this.last = this.frames[0][this.at++];
+        this.waiting -= 1;
+        if (this.at === this.frames[0].length) { this.frames.shift(); this.at = 0; }
+        this.level = Math.min(1, this.level + 1 / RAMP);
+      } else {
+        if (this.plays) {
+          this.plays = false;
+          this.target = Math.min(this.target + FRAME / 2, LARGEST);
+          this.counts.stalls += 1;
+          this.port.postMessage(this.counts);
+        }
+        this.level = Math.max(0, this.level - 1 / RAMP);
+      }
+      out[i] = this.level * this.last;
+    }
+    return true;
+  }
+}
+
+registerProcessor("capture", Capture);
+registerProcessor("player", Player);
