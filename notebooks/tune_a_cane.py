@@ -13,11 +13,9 @@ import tempfile
 import matplotlib.pyplot as plt
 import numpy as np
 
-from vinesim.tune import Experiment, extract_features, load_specimen, measure, read_trajectory, tune, with_values
-from vinesim.tune.plots import draw_held_out, draw_posterior, draw_residuals, draw_track
+from vinesim.tune import Experiment, extract_features, load_specimen, measure, plots, read_trajectory, tune, with_values
 
 FOLDER = pathlib.Path(tempfile.mkdtemp())
-ROOT = next(p for p in (pathlib.Path.cwd(), *pathlib.Path.cwd().parents) if (p / "examples/cane.toml").is_file())
 
 # %% [markdown]
 # ## The laboratory
@@ -25,7 +23,18 @@ ROOT = next(p for p in (pathlib.Path.cwd(), *pathlib.Path.cwd().parents) if (p /
 # The file says what was measured with ruler and scales. The truth differs from it in modulus and damping.
 
 # %%
-guess = load_specimen(ROOT / "examples/cane.toml")
+FILE = """[specimen]
+organ = "cane"
+length = { value = 1.0, unit = "m", grade = "READ", source = "tape measure" }
+base_diameter = { value = 0.0090, unit = "m", grade = "READ", source = "caliper" }
+tip_diameter = { value = 0.0060, unit = "m", grade = "READ", source = "caliper" }
+modulus = { value = 5.89e9, unit = "Pa", grade = "GUESSED", source = "data/plants/vine.toml" }
+density = { value = 900.0, unit = "kg/m^3", grade = "READ", source = "scales, over the volume" }
+damping = { value = 0.004, unit = "s", grade = "GUESSED", source = "a damping ratio of 0.04 at 3.5 Hz" }
+markers = { middle = 0.5 }
+"""
+(FOLDER / "cane.toml").write_text(FILE)
+guess = load_specimen(FOLDER / "cane.toml")
 truth = with_values(guess, modulus=4.2e9, damping=0.0065)
 measure(truth, Experiment(seed=3, force_noise=0.01, markers=("tip", "middle"))).write(FOLDER / "pull.csv")
 print((FOLDER / "pull.csv").read_text()[:200])
@@ -50,15 +59,15 @@ print("\n".join(fit.lines()))
 
 # %%
 figure, (above, below) = plt.subplots(2, 1, figsize=(8, 5), sharex=True, height_ratios=[2, 1])
-draw_track(fit, above)
-draw_residuals(fit, below)
+plots.draw_track(fit, above)
+plots.draw_residuals(fit, below)
 
 # %% [markdown]
 # Posterior and prior: the data know the modulus hundreds of times better than a book does.
 
 # %%
 figure, grid = plt.subplots(2, 2, figsize=(7, 5))
-draw_posterior(fit, grid)
+plots.draw_posterior(fit, grid)
 
 # %% [markdown]
 # ## A release that the fit has not seen
@@ -69,7 +78,7 @@ draw_posterior(fit, grid)
 other = measure(truth, Experiment(seed=4, displacement=0.05, angle=20.0))
 held_out = tune(fit.fitted_specimen(), other, ())
 figure, axes = plt.subplots(figsize=(8, 3))
-draw_held_out(fit, held_out, axes)
+plots.draw_held_out(fit, held_out, axes)
 print(f"left over: {1e3 * held_out.noise:.2f} mm; the camera's noise is 2 mm")
 
 # %% [markdown]

@@ -7,19 +7,31 @@
 
 # %%
 import pathlib
+import tempfile
 
 import matplotlib.pyplot as plt
 import numpy as np
 
-from vinesim.tune import Experiment, extract_features, load_specimen, measure, tune, with_values
-from vinesim.tune.plots import draw_held_out, draw_posterior, draw_residuals, draw_track
+from vinesim.tune import Experiment, extract_features, load_specimen, measure, plots, tune, with_values
 
-ROOT = next(p for p in (pathlib.Path.cwd(), *pathlib.Path.cwd().parents) if (p / "examples/bunch.toml").is_file())
+FOLDER = pathlib.Path(tempfile.mkdtemp())
 
 # %%
-guess = load_specimen(ROOT / "examples/bunch.toml")
+FILE = """[specimen]
+organ = "bunch"
+length = { value = 0.08, unit = "m", grade = "READ", source = "ruler" }
+base_diameter = { value = 0.0045, unit = "m", grade = "READ", source = "caliper" }
+tip_diameter = { value = 0.0045, unit = "m", grade = "READ", source = "caliper" }
+modulus = { value = 0.3e9, unit = "Pa", grade = "GUESSED", source = "data/plants/vine.toml" }
+density = { value = 1000.0, unit = "kg/m^3", grade = "GUESSED", source = "data/plants/vine.toml" }
+damping = { value = 0.05, unit = "s", grade = "GUESSED", source = "data/plants/vine.toml" }
+tip_mass = { value = 0.5, unit = "kg", grade = "READ", source = "scales, after picking" }
+segments = 4
+"""
+(FOLDER / "bunch.toml").write_text(FILE)
+guess = load_specimen(FOLDER / "bunch.toml")
 truth = with_values(guess, modulus=0.45e9, damping=0.03)
-seen = Experiment(seed=1, displacement=0.04, duration=4.0, axes="xy")  # from below: z is not seen
+seen = Experiment(seed=3, displacement=0.04, duration=4.0, axes="xy")  # from below: z is not seen
 track = measure(truth, seen)
 features = extract_features(track)
 print(f"{features.frequency:.3f} Hz, damping ratio {features.damping_ratio:.4f}")
@@ -29,12 +41,12 @@ print(f"log decrement {features.log_decrement:.3f}")
 fit = tune(guess, track)
 print("\n".join(fit.lines()))
 figure, (above, below) = plt.subplots(2, 1, figsize=(8, 5), sharex=True, height_ratios=[2, 1])
-draw_track(fit, above)
-draw_residuals(fit, below)
+plots.draw_track(fit, above)
+plots.draw_residuals(fit, below)
 
 # %%
 figure, grid = plt.subplots(2, 2, figsize=(7, 5))
-draw_posterior(fit, grid)
+plots.draw_posterior(fit, grid)
 
 # %% [markdown]
 # ## How much the weight hides
@@ -58,7 +70,7 @@ print(f"{own.low / 1e9:.3f} to {own.high / 1e9:.3f} GPa by the normal approximat
 other = measure(truth, Experiment(seed=2, displacement=0.07, duration=4.0, angle=30.0, axes="xy"))
 held_out = tune(fit.fitted_specimen(), other, ())
 figure, axes = plt.subplots(figsize=(8, 3))
-draw_held_out(fit, held_out, axes)
+plots.draw_held_out(fit, held_out, axes)
 print(f"left over: {1e3 * held_out.noise:.2f} mm; the camera's noise is 2 mm")
 
 # %% [markdown]
