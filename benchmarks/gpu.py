@@ -5,7 +5,8 @@
     python benchmarks/gpu.py --peer --trees 65536       # beside mujoco-warp, which must be installed
 
 Trees are the canes of ``vinesim bench plants``: 16 bodies and a bunch. *resident*: joints and bodies stay on the
-device for all ticks; *visible*: every tick the host may read bodies and add forces, as a client does.
+device for all ticks; *visible*: every tick the host may read bodies and add forces, as a client does. *with contacts*:
+every cane falls from a stirred state onto three bars and stays in touch with them; each is a world of its own.
 """
 
 from __future__ import annotations
@@ -16,11 +17,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from vinesim import frames
+from vinesim.physics.contact.resident_contacts import ResidentContacts
+from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
@@ -29,6 +33,15 @@ from vinesim.scene.state import State
 
 TICKS = 100
 PER_TREE = 17
+BARS = ((0.3, 1.975), (0.6, 1.9), (0.85, 1.75))
+"""[m] x, z of the bars that the canes fall on."""
+BAR_RADIUS = 0.012
+SWEEPS = 20
+"""Largest number of sweeps: a GPU waits for the tree that takes most."""
+PEERS = ("discrete", "implicitfast")
+"""Integrators of mujoco-warp."""
+CONTACT_CLOCK = 300
+"""Ticks after which canes have come to lie on the bars."""
 
 
 def cane(side: float) -> TreeBuilder:
@@ -43,18 +56,28 @@ def cane(side: float) -> TreeBuilder:
     return tree
 
 
-def forest(count: int) -> Model:
-    """So many equal trees side by side."""
-    one = assemble([cane(0.0)])
+def bars() -> dict[str, np.ndarray]:
+    """Level bars across the canes."""
+    start = np.array([(x, -1.0, z) for x, z in BARS], np.float32)
+    end = start * [1, -1, 1]
+    return {"fixed_start": start, "fixed_end": end.astype(np.float32),
+            "fixed_radius": np.full((len(BARS), 2), BAR_RADIUS, np.float32)}  # fmt: skip
+
+
+def forest(count: int, spacing: float = 0.5, **fixed: np.ndarray) -> Model:
+    """So many equal trees side by side, ``spacing`` [m] apart; ``fixed``: what stands among them."""
+    one = assemble([cane(0.0)], **fixed)
     counts = one.counts()
     model = Model.allocate(**{axis: n * count if axis in ("tree", "body") else n for axis, n in counts.items()})
     for name, dim in Model.array_fields().items():
         if dim.shape[0] in ("tree", "body"):
             value = getattr(one, name)
             getattr(model, name)[:] = np.tile(value, (count,) + (1,) * (value.ndim - 1))
+    for name, value in fixed.items():
+        getattr(model, name)[:] = value
     number = np.arange(count, dtype=np.int32)
     model.tree_first[:] = number * PER_TREE
-    model.tree_pose[:, 1] = 0.5 * number
+    model.tree_pose[:, 1] = spacing * number
     model.body_tree[:] = np.repeat(number, PER_TREE)
     model.body_parent[:] += np.where(model.body_parent >= 0, np.repeat(number, PER_TREE) * PER_TREE, 0)
     return model
@@ -74,6 +97,29 @@ def plants_on(device: str, count: int) -> ArticulationSolver:
     plants = ArticulationSolver(model, stirred(model), device=device)
     plants.wake(np.arange(count))
     return plants
+
+
+def canes_on_bars(device: str, count: int) -> tuple[ArticulationSolver, ResidentContacts]:
+    """So many worlds, each with a cane over the bars."""
+    model = forest(count, 0.0, **bars())
+    plants = ArticulationSolver(model, stirred(model), device=device)
+    plants.wake(np.arange(count))
+    plants.forward_kinematics()
+    return plants, ResidentContacts(plants, PhysicsParameters(solver_sweeps=SWEEPS))
+
+
+def contact_trajectory(device: str) -> dict[str, np.ndarray]:
+    """256 canes fall on the bars: where they are after 20 ticks, and how hard they press in the last of 300."""
+    plants, contacts = canes_on_bars(device, 256)
+    plants.upload()
+    plants.advance(20, contacts.solve)
+    plants.download()
+    plants.forward_kinematics()
+    early = plants.state.body_q.copy()
+    plants.upload()
+    plants.advance(280, contacts.solve)
+    plants.download()
+    return {"contact_early_q": early, "contact_force": contacts.force, "contact_count": contacts.count}
 
 
 def trajectory(device: str) -> dict[str, np.ndarray]:
@@ -103,18 +149,46 @@ def seconds(work: Callable[[], None], rounds: int = 5) -> float:
     return float(np.median(took))
 
 
-def peer_milliseconds(count: int) -> float:
-    """One step of so many worlds in mujoco-warp, each with the same cane, captured into a graph; no contacts."""
+def peer_scene(with_contacts: bool, integrator: str) -> Any:
+    """The cane in MuJoCo: alone, or with capsules as ours over the bars and the ground."""
+    import mujoco
+
+    from vinesim.bench.mujoco_reference import MujocoScene, compile_plants
+
+    model = assemble([cane(0.0)], **bars())
+    if not with_contacts:
+        world = compile_plants(model)
+    else:
+        world = MujocoScene(model, []).world
+        is_plant = world.geom_bodyid > 0
+        world.geom_contype[:], world.geom_conaffinity[:] = is_plant, ~is_plant
+        world.body_contype[:], world.body_conaffinity[:] = 1, 0
+        world.body_contype[0], world.body_conaffinity[0] = 0, 1
+        world.opt.enableflags, world.opt.disableflags, world.opt.impratio = 0, 0, 1.0
+        world.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    if integrator == "implicitfast":  # ``discrete`` adds dt K of damping by itself
+        world.dof_damping[:] = np.repeat(model.joint_damping[:, 1], 3)
+        world.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return world
+
+
+def peer_milliseconds(count: int, integrator: str, start: State | None = None) -> tuple[float, float]:
+    """One step of so many worlds in mujoco-warp, each with the same cane, captured into a graph; contacts a world.
+
+    ``start``: where canes lie on bars, for a scene with contacts.
+    """
     import mujoco
     import mujoco_warp  # pyright: ignore[reportMissingImports]
 
-    from vinesim.bench.mujoco_reference import compile_plants
-
-    spec = compile_plants(assemble([cane(0.0)]))
-    spec.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # it has no ``discrete``
-    data = mujoco.MjData(spec)
-    mujoco.mj_forward(spec, data)
-    model, worlds = mujoco_warp.put_model(spec), mujoco_warp.put_data(spec, data, nworld=count)
+    world = peer_scene(start is not None, integrator)
+    data = mujoco.MjData(world)
+    mujoco.mj_forward(world, data)
+    room = {} if start is None else {"nconmax": 12, "njmax": 48}
+    model, worlds = mujoco_warp.put_model(world), mujoco_warp.put_data(world, data, nworld=count, **room)
+    if start is not None:
+        worlds.qpos.assign(frames.to_wxyz(start.joint_q).reshape(count, -1).astype(np.float32))
+        rates = frames.rotate(frames.conjugate(start.joint_q), start.joint_qd)
+        worlds.qvel.assign(rates.reshape(count, -1).astype(np.float32))
     mujoco_warp.step(model, worlds)
     wp.synchronize()
     with wp.ScopedCapture() as capture:
@@ -125,12 +199,45 @@ def peer_milliseconds(count: int) -> float:
             wp.capture_launch(capture.graph)  # pyright: ignore[reportArgumentType]  (captured above)
         wp.synchronize()
 
-    return 1e3 * seconds(steps) / TICKS
+    took = 1e3 * seconds(steps) / TICKS
+    assert start is None or np.isfinite(worlds.qvel.numpy()).all()
+    return took, float(worlds.nacon.numpy()[0]) / count
 
 
 def say(about: dict, case: str, value: float, unit: str) -> None:
     sys.stdout.write(json.dumps({"bench": "gpu", "case": case, "value": value, "unit": unit} | about) + "\n")
     sys.stdout.flush()
+
+
+def compare_contacts(about: dict, theirs: Any, ours: dict[str, np.ndarray]) -> None:
+    """How far canes that fall on bars are from the CPU's, and how far the forces are that bear them."""
+    apart = np.abs(theirs["contact_early_q"] - ours["contact_early_q"])[:, :3].max()
+    say(about, "256 canes fall on bars, 20 ticks: largest distance from the CPU's bodies", 1e3 * float(apart), "mm")
+    weight, off = theirs["contact_force"].sum(0), (theirs["contact_force"] - ours["contact_force"]).sum(0)
+    share = float(np.linalg.norm(off) / np.linalg.norm(weight))
+    say(about, "the same after 300 ticks: force on all, difference from the CPU's, of it", share, "1")
+    counts = int(theirs["contact_count"].sum()), int(ours["contact_count"].sum())
+    say(about, f"the same: contacts, {counts[0]} on the CPU", counts[1], "contacts")
+
+
+def measure_contacts(about: dict, device: str, count: int, with_peer: bool) -> None:
+    """Canes that lie on bars, beside mujoco-warp if asked."""
+    plants, contacts = canes_on_bars(device, count)
+    plants.upload()
+    plants.advance(CONTACT_CLOCK, contacts.solve)
+    took = 1e3 * seconds(lambda: plants.advance(TICKS, contacts.solve)) / TICKS
+    plants.download()
+    assert np.isfinite(plants.state.body_q).all()
+    per_tree, sweeps = float(contacts.count.mean()), contacts.sweeps
+    case = f"{count} trees of {PER_TREE} bodies, resident, with contacts: {per_tree:.2f} a tree"
+    also = {"sweeps_mean": float(sweeps.mean()), "share_at_most_sweeps": float((sweeps >= SWEEPS).mean()),
+            "dropped": contacts.dropped}  # fmt: skip
+    say(about | also, case, took, "ms/tick")
+    for integrator in PEERS[:1] if with_peer else ():  # the other one is unstable in contact
+        theirs, their_contacts = peer_milliseconds(count, integrator, plants.state)
+        beside = {"peer": f"mujoco-warp {integrator}", "peer_value": theirs, "ratio": theirs / took,
+                  "peer_contacts_a_tree": their_contacts}  # fmt: skip
+        say(about | also | beside, f"{case}, beside mujoco-warp", took, "ms/tick")
 
 
 def main() -> None:
@@ -140,9 +247,10 @@ def main() -> None:
     ask.add_argument("--peer", action="store_true", help="also measure mujoco-warp")
     ask.add_argument("--device", default="cuda")
     ask.add_argument("--trees", type=int, nargs="*", default=[64, 1024, 4096, 16384, 65536, 131072])
+    ask.add_argument("--contacts", action="store_true", help="only with contacts")
     given = ask.parse_args()
     if given.reference:
-        np.savez_compressed(given.reference, **trajectory("cpu"))
+        np.savez_compressed(given.reference, allow_pickle=False, **trajectory("cpu"), **contact_trajectory("cpu"))
         return
     query = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
     name = driver = "none"
@@ -156,7 +264,11 @@ def main() -> None:
         say(about, "256 trees, 200 ticks, pushed: largest distance from the CPU's bodies", 1e3 * float(apart), "mm")
         off = np.abs(theirs["response"] - ours["response"]).max() / np.abs(theirs["response"]).max()
         say(about, "response to unit impulses: largest difference from the CPU's, of the largest", float(off), "1")
+        compare_contacts(about, theirs, contact_trajectory(given.device))
     for count in given.trees:
+        measure_contacts(about, given.device, count, given.peer)
+        if given.contacts:
+            continue
         plants = plants_on(given.device, count)
         bodies = count * PER_TREE
         plants.upload()
@@ -166,11 +278,11 @@ def main() -> None:
         say(about, f"{count} trees of {PER_TREE} bodies, resident", 1e3 * took, "ms/tick")
         say(about, f"{count} trees of {PER_TREE} bodies, resident", bodies / took / 1e9, "G body-steps/s")
         if given.peer:
-            theirs = peer_milliseconds(count)
-            also = {"peer": "mujoco-warp implicitfast", "peer_value": theirs, "ratio": theirs / (1e3 * took)}
-            say(
-                about | also, f"{count} trees of {PER_TREE} bodies, resident, beside mujoco-warp", 1e3 * took, "ms/tick"
-            )
+            for integrator in PEERS:
+                theirs, _ = peer_milliseconds(count, integrator)
+                also = {"peer": f"mujoco-warp {integrator}", "peer_value": theirs, "ratio": theirs / (1e3 * took)}
+                case = f"{count} trees of {PER_TREE} bodies, resident, beside mujoco-warp"
+                say(about | also, case, 1e3 * took, "ms/tick")
         if count <= 16384:
 
             def visible(plants: ArticulationSolver = plants) -> None:

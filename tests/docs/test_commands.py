@@ -70,6 +70,7 @@ def python_pages() -> list[pathlib.Path]:
 
 @pytest.mark.parametrize("page", python_pages(), ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_python_of_a_page_runs(page, tmp_path):
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     if page.name == "recording.md":
         world = World(tmp_path / "run.mcap")
         world.run(0.2)

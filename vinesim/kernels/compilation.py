@@ -23,7 +23,11 @@ SENSOR_PACKAGES = ("raster", "sensing", "shading")
 """Kernels of cameras and lidars; the others are those of physics."""
 TIMEOUT = 600.0
 """How long another process may take to compile, before this one compiles as well [s]."""
-_CUDA_ONLY = ("vinesim.kernels.raster.cuda_raster",)
+_CUDA_ONLY = (
+    "vinesim.kernels.articulation.lean_prediction",
+    "vinesim.kernels.contact.tree_islands",
+    "vinesim.kernels.raster.cuda_raster",
+)
 _CPU_ONLY = ("vinesim.kernels.articulation.eight_trees",)
 
 

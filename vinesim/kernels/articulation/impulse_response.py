@@ -140,26 +140,18 @@ def impulse_response(
                 response_out[slot, 3 + c, other - start, 3 + r] = alpha_m[r, c]
 
 
-@wp.kernel
-def apply_wrenches(
-    # model
+@wp.func
+def apply_tree_wrenches(
+    tree: int,
     dt: float,
     model: ArticulationModel,
-    # in
-    trees: wp.array(dtype=wp.int32),
     body_wrench: wp.array(dtype=wp.spatial_vector),
     factors: Factors,
-    # out
     work_out: WrenchScratch,
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread adds to the prediction of one tree what the wrenches on its bodies do over a step.
-
-    trees: [thread] which tree. body_wrench: [body] N, N m at the origin, world axes; with dt = 1 an impulse, N s, N m s.
-    prediction_out: accelerations and joint rates grow; ``body_qd_free`` stays. work_out, scratch_out.Du: scratch.
-    """
-    tree = trees[wp.tid()]
+    """Add to the prediction of one tree what the wrenches on its bodies do over a step: see :func:`apply_wrenches`."""
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
     for k in range(first, first + size * model.pitch, model.pitch):
@@ -194,3 +186,25 @@ def apply_wrenches(
         prediction_out.joint_qd_free[k] = prediction_out.joint_qd_free[k] + dt * wp.quat_rotate_inv(
             factors.axes[k], relative
         )
+
+
+@wp.kernel
+def apply_wrenches(
+    # model
+    dt: float,
+    model: ArticulationModel,
+    # in
+    trees: wp.array(dtype=wp.int32),
+    body_wrench: wp.array(dtype=wp.spatial_vector),
+    factors: Factors,
+    # out
+    work_out: WrenchScratch,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """One thread adds to the prediction of one tree what the wrenches on its bodies do over a step.
+
+    trees: [thread] which tree. body_wrench: [body] N, N m at the origin, world axes; with dt = 1 an impulse, N s, N m s.
+    prediction_out: accelerations and joint rates grow; ``body_qd_free`` stays. work_out, scratch_out.Du: scratch.
+    """
+    apply_tree_wrenches(trees[wp.tid()], dt, model, body_wrench, factors, work_out, scratch_out, prediction_out)

@@ -112,6 +112,19 @@ def geom_aabbs(
     states_out.high[g] = middle + box
 
 
+@wp.func
+def sweep_capsule(s: int, dt: float, capsules: Capsules, bodies: PlantBodies):
+    """Ends of a capsule in the world, a bound of its speed [m/s], and the corners of its box, grown by its motion."""
+    body = capsules.body[s]
+    pose = bodies.q[body]
+    velocity = bodies.qd[body]
+    start = wp.transform_point(pose, capsules.local_start[s])
+    end = wp.transform_point(pose, capsules.local_end[s])
+    speed = wp.length(wp.spatial_top(velocity)) + capsules.extent[s] * wp.length(wp.spatial_bottom(velocity))
+    grown = wp.vec3(capsules.radius[s] + speed * dt)
+    return start, end, speed, wp.min(start, end) - grown, wp.max(start, end) + grown
+
+
 @wp.kernel
 def tree_aabbs(
     # model
@@ -139,15 +152,7 @@ def tree_aabbs(
     wood_high = wp.vec3(-FAR)
     for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
         if exists_at_level(capsules.level[s], is_fine):
-            body = capsules.body[s]
-            pose = bodies.q[body]
-            velocity = bodies.qd[body]
-            start = wp.transform_point(pose, capsules.local_start[s])
-            end = wp.transform_point(pose, capsules.local_end[s])
-            speed = wp.length(wp.spatial_top(velocity)) + capsules.extent[s] * wp.length(wp.spatial_bottom(velocity))
-            grown = wp.vec3(capsules.radius[s] + speed * dt)
-            capsule_low = wp.min(start, end) - grown
-            capsule_high = wp.max(start, end) + grown
+            start, end, speed, capsule_low, capsule_high = sweep_capsule(s, dt, capsules, bodies)
             low = wp.min(low, capsule_low)
             high = wp.max(high, capsule_high)
             if capsules.bunch[s] < 0:

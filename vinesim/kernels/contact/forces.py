@@ -18,21 +18,18 @@ from vinesim.kernels.contact.structs import (
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel
-def store_warm_start(
-    # model
+@wp.func
+def store_contact(
+    c: int,
     parameters: Parameters,
     geoms: Geoms,
-    # in
     rigid: RigidBodies,
     islands: Islands,
     rows: Rows,
-    # out
     contacts_out: Contacts,
     warm_start_out: WarmStart,
 ):
-    """One thread per contact: its impulse as a force on the plant, and what the next step starts from."""
-    c = wp.tid()
+    """Write the impulse of contact ``c`` as a force on the plant, and what the next step starts from."""
     n = 3 * c
     axes = contacts_out.axes[c]
     t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
@@ -55,6 +52,23 @@ def store_warm_start(
     warm_start_out.anchor[c] = anchor
     if impulse[0] <= wp.float64(0.0):
         warm_start_out.feature[c] = -1
+
+
+@wp.kernel
+def store_warm_start(
+    # model
+    parameters: Parameters,
+    geoms: Geoms,
+    # in
+    rigid: RigidBodies,
+    islands: Islands,
+    rows: Rows,
+    # out
+    contacts_out: Contacts,
+    warm_start_out: WarmStart,
+):
+    """One thread per contact: its impulse as a force on the plant, and what the next step starts from."""
+    store_contact(wp.tid(), parameters, geoms, rigid, islands, rows, contacts_out, warm_start_out)
 
 
 @wp.kernel

@@ -110,27 +110,23 @@ def write_bias(
             rows_out.bias[3 * c + 2] = wp.dot(t2, warm_start.anchor[k]) * stiffness / share
 
 
-@wp.kernel
-def write_contact_rows(
-    # model
+@wp.func
+def write_rows(
+    c: int,
+    tree_row: int,
+    slot: int,
     parameters: Parameters,
     pairs: MaterialPairs,
     capsules: Capsules,
     geoms: Geoms,
-    # in
     bodies: PlantBodies,
     rigid: RigidBodies,
     candidates: Candidates,
     warm_start: WarmStart,
-    # out
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """One thread per contact: its three rows. The rigid Jacobian was zeroed before."""
-    c = wp.tid()
-    slots = candidates.feature.shape[1]
-    tree_row = contacts_out.source[c] // slots
-    slot = contacts_out.source[c] % slots
+    """Write the three rows of contact ``c``, found as the candidate in a slot of a row of trees."""
     g = contacts_out.other[c]
     n = candidates.normal[tree_row, slot]
     x = candidates.point[tree_row, slot]
@@ -173,3 +169,28 @@ def write_contact_rows(
         rows_out.bias[row] = wp.float64(0.0)
         rows_out.impulse[row] = wp.float64(0.0)
     write_bias(c, parameters, candidates.end_gap[tree_row, slot], contacts_out, warm_start, rows_out)
+
+
+@wp.kernel
+def write_contact_rows(
+    # model
+    parameters: Parameters,
+    pairs: MaterialPairs,
+    capsules: Capsules,
+    geoms: Geoms,
+    # in
+    bodies: PlantBodies,
+    rigid: RigidBodies,
+    candidates: Candidates,
+    warm_start: WarmStart,
+    # out
+    contacts_out: Contacts,
+    rows_out: Rows,
+):
+    """One thread per contact: its three rows. The rigid Jacobian was zeroed before."""
+    c = wp.tid()
+    slots = candidates.feature.shape[1]
+    write_rows(
+        c, contacts_out.source[c] // slots, contacts_out.source[c] % slots, parameters, pairs, capsules, geoms, bodies,
+        rigid, candidates, warm_start, contacts_out, rows_out,
+    )  # fmt: skip

@@ -276,6 +276,63 @@ def clear_slots(row: int, count: int, candidates_out: Candidates):
         candidates_out.feature[row, k] = -1
 
 
+@wp.func
+def add_pair(
+    row: int,
+    count: int,
+    s: int,
+    g: int,
+    parameters: Parameters,
+    capsules: Capsules,
+    geoms: Geoms,
+    bodies: PlantBodies,
+    capsule_states: CapsuleStates,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    candidates_out: Candidates,
+):
+    """Add the contacts of capsule ``s`` with geom ``g`` to a row that has ``count`` so far.
+
+    Returns their number, and whether one is an impact.
+    """
+    is_impact = bool(False)
+    if aabbs_disjoint(capsule_states.low[s], capsule_states.high[s], geom_states.low[g], geom_states.high[g]):
+        return count, is_impact
+    radius = wp.float64(capsules.radius[s])
+    a = to_double(capsule_states.start[s])
+    b = to_double(capsule_states.end[s])
+    bound = wp.float64(0.5) * wp.length(b - a) + radius
+    center = geom_states.center[g]
+    margin = parameters.margin + (wp.float64(capsule_states.speed[s]) + geom_states.speed[g]) * parameters.dt
+    between = wp.float64(0.5) * (a + b) - center
+    limit = bound + geoms.radius[g] + margin
+    if wp.dot(between, between) < limit * limit:
+        rotation = rigid.xmat[geoms.id[g]]
+        nearest = segment_geom_distance(geoms, hulls, g, rotation, center, a, b, radius + margin)
+        if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules):
+            ends = contact_ends(parameters, geoms, hulls, g, rotation, center, a, b, nearest)
+            pair = Pair()
+            pair.capsule = s
+            pair.body = capsules.body[s]
+            pair.geom = g
+            pair.ends = wp.where(ends[0] < ends[1], 2, 1)
+            pair.rotation = rotation
+            for end in range(pair.ends):
+                if pair.ends == 2:
+                    p = a + ends[end] * (b - a)
+                    nearest = segment_geom_distance(geoms, hulls, g, rotation, center, p, p, FAR)
+                candidate = rigid_candidate(
+                    parameters, pair, nearest, ends[end], g >= geoms.count[0], bodies, capsules, capsule_states,
+                    geoms, hulls, geom_states,
+                )  # fmt: skip
+                if candidate.exists:
+                    is_impact = is_impact or candidate.is_impact
+                    store_candidate(row, count, 2 * s + end, g, candidate, candidates_out)
+                    count = count + 1
+    return count, is_impact
+
+
 @wp.kernel
 def find_rigid_contacts(
     # model
@@ -314,45 +371,12 @@ def find_rigid_contacts(
     last = capsules.tree_start[tree + wp.where(near_count > 0, 1, 0)]
     for s in range(capsules.tree_start[tree], last):
         if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):
-            radius = wp.float64(capsules.radius[s])
-            a = to_double(capsule_states.start[s])
-            b = to_double(capsule_states.end[s])
-            middle = wp.float64(0.5) * (a + b)
-            bound = wp.float64(0.5) * wp.length(b - a) + radius
             for k in range(near_count):
-                g = candidates_out.near_geoms[row, k]
-                center = geom_states.center[g]
-                margin = (
-                    parameters.margin + (wp.float64(capsule_states.speed[s]) + geom_states.speed[g]) * parameters.dt
-                )
-                between = middle - center
-                limit = bound + geoms.radius[g] + margin
-                overlap = not aabbs_disjoint(
-                    capsule_states.low[s], capsule_states.high[s], geom_states.low[g], geom_states.high[g]
-                )
-                if overlap and wp.dot(between, between) < limit * limit:
-                    rotation = rigid.xmat[geoms.id[g]]
-                    nearest = segment_geom_distance(geoms, hulls, g, rotation, center, a, b, radius + margin)
-                    if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules):
-                        ends = contact_ends(parameters, geoms, hulls, g, rotation, center, a, b, nearest)
-                        pair = Pair()
-                        pair.capsule = s
-                        pair.body = capsules.body[s]
-                        pair.geom = g
-                        pair.ends = wp.where(ends[0] < ends[1], 2, 1)
-                        pair.rotation = rotation
-                        for end in range(pair.ends):
-                            if pair.ends == 2:
-                                p = a + ends[end] * (b - a)
-                                nearest = segment_geom_distance(geoms, hulls, g, rotation, center, p, p, FAR)
-                            candidate = rigid_candidate(
-                                parameters, pair, nearest, ends[end], g >= geoms.count[0], bodies, capsules, capsule_states,
-                                geoms, hulls, geom_states,
-                            )  # fmt: skip
-                            if candidate.exists:
-                                is_impact = is_impact or candidate.is_impact
-                                store_candidate(row, count, 2 * s + end, g, candidate, candidates_out)
-                                count = count + 1
+                count, hits = add_pair(
+                    row, count, s, candidates_out.near_geoms[row, k], parameters, capsules, geoms, bodies, capsule_states,
+                    rigid, hulls, geom_states, candidates_out,
+                )  # fmt: skip
+                is_impact = is_impact or hits
     candidates_out.is_impact[row] = is_impact
     candidates_out.count[row] = count
     clear_slots(row, count, candidates_out)

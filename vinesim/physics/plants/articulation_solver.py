@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -104,7 +105,7 @@ class ArticulationSolver:
         if self.thread_pool is not None:
             weakref.finalize(self, self.thread_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
-        self._onset_steps = numbers["contact_steps"] - 1
+        self.onset_steps = numbers["contact_steps"] - 1  # with phi = 1 after contact began
         self.launches = KernelLaunches(self, numbers, threads, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
         self._runner = StepRunner(
@@ -355,7 +356,7 @@ class ArticulationSolver:
             launches.upload_wrenches(count)
             launches.apply_wrenches(len(touched))
             begun = touched[self._last_contact[touched] < self.tick - 1]
-            self._euler_steps[begun] = np.maximum(self._euler_steps[begun], self._onset_steps + 1)  # this step counts
+            self._euler_steps[begun] = np.maximum(self._euler_steps[begun], self.onset_steps + 1)  # this step counts
             self._last_contact[touched] = self.tick
         elif len(loaded):
             launches.upload_wrenches(count)
@@ -372,13 +373,12 @@ class ArticulationSolver:
         roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
         return self.buffers.slots[roots], self.model.body_tree[roots]
 
-    def advance(self, steps: int) -> None:
-        """Many steps of the awake trees with nothing in between: no contacts, no sleep, no fault guard.
+    def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
+        """Many steps of the awake trees: no sleep, no fault guard, no contacts but what ``between`` launches.
 
         Threads part once for all of them. A GPU works on its own copies meanwhile: :meth:`upload` before and
-        :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free`` and
-        ``acceleration`` are of the last step; a tree that went wrong stays where it was (``tree_rate`` is NaN or above
-        ``fault_rate``).
+        :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free``, ``acceleration``
+        are of the last step; a tree that went wrong stays where it was (``tree_rate`` NaN or above ``fault_rate``).
         """
         self._runner.list_trees(self._awake)
         floating = self._floating_roots()
@@ -388,9 +388,9 @@ class ArticulationSolver:
             self._loaded_bodies = _NO_TREES
             self.launches.upload_wrenches(len(self._runner.stepped))
             self._runner.integrate(_NO_TREES, *floating)
-            self._runner.advance(steps - 1, *floating)
+            self._runner.advance(steps - 1, *floating, between)
         else:
-            self._runner.advance(steps, *floating)
+            self._runner.advance(steps, *floating, between)
         self.tick += steps
 
     def upload(self) -> None:
@@ -407,7 +407,7 @@ class ArticulationSolver:
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
         """Use phi = 1 for ``contact_onset_duration``: trees about to be touched (``integrate()`` sees to touched)."""
-        self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self._onset_steps)
+        self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self.onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
         """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""

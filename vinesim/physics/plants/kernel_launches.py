@@ -25,6 +25,7 @@ from vinesim.kernels.articulation.integration import integrate
 from vinesim.kernels.articulation.joint_wrench import joint_wrench
 from vinesim.kernels.articulation.kinematics import forward_kinematics
 from vinesim.kernels.articulation.lane_records import LANES, RECORD
+from vinesim.kernels.articulation.lean_prediction import predict_lean
 from vinesim.kernels.articulation.prediction import predict
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.parameters import PhysicsParameters
@@ -118,6 +119,7 @@ class KernelLaunches:
         for dtype, names in SCRATCH.items():
             for name in names:
                 buffers.add_scratch(name, dtype)
+        buffers.add_constant("body_branches", self._branching(model.body_parent), wp.bool)
         trees = len(model.tree_first)
         self.budget = structs.EnergyBudget()
         for name, field in structs.fields(structs.EnergyBudget).items():
@@ -127,6 +129,13 @@ class KernelLaunches:
         rows = (self.budget.limit, self.budget.watch)
         self._budget_rows = [array.numpy() for array in rows] if buffers.device.is_cpu else []
         buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
+
+    def _branching(self, parent: np.ndarray) -> np.ndarray:
+        """[place] whether a body is the parent of another than the next one, where kernels look for it."""
+        places = np.zeros(self.buffers.slot_count, np.bool_)
+        apart = (parent >= 0) & (parent != np.arange(len(parent)) - 1)
+        places[self.buffers.slots[parent[apart]]] = True
+        return places
 
     def upload_changed(self) -> None:
         """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
@@ -179,10 +188,11 @@ class KernelLaunches:
         joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
         partitioned = {"index_list": "trees", "partitions": self._threads}
+        kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
         self.predict, self.predict_subset = (
             record(
-                predict, parameters, self._model, trees, "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
-                joints, "phi_used",
+                kernel[0], parameters, self._model, *kernel[1], trees, "tree_phi", "tree_euler_steps", "tree_steps",
+                self._forces, joints, "phi_used",
                 self._bodies, self._factors, scratch, prediction, **options,
             )
             for trees, options in (("stepping", partitioned), ("subset", {"index_list": "trees"}))

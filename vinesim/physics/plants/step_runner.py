@@ -201,8 +201,10 @@ class StepRunner:
 
     # ------------------------------------------------------------------ many steps
 
-    def advance(self, steps: int, roots: np.ndarray, root_trees: np.ndarray) -> None:
-        """Predict and integrate so many times without coming back in between."""
+    def advance(
+        self, steps: int, roots: np.ndarray, root_trees: np.ndarray, between: Callable[[], None] | None = None
+    ) -> None:
+        """Predict and integrate so many times without coming back in between; ``between`` launches what comes there."""
         self._divide(np.zeros(0, np.int32))
         self._list_roots(roots, root_trees)
         count = len(self.stepped)
@@ -210,16 +212,16 @@ class StepRunner:
             return
         self._launches.look_for_budgets(steps)
         if not self._buffers.device.is_cpu:
-            what = (self._whole, self._levels, self._roots, self._root_levels)
+            what = (self._whole, self._levels, self._roots, self._root_levels, between)
             if self._graph is None or self._graph_of != what:
                 with wp.ScopedCapture(self._buffers.device) as capture:
-                    self._steps(1)
+                    self._steps(1, between)
                 self._graph, self._graph_of = capture.graph, what
             for _ in range(steps):
                 wp.capture_launch(self._graph)  # pyright: ignore[reportArgumentType]  (captured above)
             self._buffers.synchronize()
-        elif self._pool is None or count < self._threads or len(roots):
-            self._steps(steps)
+        elif self._pool is None or count < self._threads or len(roots) or between is not None:
+            self._steps(steps, between)
         else:
             shares = enumerate(self._shares_of_substeps())
             self._pool.run([functools.partial(self._steps_of_part, steps, i, levels, at) for i, (at, levels) in shares])
@@ -230,9 +232,11 @@ class StepRunner:
         ends = np.arange(self._threads + 1) * len(fast) // self._threads
         return [(self._whole + int(a), _levels(self._steps_of[fast[a:b]])) for a, b in itertools.pairwise(ends)]
 
-    def _steps(self, steps: int) -> None:
+    def _steps(self, steps: int, between: Callable[[], None] | None) -> None:
         for _ in range(steps):
             self._predict(self._whole_groups)
+            if between is not None:
+                between()
             self._launches.integrate(self._whole)
             self._launches.correct_floating_momentum(self._roots)
             self._take_substeps(self._levels, self._whole, 0, self._root_levels)

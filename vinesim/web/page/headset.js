@@ -9,6 +9,11 @@ const UPRIGHT = new THREE.Quaternion(HALF, 0, 0, HALF);
 /** From an eye or a pointing ray of WebXR (along -z, y up) to x forward, z up. */
 const FORWARD = new THREE.Quaternion(-0.5, 0.5, 0.5, 0.5);
 
+const FINGERS = ["thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"];
+/** Angles [rad] between the first and the last bone of a finger that is bent all the way; the thumb has one joint less. */
+const FULL_BEND = [1.6, 3.8, 3.8, 3.8, 3.8];
+const PINCH = 0.025, CLOSED = 0.5; // m between the tips, mean bend of the fingers
+
 export class Headset {
   /** `rig` carries camera and controllers: the floor that the person stands on. */
   constructor(renderer, rig, camera, poses) {
@@ -22,6 +27,7 @@ export class Headset {
     rig.add(camera);
     this.rays = [0, 1].map((k) => rig.add(renderer.xr.getController(k)) && renderer.xr.getController(k));
     this.sources = [null, null];
+    this.tracked = [null, null]; // hands without a controller, on the rig
     this.rays.forEach((ray, k) => {
       ray.addEventListener("connected", (event) => { this.sources[k] = event.data; });
       ray.addEventListener("disconnected", () => { this.sources[k] = null; });
@@ -43,6 +49,7 @@ export class Headset {
   update(frame, seconds) {
     const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
     if (viewer) this.viewer.fromArray(viewer.transform.matrix);
+    this.tracked = this.sources.map((source) => this.trackHand(frame, source?.hand));
     for (const source of this.sources) {
       const [x, y] = source?.gamepad?.axes?.slice(-2) ?? [0, 0];
       if (source?.handedness === "left" && Math.hypot(x, y) > DEAD) {
@@ -55,6 +62,30 @@ export class Headset {
         this.turned = Math.abs(x) > 0.7 || (this.turned && Math.abs(x) > DEAD);
       }
     }
+  }
+
+  /** A hand whose joints the headset sees: palm on the rig, bend of each finger, whether it holds; null: not seen. */
+  trackHand(frame, hand) {
+    if (!frame?.getJointPose || !hand) return null;
+    const space = this.renderer.xr.getReferenceSpace();
+    const joint = (name) => hand.get(name) && frame.getJointPose(hand.get(name), space)?.transform;
+    const place = (name) => { const at = joint(name)?.position; return at && new THREE.Vector3(at.x, at.y, at.z); };
+    const knuckle = place("middle-finger-phalanx-proximal"), palm = joint("middle-finger-metacarpal");
+    if (!knuckle || !palm) return null;
+    const fingers = FINGERS.map((finger, k) => {
+      const bones = k === 0 ? ["metacarpal", "phalanx-proximal", "phalanx-distal", "tip"]
+        : ["metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip"];
+      const points = bones.map((bone) => place(`${finger}-${bone}`));
+      if (points.includes(undefined)) return 0;
+      const ways = points.slice(1).map((point, i) => point.clone().sub(points[i]).normalize());
+      const bend = ways.slice(1).reduce((sum, way, i) => sum + Math.acos(Math.min(Math.max(way.dot(ways[i]), -1), 1)), 0);
+      return Math.min(bend / FULL_BEND[k], 1);
+    });
+    const gap = place("thumb-tip")?.distanceTo(place("index-finger-tip") ?? knuckle) ?? 1;
+    const closed = gap < PINCH || fingers.slice(1).reduce((sum, bend) => sum + bend, 0) / 4 > CLOSED;
+    const matrix = new THREE.Matrix4().fromArray(palm.matrix);
+    matrix.setPosition(new THREE.Vector3().setFromMatrixPosition(matrix).lerp(knuckle, 0.5));
+    return { matrix, fingers, closed };
   }
 
   /** Cosine and sine of where the head looks, about the world's z. */
@@ -82,6 +113,13 @@ export class Headset {
     const hands = { left: null, right: null };
     this.sources.forEach((source, k) => {
       if (!source || !(source.handedness in hands)) return;
+      const seen = this.tracked[k];
+      if (seen !== null) {
+        const pose = worldPose(new THREE.Matrix4().multiplyMatrices(this.rig.matrixWorld, seen.matrix));
+        hands[source.handedness] = { pose, closed: seen.closed, fingers: seen.fingers };
+        return;
+      }
+      if (source.hand) return; // not seen now: it hangs down
       const buttons = source.gamepad?.buttons ?? [], trigger = buttons[0]?.value ?? 0, grip = buttons[1]?.value ?? 0;
       const own = buttons[4]?.pressed ? this.poses.a : buttons[5]?.pressed ? this.poses.b : undefined;
       const thumb = buttons.slice(3).some((button) => button.touched) || grip > 0.8 ? 1 : 0;

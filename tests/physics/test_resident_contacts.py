@@ -1,0 +1,100 @@
+"""Contacts of a batch of trees that stay on a device: as those of a whole scene, step by step."""
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.physics.contact.resident_contacts import ResidentContacts
+from vinesim.physics.parameters import PhysicsParameters
+from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.device_buffers import DeviceBuffers
+from vinesim.physics.step import Physics
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+
+PARAMETERS = PhysicsParameters(sleep=False)
+BARS = np.array([(0.3, -1.0, 1.975), (0.6, -1.0, 1.9)], np.float32)
+
+
+def canes(count: int, **others: np.ndarray) -> Model:
+    """Limp canes in one place above two bars, one with a side branch; each is a world of its own."""
+    trees = []
+    for i in range(count):
+        tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 2.0])))
+        wood = RodMaterial(5e9, 800.0, 0.006)
+        bodies = tree.add_rod(-1, 1.0, (0.004, 0.004), wood, 8)
+        if i == 0:
+            tree.add_rod(bodies[3], 0.3, (0.003, 0.003), wood, 3, rest=frames.from_x_axis(np.array([0.8, 0.0, -0.6])))
+        trees.append(tree)
+    bars = {"fixed_start": BARS, "fixed_end": BARS * np.array([1, -1, 1], np.float32),
+            "fixed_radius": np.full((len(BARS), 2), 0.012, np.float32)}  # fmt: skip
+    return assemble(trees, **(bars | others))
+
+
+def moving(model: Model) -> State:
+    rng = np.random.default_rng(3)
+    state = State.at_rest(model)
+    state.joint_qd[:] = rng.normal(size=state.joint_qd.shape) * 0.3
+    return state
+
+
+def resident(model: Model, interleave: int = 0, **options: int) -> tuple[ArticulationSolver, ResidentContacts]:
+    plants = ArticulationSolver(model, moving(model), PARAMETERS, buffers=DeviceBuffers("cpu", interleave))
+    plants.wake(np.arange(len(model.tree_first)))
+    plants.forward_kinematics()
+    return plants, ResidentContacts(plants, PARAMETERS, **options)
+
+
+@pytest.mark.parametrize("interleave", [0, 2])
+def test_trees_move_and_press_as_in_a_scene(interleave: int) -> None:
+    model = canes(3)
+    scene = Physics(model, parameters=PARAMETERS)
+    scene.contact_solver.plant_plant_contacts = False
+    scene.state.joint_qd[:] = moving(model).joint_qd
+    scene.wake(np.arange(3))
+    plants, contacts = resident(model, interleave)
+    plants.upload()
+    most = 0
+    for _ in range(4):
+        for _ in range(15):
+            scene.step()
+        plants.advance(15, contacts.solve)
+        plants.download()
+        plants.forward_kinematics()
+        scene.update_kinematics()
+        np.testing.assert_allclose(plants.state.body_q, scene.state.body_q, atol=1e-4)
+        most = max(most, scene.contact_solver.count)
+        assert contacts.count.sum() == scene.contact_solver.count
+        force = np.zeros((3, 3))
+        for contact in scene.contacts:
+            force[model.body_tree[contact.body]] -= contact.force
+        np.testing.assert_allclose(contacts.force, force, atol=0.02 * np.abs(force).max() + 1e-3)
+    assert most >= 3
+    assert contacts.dropped == 0
+
+
+def test_contacts_beyond_the_slots_are_counted() -> None:
+    low = BARS - np.array([0, 0, 0.06], np.float32)  # a third and a fourth one right below
+    start = np.concatenate([BARS, low])
+    bars = {"fixed_start": start, "fixed_end": start * np.array([1, -1, 1], np.float32),
+            "fixed_radius": np.full((len(start), 2), 0.028, np.float32)}  # fmt: skip
+    plants, contacts = resident(canes(2, **bars), slots=1)
+    plants.advance(100, contacts.solve)
+    assert contacts.count.max() == 1
+    assert contacts.dropped > 0
+    assert np.isfinite(plants.state.joint_q).all()
+
+
+def test_what_cannot_stay_on_the_device_is_refused() -> None:
+    model = canes(2)
+    asleep = ArticulationSolver(model, State.at_rest(model), PARAMETERS)
+    with pytest.raises(ValueError, match="sleep"):
+        ResidentContacts(asleep, PARAMETERS)
+    crate = {"box_pose": frames.pose(np.array([5.0, 0.0, 0.5]))[None].astype(np.float32),
+             "box_size": np.array([[0.6, 0.4, 0.3]], np.float32), "box_mass": np.ones(1, np.float32)}  # fmt: skip
+    with pytest.raises(ValueError, match="crates"):
+        resident(canes(1, **crate))
+    plants, _ = resident(model)
+    with pytest.raises(ValueError, match="must be the same"):
+        ResidentContacts(plants, PhysicsParameters(dt=0.005))

@@ -1,0 +1,291 @@
+"""Prediction for GPUs: the three passes of :mod:`vinesim.kernels.articulation.prediction` with little traffic to memory.
+
+There, what is left of a subtree is added to its parent's record and read again; on a GPU, where every tree is a thread and
+none of these records stays in a cache, that is most of the time. Here a body's own inertia is made when its joint is
+eliminated, and what is left goes on in registers to the parent, which mostly is the body before; records serve branches
+alone. The functions of one body and the order of sums are the same, but where two branches or more leave one body.
+"""
+
+import warp as wp
+
+from vinesim.kernels.articulation.body_dynamics import (
+    accelerate_body,
+    drag_terms,
+    joint_terms,
+    own_terms,
+    terms_left,
+    tie_terms,
+    turned_rest_moment,
+)
+from vinesim.kernels.articulation.kinematics import body_kinematics, parent_kinematics
+from vinesim.kernels.articulation.prediction import add_terms, chosen_phi, is_conservative, predict_tree
+from vinesim.kernels.articulation.spatial import inverse_symmetric, symmetric, world_inertia
+from vinesim.kernels.articulation.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    Factors,
+    JointState,
+    Prediction,
+    Scratch,
+    SolverParameters,
+    substep_parameters,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def place_bodies(
+    model: ArticulationModel,
+    joints: JointState,
+    is_branching: wp.array(dtype=wp.bool),
+    tree: int,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+):
+    """From the root to the tips of one tree: pose and velocity of each body; empty records for what branches leave."""
+    first = model.tree_first[tree]
+    pose = wp.transform()
+    motion = wp.spatial_vector()
+    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
+        parent = model.body_parent[k]
+        if parent < 0 or parent != k - model.pitch:
+            pose, motion = parent_kinematics(k, tree, model, joints, bodies_out)
+        axes, lever, pose, motion = body_kinematics(
+            pose, motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
+        )
+        bodies_out.body_q[k] = pose
+        bodies_out.body_qd[k] = motion
+        factors_out.axes[k] = axes
+        factors_out.lever[k] = lever
+        if is_branching[k]:
+            scratch_out.J[k] = wp.mat33()
+            scratch_out.H[k] = wp.mat33()
+            scratch_out.M[k] = wp.mat33()
+            scratch_out.bias[k] = wp.spatial_vector()
+            scratch_out.tension[k] = wp.vec3()
+
+
+@wp.func
+def applied_terms(
+    k: int,
+    tree: int,
+    p: SolverParameters,
+    phi: float,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    joints: JointState,
+    pose: wp.transform,
+    motion: wp.spatial_vector,
+    axes: wp.quat,
+    q: wp.quat,
+    stiffness: wp.vec3,
+    damping: wp.vec3,
+):
+    """Implicit inertia J, H, M of body k, its bias and its tension: its own, of drag and of its ties."""
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+    com = rotation * model.body_com[k]
+    inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+    falls = float(0.0)
+    fall = wp.vec3()
+    root = model.body_root[k]
+    if root >= 0:
+        falls = 1.0
+        fall = joints.joint_xd[root]
+    load = forces.body_load[k]
+    if model.body_parent[k] < 0:
+        load = load + wp.spatial_vector(
+            wp.vec3(),
+            turned_rest_moment(
+                p.dt, phi, axes, q, stiffness, damping, forces.root_turn[tree], forces.root_turn_rate[tree]
+            ),
+        )  # fmt: skip
+    J, H, M, bias, tension, _steady = own_terms(
+        p, phi, motion, model.body_mass[k], com, inertia, load, wp.spatial_top(forces.body_wrench[k]), falls, fall
+    )
+    area = model.body_drag[k]
+    if area > 0.0:
+        J_more, H_more, M_more, bias_more, tension_more = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
+        J += J_more
+        H += H_more
+        M += M_more
+        bias += bias_more
+        tension += tension_more
+    ties = model.tie_span[k]
+    for t in range(ties[0], ties[1]):
+        J_more, H_more, M_more, bias_more, tension_more = tie_terms(
+            p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+            forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
+        )  # fmt: skip
+        J += J_more
+        H += H_more
+        M += M_more
+        bias += bias_more
+        tension += tension_more
+    return J, H, M, bias, tension
+
+
+@wp.func
+def eliminate_bodies(
+    p: SolverParameters, model: ArticulationModel, forces: AppliedForces, joints: JointState, bodies: BodyState,
+    is_branching: wp.array(dtype=wp.bool), tree: int, phi: float, factors_out: Factors, scratch_out: Scratch,
+):  # fmt: skip
+    """From the tips to the root of one tree: each body's implicit inertia and bias, its joint's factors, and what is left."""
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    last = first + (size - 1) * model.pitch
+    motion = bodies.body_qd[last]
+    carried = bool(False)
+    J_carried = wp.mat33()
+    H_carried = wp.mat33()
+    M_carried = wp.mat33()
+    bias_carried = wp.spatial_vector()
+    tension_carried = wp.vec3()
+    for i in range(size):
+        k = last - i * model.pitch
+        parent = model.body_parent[k]
+        pose = bodies.body_q[k]
+        axes = factors_out.axes[k]
+        q = joints.joint_q[k]
+        stiffness = model.joint_stiffness[k]
+        damping = model.joint_damping[k]
+        J, H, M, bias, tension = applied_terms(
+            k, tree, p, phi, model, forces, joints, pose, motion, axes, q, stiffness, damping
+        )
+        if is_branching[k]:
+            J += scratch_out.J[k]
+            H += scratch_out.H[k]
+            M += scratch_out.M[k]
+            bias += scratch_out.bias[k]
+            tension += scratch_out.tension[k]
+        if carried:
+            J += J_carried
+            H += H_carried
+            M += M_carried
+            bias += bias_carried
+            tension += tension_carried
+
+        above = wp.spatial_vector()
+        if parent >= 0:
+            above = bodies.body_qd[parent]
+        turning = wp.spatial_bottom(above)
+        metric, drive, _torque = joint_terms(
+            p.dt, phi, axes, q, joints.joint_qd[k], stiffness, damping, turning, wp.spatial_bottom(motion)
+        )
+        J = symmetric(J)
+        M = symmetric(M)
+        D = inverse_symmetric(J + metric)
+        DJ = D * J
+        DH = D * H
+        Du = D * (drive - wp.spatial_bottom(bias))
+        factors_out.D[k] = D
+        factors_out.DJ[k] = DJ
+        factors_out.DH[k] = DH
+        scratch_out.Du[k] = Du
+        carried = False
+        if parent >= 0:
+            J_left, H_left, M_left, bias_left = terms_left(
+                p, phi, turning, metric, factors_out.lever[k], J, H, M, bias, tension, DJ, DH, Du
+            )
+            if parent == k - model.pitch:
+                carried = True
+                J_carried = J_left
+                H_carried = H_left
+                M_carried = M_left
+                bias_carried = bias_left
+                tension_carried = tension
+            else:
+                add_terms(parent, J_left, H_left, M_left, bias_left, tension, scratch_out)
+        else:
+            factors_out.root_inverse_mass[k] = wp.mat33()
+            if model.body_root[k] >= 0:
+                scratch_out.H[k] = H
+                scratch_out.bias[k] = bias
+                factors_out.root_inverse_mass[k] = wp.inverse(M - wp.transpose(H) * DH)
+        motion = above
+        if not carried and i + 1 < size:
+            motion = bodies.body_qd[k - model.pitch]
+
+
+@wp.func
+def accelerate_tree(
+    dt: float,
+    model: ArticulationModel,
+    joints: JointState,
+    bodies: BodyState,
+    factors: Factors,
+    scratch: Scratch,
+    tree: int,
+    prediction_out: Prediction,
+):
+    """From the root to the tips of one tree: accelerations, and the rates and velocities they lead to."""
+    first = model.tree_first[tree]
+    acceleration = wp.spatial_vector()
+    velocity = wp.spatial_vector()
+    omega = wp.vec3()
+    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
+        parent = model.body_parent[k]
+        turning = omega
+        if parent < 0:
+            acceleration = wp.spatial_vector()
+            velocity = wp.spatial_vector()
+            turning = wp.vec3()
+            if model.body_root[k] >= 0:
+                force = wp.spatial_top(scratch.bias[k]) + wp.transpose(scratch.H[k]) * scratch.Du[k]
+                falling = -(factors.root_inverse_mass[k] * force)
+                acceleration = wp.spatial_vector(falling, wp.vec3())
+                prediction_out.joint_xd_free[k] = joints.joint_xd[k] + dt * falling
+                velocity = wp.spatial_vector(prediction_out.joint_xd_free[k], wp.vec3())
+        elif parent != k - model.pitch:
+            acceleration = prediction_out.body_acceleration[parent]
+            velocity = prediction_out.body_qd_free[parent]
+            turning = wp.spatial_bottom(bodies.body_qd[parent])
+        omega = wp.spatial_bottom(bodies.body_qd[k])
+        acceleration, rate, velocity = accelerate_body(
+            dt, acceleration, velocity, turning, omega, factors.lever[k], factors.axes[k], joints.joint_qd[k],
+            factors.DJ[k], factors.DH[k], scratch.Du[k],
+        )  # fmt: skip
+        prediction_out.body_acceleration[k] = acceleration
+        prediction_out.joint_qd_free[k] = rate
+        prediction_out.body_qd_free[k] = velocity
+
+
+@wp.kernel
+def predict_lean(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    is_branching: wp.array(dtype=wp.bool),
+    # in
+    trees: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_euler_steps: wp.array(dtype=wp.int32),
+    tree_steps: wp.array(dtype=wp.int32),
+    forces: AppliedForces,
+    joints: JointState,
+    # out
+    tree_phi_out: wp.array(dtype=float),
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """One thread solves the motion of one tree: :func:`vinesim.kernels.articulation.prediction.predict`.
+
+    is_branching: [body] whether a body is the parent of another than the next one. Conservative trees take the passes of
+    that kernel.
+    """
+    tree = trees[wp.tid()]
+    phi = chosen_phi(p, model, joints, tree, tree_phi[tree], tree_euler_steps[tree])
+    tree_phi_out[tree] = phi
+    step = substep_parameters(p, tree_steps[tree])
+    if is_conservative(step, phi):
+        predict_tree(step, model, forces, joints, tree, phi, bodies_out, factors_out, scratch_out, prediction_out)
+    else:
+        place_bodies(model, joints, is_branching, tree, bodies_out, factors_out, scratch_out)
+        eliminate_bodies(
+            step, model, forces, joints, bodies_out, is_branching, tree, phi, factors_out, scratch_out
+        )  # fmt: skip
+        accelerate_tree(step.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)
