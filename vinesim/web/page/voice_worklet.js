@@ -1,7 +1,9 @@
 // In the thread of sound: cuts the microphone into frames, and plays the frames of one speaker at an even pace.
 
 const FRAME = 960; // samples of 20 ms at 48 kHz
-const START = 2 * FRAME, LARGEST = 12 * FRAME, SPARE = 4 * FRAME; // samples that wait before a voice begins; at most; beyond
+const START = 2 * FRAME, LARGEST = 12 * FRAME; // samples that wait before a voice begins, at first and at most
+const SPARE = 4 * FRAME; // samples that may wait beyond these
+const SILENT = 0.01; // amplitude below which a frame may be the last one of a while: nothing is sent for silence
 const RAMP = 96; // samples of a fade, 2 ms
 
 class Capture extends AudioWorkletProcessor {
@@ -30,7 +32,10 @@ class Capture extends AudioWorkletProcessor {
   }
 }
 
-/** Waits for a few frames, then plays; an empty queue makes it wait for more of them, a long one is cut. */
+/**
+ * Waits for a few frames, then plays. A queue that is empty amid a voice makes it wait for more of them from then on; one
+ * that was never shorter than a frame for a second is cut by one, so that a voice is no later than its network makes it.
+ */
 class Player extends AudioWorkletProcessor {
   constructor() {
     super();
@@ -42,16 +47,35 @@ class Player extends AudioWorkletProcessor {
     this.level = 0; // of the fade, 0 to 1
     this.last = 0;
     this.counts = { stalls: 0, cut: 0 };
+    this.peak = 0; // of the last frame
+    this.least = Infinity; // samples that waited in the last second
+    this.passed = 0; // samples of it
     this.port.onmessage = ({ data }) => {
       this.frames.push(data);
+      this.peak = data.reduce((most, value) => Math.max(most, Math.abs(value)), 0);
       this.waiting += data.length;
-      while (this.waiting > this.target + SPARE) {
-        this.waiting -= this.frames.shift().length - this.at;
-        this.at = 0;
-        this.counts.cut += 1;
-        this.port.postMessage(this.counts);
-      }
+      while (this.waiting > this.target + SPARE) this.cut();
     };
+  }
+
+  cut() {
+    this.waiting -= this.frames.shift().length - this.at;
+    this.at = 0;
+    this.counts.cut += 1;
+    this.port.postMessage(this.counts);
+  }
+
+  /** After some samples: cut what has waited for nothing. */
+  follow(count) {
+    this.least = this.plays ? Math.min(this.least, this.waiting) : 0;
+    this.passed += count;
+    if (this.passed < 50 * FRAME) return;
+    if (this.least > FRAME) {
+      this.target = Math.max(START, this.target - FRAME);
+      this.cut();
+    }
+    this.passed = 0;
+    this.least = Infinity;
   }
 
   process(_, outputs) {
@@ -66,14 +90,17 @@ class Player extends AudioWorkletProcessor {
       } else {
         if (this.plays) {
           this.plays = false;
-          this.target = Math.min(this.target + FRAME / 2, LARGEST);
-          this.counts.stalls += 1;
-          this.port.postMessage(this.counts);
+          if (this.peak > SILENT) {
+            this.target = Math.min(this.target + FRAME / 2, LARGEST);
+            this.counts.stalls += 1;
+            this.port.postMessage(this.counts);
+          }
         }
         this.level = Math.max(0, this.level - 1 / RAMP);
       }
       out[i] = this.level * this.last;
     }
+    this.follow(out.length);
     return true;
   }
 }
