@@ -307,7 +307,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stderr.write(reason + "\n")
         return 2
     middleware.clear_profile()
-    message_packages.ensure_importable(["tf2_msgs", "vision_msgs"])
+    message_packages.ensure_importable(["tf2_msgs", "vision_msgs", "audio_common_msgs"])
     requests: queue.SimpleQueue[str] = queue.SimpleQueue()
     if given.seconds is None:
         threading.Thread(target=_read_requests, args=(requests,), daemon=True).start()
