@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from tests.support.tuning import bunch, cane, number
-from vinesim.cli.tune import run
+from vinesim.cli.tune import plan, run
 from vinesim.errors import UsageError
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.plant_parameters import load_plant, load_specimen
 from vinesim.scene.spec import load_scene
 from vinesim.scene.toml_loader import DataError
-from vinesim.tune import Experiment, Trajectory, TrajectoryError, measure, tune
+from vinesim.tune import Experiment, Trajectory, TrajectoryError, measure, read_trajectory, tune
 from vinesim.tune.fit import specimen_toml
 
 SHORT = Experiment(duration=2.0)
@@ -136,7 +136,9 @@ def test_scenes_load_what_was_fitted(track: Trajectory, tmp_path, capsys) -> Non
     (tmp_path / "cane.toml").write_text(specimen_toml(cane(8e9)))
     out = tmp_path / "fitted.toml"
     plot = tmp_path / "fit.png"
-    code = run(tmp_path / "pull.csv", tmp_path / "cane.toml", "modulus,damping", out, True, plot, None, 0, 0, "cpu")
+    code = run(
+        tmp_path / "pull.csv", tmp_path / "cane.toml", "modulus,damping", out, True, plot, None, False, 0, 0, "cpu"
+    )
     said = json.loads(capsys.readouterr().out)
     assert code == 0
     assert said["ok"]
@@ -175,3 +177,30 @@ def test_a_specimen_that_cannot_be_is_refused(tmp_path, text: str, words: str) -
         load_specimen(path)
     assert words in str(refused.value)
     assert str(path) in str(refused.value)
+
+
+def test_an_experiment_writes_the_track_and_says_what_a_fit_would_know(tmp_path, capsys) -> None:
+    """A push with a force gauge, read back from CSV and fitted."""
+    (tmp_path / "cane.toml").write_text(specimen_toml(cane(segments=4)))
+    experiment = Experiment(kind="push", force_noise=0.0, duration=1.5, axes="z")
+    assert plan(experiment, tmp_path / "cane.toml", tmp_path / "push.csv", "modulus,damping,mass", True) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert 0.0 < said["deviation"]["modulus"] < 0.1
+    assert 0.0 < said["deviation"]["mass"] < 0.1
+    track = read_trajectory(tmp_path / "push.csv")
+    assert len(track.time) == said["samples"]
+    fit = tune(cane(2e9, segments=4), track, ("modulus", "damping", "mass"), pushed=True)
+    assert fit.ok
+    assert fit.estimate("modulus").value == pytest.approx(5e9, rel=0.1)
+    assert fit.estimate("mass").value == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_plant_is_tested_on_another_release(track: Trajectory) -> None:
+    """Nothing of the plant is fitted: the right one leaves the noise, a stiffer one leaves more and says so."""
+    right = tune(cane(), track, ())
+    assert right.ok
+    assert right.noise == pytest.approx(2e-3, rel=0.15)
+    assert not right.estimates
+    wrong = tune(cane(5.5e9), track, ())
+    assert not wrong.ok
+    assert wrong.noise > 1.3 * right.noise

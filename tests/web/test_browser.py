@@ -1,5 +1,6 @@
 """The page in a real browser: it draws the live vineyard within its budgets, and what happens there is seen."""
 
+import contextlib
 import pathlib
 import threading
 
@@ -51,6 +52,17 @@ class LiveVineyard:
         """Called once before the next step."""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="client")
+
+    @contextlib.contextmanager
+    def paused(self):
+        """The client stands still within the block."""
+        standing, go_on = threading.Event(), threading.Event()
+        self.due.append(lambda: (standing.set(), go_on.wait()))
+        standing.wait()
+        try:
+            yield
+        finally:
+            go_on.set()
 
     def _run(self):
         while not self._stop.wait(0.005):
@@ -198,6 +210,14 @@ def test_a_headset_moves_head_and_hands():
         page.run("device.controllers.right.updateButtonValue('squeeze', 0), 0")
         page.run("device.controllers.right.updateButtonValue('a-button', 1), 0")
         wait(lambda: human.pose.right_fingers == VICTORY, "a button makes the person's own pose")
+        with live.paused():
+            hand = "vinesim.viewer.world.bodies + 1 + vinesim.viewer.world.names.indexOf('viewer/right_hand')"
+            z = page.run(f"vinesim.viewer.world.place({hand}).z")
+            page.run("device.controllers.right.position.y += 0.2, 0")
+            wait(
+                lambda: page.run(f"vinesim.viewer.world.place({hand}).z") == pytest.approx(z + 0.2, abs=0.01),
+                "the page draws the hand where the controller is, while the client stands still",
+            )
         page.run("device.primaryInputMode = 'hand', device.hands.right.position.set(0.2, 1.3, -0.5), 0")
         page.run("device.hands.right.quaternion.set(0, 0, 0, 1), 0")
         wrist = np.array([*(start[:2] + 0.5 * ahead + 0.2 * right), 1.3])

@@ -149,6 +149,12 @@ def _kill(times: int = 50, seed: int = 1) -> Iterator[Measurement]:
     return kill(times, seed, _announce)
 
 
+def _tune() -> Iterator[Measurement]:
+    from vinesim.bench.tuning import tuning
+
+    return tuning()
+
+
 def _announce(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
@@ -187,6 +193,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "fuzz": _fuzz,
     "kill": _kill,
     "soak": _soak,
+    "tune": _tune,
 }
 
 

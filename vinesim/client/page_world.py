@@ -14,6 +14,7 @@ from vinesim.client import page_overlays
 from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator, follow_view
 from vinesim.physics.plants.sway import Sway
+from vinesim.physics.rigid.human_shapes import SIDES
 from vinesim.scene.model import Model
 from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, Snapshot
 from vinesim.sensors.scene import textures
@@ -69,6 +70,8 @@ class PageWorld:
         self._overlay_pages: set[int] = set()
         """Pages that show contacts and owners."""
         self._contacts: tuple[Contact, ...] = ()
+        self._hands: dict[str, np.ndarray] = {}
+        """Of the person's left and right hand [2, 7]: as simulated, and the controllers that they followed."""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
 
@@ -93,6 +96,12 @@ class PageWorld:
         snapshot = physics.snapshot()
         swayed = self._sway.apply(snapshot, np.flatnonzero(self._moved_at == physics.tick))
         self._moved_at[swayed.moved_trees] = physics.tick
+        if self._person is not None:
+            hands = [physics.hand(self._client.name, side) for side in SIDES]
+            self._hands = {
+                "hand_proxy": np.array([hand.pose for hand in hands], np.float32),
+                "hand_controller": np.array([hand.controller for hand in hands], np.float32),
+            }
         with self._lock:
             self._snapshot = swayed
         server.notify()
@@ -161,7 +170,7 @@ class PageWorld:
                 "body": body.astype(np.uint32), "place": pose[:, :3].astype(np.float32), "turn": _turns(pose),
                 "rigid_place": rigid[:, :3].astype(np.float32), "rigid_turn": _turns(rigid),
                 "picked": np.flatnonzero(~snapshot.bunch_attached).astype(np.uint32), **self._lamps,
-                **page_overlays.contact_arrays(self._contacts),
+                **self._hands, **page_overlays.contact_arrays(self._contacts),
             },
         )  # fmt: skip
         return snapshot.tick, state

@@ -54,10 +54,11 @@ class Candidates:
         markers: names of the points whose motion is wanted.
         dt: step [s].
         device: ``cpu``, ``cuda`` or ``cuda:N``.
+        least: candidates for which there is place from the first run on.
     """
 
     def __init__(
-        self, specimen: Specimen, markers: tuple[str, ...] = (TIP,), *, dt: float, device: str = "cpu"
+        self, specimen: Specimen, markers: tuple[str, ...] = (TIP,), *, dt: float, device: str = "cpu", least: int = 1
     ) -> None:
         self.specimen, self.markers, self.dt, self.device = specimen, markers, dt, device
         self._tree = build_tree(specimen)
@@ -67,6 +68,7 @@ class Candidates:
         self._axes = frames.to_matrix(base_pose(specimen)[3:])
         self._solvers: dict[int, tuple[ArticulationSolver, ArticulationSolver]] = {}
         self._own: dict[int, tuple[np.ndarray, ...]] = {}
+        self._least = least
         self.runs = 0
         """Candidates run so far."""
 
@@ -87,15 +89,14 @@ class Candidates:
             ticks: [k] whole numbers of steps after the release, increasing, 0 or more.
             pushed: the other way round: from rest, the force begins to act at tick 0 and stays.
         """
-        count = len(candidates)
-        still, moving = self._solvers.get(count) or self._new_solvers(count)
+        count, candidates = len(candidates), self._padded(candidates)
+        still, plants = self._solvers[len(candidates)]
         self._write(still, candidates, 0.0)
-        self._write(moving, candidates, 1.0)
-        self._settle(still, np.zeros_like(candidates) if pushed else candidates)
-        plants, state = moving, moving.state
+        self._write(plants, candidates, 1.0)
+        self._settle(still, candidates * [1, 1, 1, 1, 1, 0, 0] if pushed else candidates, count)
+        self._begin(plants, count)
         for name in ("joint_q", "joint_qd"):
-            getattr(state, name)[:] = getattr(still.state, name)
-        plants.wake(np.arange(count))
+            getattr(plants.state, name)[:] = getattr(still.state, name)
         self.runs += count
         rows = [np.empty((count, len(ticks), len(self.markers), 3), np.float32) for _ in range(3)]
         at = 0
@@ -113,23 +114,43 @@ class Candidates:
         position, velocity, later = rows
         return Motion(position, velocity, (later - velocity) / np.float32(self.dt))
 
+    def held_pose(self, candidates: np.ndarray) -> np.ndarray:
+        """Joint rotations [n, body, 4] of candidates [n, 7] in equilibrium under their pull."""
+        self.shape(candidates)
+        still, _ = self._solvers[len(self._padded(candidates))]
+        return still.state.joint_q.reshape(-1, self.size, 4)[: len(candidates)].astype(float)
+
     def shape(self, candidates: np.ndarray) -> np.ndarray:
         """Markers [n, marker, 3] m of candidates [n, 7] in equilibrium under their pull."""
-        count = len(candidates)
-        still, _ = self._solvers.get(count) or self._new_solvers(count)
+        count, candidates = len(candidates), self._padded(candidates)
+        still, _ = self._solvers[len(candidates)]
         self._write(still, candidates, 0.0)
-        self._settle(still, candidates)
+        self._settle(still, candidates, count)
         pose = still.state.body_q[self._bodies(count)].astype(float)
         return pose[..., :3] + frames.rotate(pose[..., 3:], np.broadcast_to(self._point, (*pose.shape[:-1], 3)))
 
     # ------------------------------------------------------------------
 
+    def _padded(self, candidates: np.ndarray) -> np.ndarray:
+        """Candidates [n, 7] and copies of the last up to a number for which there are solvers."""
+        count = len(candidates)
+        sizes = [size for size in self._solvers if count <= size <= 2 * count + 8]
+        size = min(sizes, default=max(count, self._least))
+        if not sizes:
+            self._new_solvers(size)
+        return np.concatenate([candidates, np.repeat(candidates[-1:], size - count, 0)])
+
+    def _begin(self, plants: ArticulationSolver, count: int) -> None:
+        """Let the first candidates move and no others."""
+        plants.put_to_sleep(np.arange(count, len(plants.model.tree_first)))
+        plants.wake(np.arange(count))
+
     def _bodies(self, count: int) -> np.ndarray:
         """Bodies [n, marker] that carry the markers."""
         return np.arange(count)[:, None] * self.size + self._body
 
-    def _new_solvers(self, count: int) -> tuple[ArticulationSolver, ArticulationSolver]:
-        """Solvers of so many candidates: one in long steps for the start, one for the motion."""
+    def _new_solvers(self, count: int) -> None:
+        """Make solvers of so many candidates: one in long steps for the start, one for the motion."""
         model = assemble([self._tree] * count)
         common = {"fast_rate": _RATE, "max_rate": _RATE, "substeps": False, "device": self.device}
         still, moving = (
@@ -140,7 +161,6 @@ class Candidates:
             self._solvers.pop(next(iter(self._solvers)))
         self._solvers[count] = (still, moving)
         self._own[count] = tuple(x.copy() for x in (moving.body_mass, moving.body_inertia, moving.body_product))
-        return still, moving
 
     def _write(self, plants: ArticulationSolver, candidates: np.ndarray, damped: float) -> None:
         """Give each tree its stiffness, damping, masses and slack shape."""
@@ -152,17 +172,16 @@ class Candidates:
         plants.body_inertia[:], plants.body_product[:] = own_inertia * mass, own_product * mass
         plants.body_mass[:] = own_mass * mass[:, 0]
         bends = rest_bends(self.specimen, candidates[:, 3:5])
-        if self.specimen.bow != (0.0, 0.0) or candidates[:, 3:5].any():
-            rest = plants.kernel_arrays()[wp.quat]["body_rest"].reshape(count, self.size, 4)
-            rest[:, : self.specimen.segments] = frames.exp(bends)
+        rest = plants.kernel_arrays()[wp.quat]["body_rest"].reshape(count, self.size, 4)
+        rest[:, : self.specimen.segments] = frames.exp(bends)
         plants.launches.changed = True
 
-    def _settle(self, plants: ArticulationSolver, candidates: np.ndarray) -> None:
-        """Bring all trees into equilibrium under their pull."""
-        state, count = plants.state, len(candidates)
+    def _settle(self, plants: ArticulationSolver, candidates: np.ndarray, count: int) -> None:
+        """Bring the first trees into equilibrium under their pull."""
+        state = plants.state
         state.joint_q[:] = frames.IDENTITY
         state.joint_qd[:] = 0.0
-        plants.wake(np.arange(count))
+        self._begin(plants, count)
         plants.forward_kinematics()
         for _ in range(STATIC_STEPS):
             self._push(plants, candidates)

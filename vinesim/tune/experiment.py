@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Literal
 
+import msgspec
 import numpy as np
 
 from vinesim.errors import UsageError
@@ -14,17 +14,19 @@ from vinesim.scene.plant_parameters import Specimen
 from vinesim.tune.candidates import COLUMNS, Candidates
 from vinesim.tune.specimen import TIP
 from vinesim.tune.trajectory import Trajectory
+from vinesim.tune.tuning import tune
 
 TRUTH_STEP = 1e-3
 """[s] Step of the simulation that stands for the plant."""
-Kind = Literal["pull-release", "push"]
+TRUTH_SEGMENTS = 64
+"""Its segments, at least."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment:
     """How a plant is moved and watched."""
 
-    kind: Kind = "pull-release"
+    kind: str = "pull-release"
     """``pull-release``: held aside, then let go at :attr:`hold`. ``push``: at rest, then a steady force on its tip."""
     displacement: float = 0.1
     """[m] Of the tip, by the pull; by the push, once it has come to rest."""
@@ -47,6 +49,8 @@ class Experiment:
 
     def check(self) -> None:
         """:class:`UsageError` naming the first number that is out of range."""
+        if self.kind not in ("pull-release", "push"):
+            raise UsageError(f"no experiment {self.kind!r}; there are: pull-release, push")
         for name in ("displacement", "duration", "rate"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise UsageError(f"{name} is {getattr(self, name)}; give a finite number above 0")
@@ -62,6 +66,7 @@ def measure(specimen: Specimen, experiment: Experiment = Experiment(), *, exact:
     """The track of an experiment on a specimen; ``exact``: without noise."""
     experiment.check()
     e, rng = experiment, np.random.default_rng(experiment.seed)
+    specimen = msgspec.structs.replace(specimen, segments=max(TRUTH_SEGMENTS, specimen.segments))
     candidates = Candidates(specimen, e.markers, dt=TRUTH_STEP)
     row = np.zeros((1, len(COLUMNS)))
     row[0, 3:5] = specimen.bow
@@ -110,12 +115,10 @@ def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.nd
 
 
 def expected_deviations(
-    specimen: Specimen, experiment: Experiment, parameters: Sequence[str] = ("modulus", "damping")
+    specimen: Specimen, track: Trajectory, parameters: Sequence[str] = ("modulus", "damping"), *, pushed: bool = False
 ) -> dict[str, float]:
-    """Standard deviation of each parameter's posterior, were the specimen the truth: relative, or rad for bows."""
-    from vinesim.tune.tuning import tune
-
-    fit = tune(specimen, measure(specimen, experiment), parameters)
+    """Standard deviation of each parameter's posterior after a fit of a track: relative, or rad for bows."""
+    fit = tune(specimen, track, parameters, pushed=pushed)
     if not fit.ok:
         raise UsageError(f"this experiment cannot be fitted: {fit.faults[0]}")
     return dict(zip(fit.posterior.names[: fit.posterior.physical], fit.posterior.deviation.tolist(), strict=False))

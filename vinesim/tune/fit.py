@@ -9,6 +9,7 @@ import pathlib
 import re
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from vinesim.errors import writing
@@ -195,7 +196,7 @@ class Fit:
                     value = number.value * e.value if e.name == "mass" else e.value
                     told = told + " times" * (e.name == "mass")
                     changes[field] = _replaced(number, float(f"{value:.5g}"), told)
-        return _replace_struct(self.specimen, bow=(bow[0], bow[1]), **changes)
+        return msgspec.structs.replace(self.specimen, bow=(bow[0], bow[1]), **changes)
 
     def write_plant(self, path: str | pathlib.Path, plant: str = "vine") -> None:
         """Write plant parameters that scenes load (``plants = "FILE"``): those of ``plant`` with the fitted numbers,
@@ -243,11 +244,7 @@ def _number(number: Any) -> str:
 
 
 def _replaced(number: Any, value: float, source: str) -> Any:
-    return _replace_struct(number, value=value, grade="FITTED", source=source)
-
-
-def _replace_struct(struct: Any, **changes: Any) -> Any:
-    return type(struct)(**({name: getattr(struct, name) for name in struct.__struct_fields__} | changes))
+    return msgspec.structs.replace(number, value=value, grade="FITTED", source=source)
 
 
 def _replace_line(text: str, table: str, key: str, number: Any) -> str:

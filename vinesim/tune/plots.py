@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import pathlib
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -19,7 +18,6 @@ _ORDER = ("modulus", "damping", "mass")
 
 def plot_fit(fit: Fit, path: str | pathlib.Path) -> None:
     """Draw track, residuals and posterior into a file."""
-    matplotlib.use("Agg")
     figure = Figure(figsize=(11.0, 4.6), layout="constrained")
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.3, 1.0])[0]
     above, below = left.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.0])

@@ -10,6 +10,7 @@ import dataclasses
 import math
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy.optimize import least_squares
 
@@ -22,6 +23,8 @@ from vinesim.tune.trajectory import Trajectory
 PHYSICAL = COLUMNS[:5]
 SOFT = 3.0
 """[1] Residuals of so many standard deviations begin to weigh less (soft L1)."""
+FINER = 3
+"""So many times more steps and segments does the run have that tells the bias of the others."""
 PHASE_STEP = 0.05
 """[rad] Change of phase at the end of the track by which derivatives of modulus and mass are taken."""
 
@@ -50,14 +53,17 @@ class Problem:
         fitted: which of :data:`PHYSICAL` are fitted.
         priors: of those, by name.
         dt: step of the simulation [s].
+        device: ``cpu``, ``cuda`` or ``cuda:N``.
+        pushed: from rest, a steady force begins to act at the release.
     """
 
     def __init__(
         self, specimen: Specimen, track: Trajectory, features: Features, fitted: tuple[str, ...],
-        priors: dict[str, Prior], dt: float, device: str = "cpu",
+        priors: dict[str, Prior], dt: float, device: str = "cpu", pushed: bool = False,
     ) -> None:  # fmt: skip
         self.specimen, self.track, self.features, self.fitted = specimen, track, features, fitted
-        self.candidates = Candidates(specimen, track.markers, dt=dt, device=device)
+        self._device, self.pushed = device, pushed
+        self.candidates = Candidates(specimen, track.markers, dt=dt, device=device, least=9)
         self.observed = columns_of(track)
         self.seen = np.isfinite(self.observed)
         self.axes = np.flatnonzero(track.tracked.any(0))
@@ -71,17 +77,18 @@ class Problem:
         flat = Prior(0.0, math.inf, "flat")
         known = priors | {"release": Prior(features.release, turn, "onset of the motion")}
         self.priors = [known.get(name, flat) for name in self.names]
-        self.force = _force_reading(track, features.release)
+        self.force = _force_reading(track, features.release, pushed)
         self.pull_scale = 1.0
         """[N] Size of the pull, for the step of its derivative."""
         self.evaluations = 0
-        self.correction = np.zeros(self.observed.shape)
-        """[sample, column] m, what shorter steps would change; see :meth:`refine`."""
+        self.shift = np.zeros(len(self.names))
+        """[parameter] Bias of the coarse candidates; see :meth:`correct_discretisation`."""
 
     # ------------------------------------------------------------------ parameters
 
     def row(self, theta: np.ndarray) -> np.ndarray:
         """The candidate [7] of parameters [parameter]."""
+        theta = theta + self.shift
         candidate = np.zeros(len(COLUMNS))
         candidate[3:5] = self.specimen.bow
         for name in self.simulated:
@@ -92,7 +99,8 @@ class Problem:
         """Half the difference by which the derivative by a simulated parameter is taken."""
         if name in ("modulus", "mass"):
             swing = math.pi * self.features.frequency * max(self.track.time[-1] - self.features.release, 0.2)
-            return min(0.05, 2.0 * PHASE_STEP / swing)
+            by_weight = 4.0 if self.specimen.organ == "bunch" else 1.0  # then it changes the frequency that much less
+            return min(0.1, 2.0 * by_weight * PHASE_STEP / swing)
         return {"damping": 0.1, "bow_y": 0.01, "bow_z": 0.01}.get(name, 0.05 * self.pull_scale)
 
     # ------------------------------------------------------------------ model
@@ -102,32 +110,43 @@ class Problem:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities [n, sample, column] of candidates [n, 7] whose release and origin ``thetas`` [n,
         parameter] say, at the samples up to ``end`` [s]."""
+        thetas = thetas + self.shift
         time = self.track.time[self.track.time <= end]
         at = self.names.index("release")
         release = thetas[:, at]
         after = np.maximum(time - release.mean(), 0.0)
         tick = np.floor(after / self.candidates.dt + 1e-6).astype(int)
         ticks, index = np.unique(tick, return_inverse=True)
-        motion = self.candidates.run(candidates, ticks)
+        motion = self.candidates.run(candidates, ticks, self.pushed)
         begun = time > release[:, None]
         offset = np.where(begun, time - release[:, None] - tick * self.candidates.dt, 0.0)
         position, velocity = motion.at(index, offset)
         velocity = velocity * begun[..., None, None]
         x, v = (rows[:, :, self.track.tracked] for rows in (position, velocity))
-        return x + self._origin(thetas)[:, None] + self.correction[: len(time)], v
+        return x + self._origin(thetas)[:, None], v
 
-    def refine(self, theta: np.ndarray) -> None:
-        """Find the error of the step near ``theta`` and correct all positions by it from now on.
+    def correct_discretisation(self, theta: np.ndarray, noise: float) -> np.ndarray:
+        """Find by how much the coarse chain and step bias a fit near ``theta``; the parameters without that bias.
 
-        The scheme is of second order, so what is missing is 4/3 of what half the step changes (Richardson).
+        The coarse candidates are fitted to the track of one candidate with finer segments and steps at ``theta``: what
+        comes out differs from ``theta`` by the bias, of second order in both. From now on :meth:`row` and
+        :meth:`samples` add it to what they are given.
         """
-        coarse, self.correction = self.candidates, np.zeros(self.observed.shape)
-        row = self.row(theta)[None]
-        before, _ = self.samples(theta[None], row)
-        self.candidates = Candidates(self.specimen, self.track.markers, dt=0.5 * coarse.dt, device=coarse.device)
-        after, _ = self.samples(theta[None], row)
+        coarse, observed, priors, force = self.candidates, self.observed, self.priors, self.force
+        self.candidates = Candidates(
+            msgspec.structs.replace(self.specimen, segments=FINER * self.specimen.segments), self.track.markers,
+            dt=coarse.dt / FINER, device=self._device,
+        )  # fmt: skip
+        fine, _ = self.samples(theta[None], self.row(theta)[None])
         self.candidates = coarse
-        self.correction = 4.0 / 3.0 * (after[0] - before[0])
+        self.observed = np.where(self.seen, fine[0], np.nan)
+        self.priors = [dataclasses.replace(p, mean=float(m)) for p, m in zip(priors, theta, strict=True)]
+        if force is not None:
+            self.force = (force[1] * float(self._extra(theta)[0][-1]) + force[0], force[1])
+        biased, _ = self.minimise(theta, noise, most=8, tolerance=1e-4)
+        self.observed, self.priors, self.force = observed, priors, force
+        self.shift = (biased - theta) * FINER**2 / (FINER**2 - 1.0)
+        return theta - self.shift
 
     def _origin(self, thetas: np.ndarray) -> np.ndarray:
         """[n, column] m"""
@@ -228,11 +247,11 @@ class Problem:
         return np.array([sizes.get(name, 0.02) for name in self.names])
 
 
-def _force_reading(track: Trajectory, release: float) -> tuple[float, float] | None:
-    """Mean and standard deviation [N] of the pull before the release; at least 1 % of the mean."""
+def _force_reading(track: Trajectory, release: float, pushed: bool) -> tuple[float, float] | None:
+    """Mean and standard deviation [N] of the pull before the release, or of the push after; at least 1 % of it."""
     if track.force is None:
         return None
-    held = track.force[(track.time <= release) & np.isfinite(track.force)]
+    held = track.force[((track.time <= release) ^ pushed) & np.isfinite(track.force)]
     held = held[held > 0.0]
     if len(held) == 0:
         return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 
 from vinesim import frames
@@ -14,6 +15,12 @@ from vinesim.scene.plant_parameters import Specimen
 TIP = "tip"
 """The marker that every specimen has."""
 _DIRECTIONS = {"cane": (1.0, 0.0, 0.0), "bunch": (0.0, 0.0, -1.0)}
+
+
+def with_values(specimen: Specimen, **values: float) -> Specimen:
+    """The specimen with other values of some numbers, in their units: ``with_values(cane, modulus=4e9)``."""
+    changed = {name: msgspec.structs.replace(getattr(specimen, name), value=value) for name, value in values.items()}
+    return msgspec.structs.replace(specimen, **changed)
 
 
 def base_pose(specimen: Specimen) -> np.ndarray:
@@ -49,7 +56,8 @@ def build_tree(specimen: Specimen) -> TreeBuilder:
         -1, specimen.length.value, radius, material, specimen.segments, organ=Organ.PEDUNCLE, bends=frames.exp(bends)
     )[-1]
     assert specimen.tip_mass is not None  # checked when it was loaded
-    tree.add_bunch(last, specimen.tip_mass.value, clusters=False)
+    far = tree.bodies[last]["far"]  # what lies between the last segment's middle and the bunch, which is rigid
+    tree.add_bunch(last, specimen.tip_mass.value, clusters=False, stiffness=far, damping=specimen.damping.value * far)
     return tree
 
 

@@ -50,13 +50,15 @@ def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None
         rows[1 + i, COLUMNS.index(name)] = unit
     shape = problem.candidates.shape(rows)[:, problem.track.tracked]
     response = (shape[1:] - shape[0]) / unit  # [pull, column]
-    pull = np.linalg.lstsq(response.T, problem.features.displacement, rcond=None)[0]
+    way = -1.0 if problem.pushed else 1.0  # a push ends where the swing does
+    pull = np.linalg.lstsq(response.T, way * problem.features.displacement, rcond=None)[0]
     for name, value in zip(problem.pulls, pull, strict=True):
         theta[at[name]] = value
     problem.pull_scale = max(float(np.linalg.norm(pull)), 1e-3 * unit)
     axis = np.nonzero(problem.track.tracked)[1]
     for i, name in enumerate(problem.origins):
-        theta[at[name]] = (problem.features.rest - shape[0])[axis == problem.axes[i]].mean()
+        rest = shape[0] + (pull @ response if problem.pushed else 0.0)
+        theta[at[name]] = (problem.features.rest - rest)[axis == problem.axes[i]].mean()
 
 
 def _scan(problem: Problem, theta: np.ndarray, features: Features) -> tuple[float, float]:
@@ -70,7 +72,7 @@ def _scan(problem: Problem, theta: np.ndarray, features: Features) -> tuple[floa
     duration = min(max(6.0 / features.frequency, 1.0), 4.0)
     stride = 2
     ticks = np.arange(0, int(duration / problem.candidates.dt), stride)
-    motion = problem.candidates.run(rows, ticks).position[:, :, problem.track.tracked].astype(float)
+    motion = problem.candidates.run(rows, ticks, problem.pushed).position[:, :, problem.track.tracked].astype(float)
     strongest = int(np.argmax(np.abs(features.displacement)))
     swing = motion[:, :, strongest] - motion[:, :, strongest].mean(1, keepdims=True)
     frequency = _peak_frequency(swing, stride * problem.candidates.dt)

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 
 from vinesim.errors import UsageError
@@ -15,7 +16,7 @@ from vinesim.tune.features import Features, extract_features, find_onset, robust
 from vinesim.tune.fit import Fit, Minimum
 from vinesim.tune.posterior import Posterior, importance_sample, laplace
 from vinesim.tune.priors import physical_priors
-from vinesim.tune.problem import Evaluation, Problem
+from vinesim.tune.problem import FINER, Evaluation, Problem
 from vinesim.tune.start import start_values
 from vinesim.tune.trajectory import Trajectory, TrajectoryError
 
@@ -34,18 +35,20 @@ MINIMA = 2.0 ** np.linspace(-2.0, 2.0, 24)
 def tune(
     specimen: Specimen, track: Trajectory, parameters: Sequence[str] = ("modulus", "damping"), *,
     release: float | None = None, samples: int = 0, seed: int = 0, device: str = "cpu",
+    pushed: bool = False,
 ) -> Fit:  # fmt: skip
     """Fit a specimen to a track of a pull and release.
 
     Args:
         specimen: the plant as far as it is known; modulus and damping may be off by any factor up to 40.
         track: of one or more markers, from before or after the release on.
-        parameters: of :data:`PARAMETERS`. ``mass`` scales all masses alike and needs a force reading; ``rest`` is the
-            slack shape and needs positions from the base.
+        parameters: of :data:`PARAMETERS`; none to test the plant as it is on another release. ``mass`` scales all
+            masses alike and needs a force reading; ``rest`` is the slack shape and needs positions from the base.
         release: when it was let go [s]; found unless given.
         samples: so many draws of the posterior beside Laplace's approximation.
         seed: of those draws.
         device: ``cpu``, ``cuda`` or ``cuda:N``.
+        pushed: the track is one of a push: from rest, a steady force begins to act at ``release``.
 
     :class:`~vinesim.tune.trajectory.TrajectoryError` for a track that cannot belong to the specimen,
     :class:`~vinesim.errors.UsageError` for other parameters. A fit that has failed is returned and says so.
@@ -56,13 +59,16 @@ def tune(
         features = dataclasses.replace(features, release=release)
     _check_track(specimen, track, features)
     dt = float(np.clip(STEP_PHASE / (2.0 * math.pi * features.frequency), 5e-4, 0.01))
-    problem = Problem(specimen, track, features, fitted, physical_priors(specimen), dt, device)
-    theta, _, noise = _minimise(problem, start_values(problem), features.noise)
+    chain, coarse = specimen, "modulus" in fitted
+    if not coarse:  # a coarse chain swings up to 1 % too slowly, which only a fitted modulus can make good
+        chain, dt = msgspec.structs.replace(specimen, segments=FINER * specimen.segments), dt / FINER
+    problem = Problem(chain, track, features, fitted, physical_priors(specimen), dt, device, pushed)
+    theta, found, noise = _minimise(problem, start_values(problem), features.noise)
     minima: tuple[Minimum, ...] = ()
-    if "modulus" in fitted:
-        theta, noise, minima = _look_for_minima(problem, theta, noise)
-    problem.refine(theta)
-    theta, found, noise = _settle(problem, theta, noise)
+    if coarse:
+        theta, found, noise, minima = _look_for_minima(problem, theta, found, noise)
+        theta = problem.correct_discretisation(theta, noise)
+        found = problem.evaluate(theta)
     posterior = laplace(problem, theta, found, noise)
     sample = importance_sample(problem, posterior, noise, samples, seed) if samples else None
     model = np.full(problem.observed.shape, np.nan)
@@ -78,9 +84,8 @@ def tune(
 
 def _columns(parameters: Sequence[str]) -> tuple[str, ...]:
     unknown = [name for name in parameters if name not in PARAMETERS]
-    if unknown or not parameters:
-        given = unknown[0] if unknown else ""
-        raise UsageError(f"{given!r} cannot be fitted; give one or more of: {', '.join(PARAMETERS)}")
+    if unknown:
+        raise UsageError(f"{unknown[0]!r} cannot be fitted; give one or more of: {', '.join(PARAMETERS)}")
     return tuple(column for name, columns in PARAMETERS.items() if name in parameters for column in columns)
 
 
@@ -138,8 +143,8 @@ def _settle(problem: Problem, theta: np.ndarray, noise: float) -> tuple[np.ndarr
 
 
 def _look_for_minima(
-    problem: Problem, theta: np.ndarray, noise: float
-) -> tuple[np.ndarray, float, tuple[Minimum, ...]]:
+    problem: Problem, theta: np.ndarray, found: Evaluation, noise: float
+) -> tuple[np.ndarray, Evaluation, float, tuple[Minimum, ...]]:
     """Scan the modulus for other minima of the loss; go to one that is better."""
     at = problem.names.index("modulus")
     thetas = np.repeat(theta[None], len(MINIMA) + 1, 0)
@@ -151,12 +156,12 @@ def _look_for_minima(
     lower = lower[np.abs(np.log(MINIMA[lower])) > 0.1]
     if len(lower) and scan[lower].min() < here:
         start = thetas[1 + lower[np.argmin(scan[lower])]]
-        other, _, left = _settle(problem, start, noise)
-        if left < 0.95 * noise:
-            return other, left, ()
+        other = _settle(problem, start, noise)
+        if other[2] < 0.95 * noise:
+            return *other, ()
     own = problem.specimen.modulus.value
     minima = [Minimum(own * math.exp(thetas[1 + i, at]), float(scan[i] / here)) for i in lower]
-    return theta, noise, tuple(sorted(minima, key=lambda minimum: minimum.loss_ratio))
+    return theta, found, noise, tuple(sorted(minima, key=lambda minimum: minimum.loss_ratio))
 
 
 def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> Features:

@@ -37,6 +37,7 @@ def bench(
     network: sync (what delay does, in simulated time), link (real clients over emulated links;
     needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz
     (broken messages and well-formed lies), kill (programs killed at random moments, while all others go on).
+    Of fits: tune (recovery over 50 seeds, MuJoCo as the truth; beside scipy and CMA-ES; needs scipy and cma).
     Of a long run: soak (memory, threads and open files of robots, people and a recorder; Linux).
 
     \b

@@ -1,4 +1,4 @@
-"""``vinesim tune``: its options."""
+"""``vinesim tune`` and ``vinesim experiment``: their options."""
 
 from __future__ import annotations
 
@@ -32,6 +32,7 @@ def tune(
         pathlib.Path | None, typer.Option(help="Draw track, residuals and posterior into this file (.png, .pdf, .svg).")
     ] = None,
     release: Annotated[float | None, typer.Option(help="When it was let go [s]; found unless given.")] = None,
+    push: Annotated[bool, typer.Option("--push", help="The track is of a push: a steady force begins.")] = False,
     samples: Annotated[
         int, typer.Option(min=0, max=100_000, help="Draw so many candidates of the posterior, all simulated.")
     ] = 0,
@@ -51,4 +52,44 @@ def tune(
     """
     from vinesim.cli.tune import run
 
-    raise typer.Exit(run(data, model, fit, out, json, plot, release, samples, seed, device))
+    raise typer.Exit(run(data, model, fit, out, json, plot, release, push, samples, seed, device))
+
+
+def experiment(
+    kind: Annotated[str, typer.Argument(help="pull-release: held aside, then let go. push: a steady force begins.")],
+    model: Model,
+    out: Annotated[pathlib.Path | None, typer.Option(help="Write the track as CSV; KIND.csv unless given.")] = None,
+    displacement: Annotated[float, typer.Option(help="Of the tip, by the pull or the push [m].")] = 0.1,
+    angle: Annotated[float, typer.Option(help="Of the force about the base's x axis, from its y axis [deg].")] = 90.0,
+    duration: Annotated[float, typer.Option(help="Of the track after the release [s].")] = 3.0,
+    hold: Annotated[float, typer.Option(help="Before it [s].")] = 0.2,
+    rate: Annotated[float, typer.Option(help="Pictures a second.")] = 30.0,
+    noise: Annotated[float, typer.Option(help="Standard deviation of a tracked position [m].")] = 0.002,
+    force_noise: Annotated[
+        float | None, typer.Option(help="A force gauge of this relative standard deviation, 0.01; none unless given.")
+    ] = None,
+    marker: Annotated[list[str] | None, typer.Option(help="tip, or one of specimen.markers; may repeat.")] = None,
+    axes: Annotated[str, typer.Option(help="Axes of the world that are tracked.")] = "xyz",
+    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
+    fit: Annotated[str, typer.Option(help="What will be fitted; see vinesim tune.")] = "modulus,damping",
+    json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout, nothing else.")] = False,
+) -> None:
+    """Simulate what a laboratory would measure, with noise, and say what a fit of it would know.
+
+    To plan a campaign: how long to film, how fast, with or without a force gauge. Needs scipy (extra: tune).
+
+    \b
+    Examples:
+      vinesim experiment pull-release --model examples/cane.toml
+      vinesim experiment pull-release --model examples/cane.toml --rate 120 --duration 2 --axes z
+      vinesim experiment pull-release --model examples/cane.toml --force-noise 0.01 --fit modulus,damping,mass
+      vinesim experiment push --model examples/cane.toml --out push.csv
+    """
+    from vinesim.cli.tune import plan
+    from vinesim.tune.experiment import Experiment
+
+    what = Experiment(
+        kind=kind, displacement=displacement, angle=angle, duration=duration, hold=hold, rate=rate, noise=noise,
+        force_noise=force_noise, markers=tuple(marker or ["tip"]), axes=axes, seed=seed,
+    )  # fmt: skip
+    raise typer.Exit(plan(what, model, out, fit, json))

@@ -6,6 +6,7 @@ import { FlyingEyes } from "./fly.js";
 import { Headset } from "./headset.js";
 import { Absence, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
+import { LateHands } from "./late.js";
 import { DeskHand, WalkingEyes } from "./person.js";
 import { Voice } from "./voice.js";
 import { World } from "./world.js";
@@ -36,6 +37,7 @@ class Viewer {
     this.offerHeadset();
     this.absence = new Absence();
     this.overlays = new Overlays(world);
+    this.lateHands = new LateHands(world);
     this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
     this.help.hidden = false;
     this.intention = "";
@@ -106,6 +108,7 @@ class Viewer {
     // poses of trees come once: those of a state that is overtaken before it is drawn count, too
     this.world.apply(state);
     this.newest = state;
+    this.lateHands.take(state);
     this.overlays.take(state);
     this.heardAt = performance.now();
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
@@ -155,6 +158,10 @@ class Viewer {
     page.voice.listen(pose);
     this.world.list(eye);
     this.overlays.draw(actors, this.camera);
+    if (this.isPerson) {
+      this.person = this.track(pose);
+      this.lateHands.draw(this.person);
+    }
     this.renderer.info.reset();
     if (now - this.shadowAt > SHADOW_PERIOD) {
       this.shadowAt = now;
@@ -184,12 +191,17 @@ class Viewer {
   message(pose) {
     const message = { drawn: page.tick, view: pose, overlays: this.overlays.areShown };
     if (!this.isPerson) return message;
-    if (this.headset.isWorn) return { ...message, person: { head: pose, ...this.headset.hands(), intention: this.intention } };
+    return { ...message, person: { ...this.person, intention: this.intention } };
+  }
+
+  /** The person's tracked head and hands in this frame. */
+  track(pose) {
+    if (this.headset.isWorn) return { head: pose, ...this.headset.hands() };
     const ray = new THREE.Vector3(...this.hand.cursor, 0.5).unproject(this.camera).sub(this.camera.position).normalize();
     const now = performance.now(), seconds = Math.min((now - (this.toldAt ?? now)) / 1000, 0.1);
     this.toldAt = now;
     const right = this.hand.tracked(pose.slice(0, 3), [ray.x, -ray.z, ray.y], this.eyes.yaw, seconds);
-    return { ...message, person: { head: pose, left: null, right, intention: this.intention } };
+    return { head: pose, left: null, right };
   }
 
   /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
