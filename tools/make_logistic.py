@@ -54,7 +54,7 @@ def logistic() -> str:
     eye(urdf)
     for end, way in (("front", 1.0), ("rear", -1.0)):
         clamp(urdf, end, way)
-    return urdf.text()
+    return urdf.text().replace("make_vinebot.py", "make_logistic.py")
 
 
 def eye(urdf: Urdf) -> None:
@@ -105,4 +105,4 @@ def clamp(urdf: Urdf, end: str, way: float) -> None:
 
 
 if __name__ == "__main__":
-    TARGET.write_text(logistic().replace("make_vinebot.py", "make_logistic.py"))
+    TARGET.write_text(logistic())

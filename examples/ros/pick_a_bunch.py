@@ -34,6 +34,7 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 
 DEPTH = 0.06  # m below a bunch's upper end: there the cutter is at its stalk
 AHEAD, ASIDE = 0.88, 0.28  # m from the base to the bunch at the pick
+OPEN = 0.15  # m between the fingers: as wide as they go, since a bunch may be 0.13 m wide
 ALLEY = (1.36, 1.75, 0.8, 6.7)  # m: y and x in which the base may stand and turn
 LANE = 1.06  # m: y of the base beside a box
 DRAWN_IN = (0.45, 0.12, 1.20)  # m: the left hand while the base drives, in the base's frame
@@ -272,7 +273,7 @@ def pick(robot: Robot, name: str, side: str, place: np.ndarray, heading: float) 
 
     back = np.array([0.20, 0.0, 0.0])
     try:
-        robot.grip(side, 0.15)
+        robot.grip(side, OPEN)
         arm.move(grasp_point() - back, level)
         arm.move(grasp_point(), level, speed=0.1)
         if not robot.grip(side, 0.0, 25.0).stalled:
@@ -287,7 +288,7 @@ def pick(robot: Robot, name: str, side: str, place: np.ndarray, heading: float) 
         arm.move(here - back - [0.0, 0.0, 0.03], level, speed=0.15)
         arm.move(np.array(DRAWN_IN) * [1.0, 1.0 if side == "left" else -1.0, 1.0], level)
     except RuntimeError:
-        robot.grip(side, 0.15)
+        robot.grip(side, OPEN)
         here = arm.hand(np.array([robot.joints[joint] for joint in arm.names]))[:3]
         arm.move(here - back, level)
         arm.move(np.array(DRAWN_IN) * [1.0, 1.0 if side == "left" else -1.0, 1.0], level)
@@ -312,7 +313,8 @@ def put_into_box(robot: Robot, side: str) -> None:
     arm.move(over, level)
     arm.move(over, down)
     arm.move(low, down, speed=0.15)
-    robot.grip(side, 0.12)
+    if not robot.grip(side, OPEN).reached_goal:
+        raise RuntimeError("the hand does not open")
     arm.move(over, down)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import pathlib
 import sys
@@ -35,6 +36,14 @@ def joint(name: str, parent: str, child: str, limit: str = LIMIT, axis: str = "0
         f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/><axis xyz="{axis}"/>'
         f"{limit}</joint>"
     )
+
+
+@pytest.mark.parametrize("name", ["vinebot", "logistic"])
+def test_own_robots_are_what_their_tools_write(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = pathlib.Path(__file__).resolve().parents[2]
+    monkeypatch.syspath_prepend(root / "tools")
+    written = getattr(importlib.import_module(f"make_{name}"), name)()
+    assert written == (root / "data" / "robots" / f"{name}.urdf").read_text()
 
 
 def write(folder: pathlib.Path, *parts: str) -> pathlib.Path:

@@ -189,6 +189,7 @@ def test_every_topic_is_heard_with_its_official_type():
             t = next(ticks) / 100
             robot.publish_clock(t)
             robot.publish_robot_state(robot_sample(t, contacts=(contact,)))
+            robot.publish_sound(t, bytes(640))
             sensors.publish_camera(camera_frame(t, 32, 24))
             sensors.publish_lidar(lidar_scan(t, 10))
             robot.publish_environment(t, names, poses)

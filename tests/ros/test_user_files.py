@@ -29,6 +29,8 @@ if middleware.unavailable_reason() is not None:
 import yaml
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from sensor_msgs.msg import BatteryState
+from std_msgs.msg import String
 
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.bench.ros_topics import action_rows
@@ -131,6 +133,33 @@ def test_an_arm_gives_way_and_comes_back(robot: StockNode) -> None:
         )  # fmt: skip
         count = len(printed())
         wait_until(lambda: "back" in printed()[count - 1 :], lambda: drive(0.0, 0.0), "rest")
+
+
+def test_a_low_battery_lights_the_signal_tower(robot: StockNode) -> None:
+    """The pattern follows the charge with a margin, and the robot takes the command."""
+    told: list[str] = []
+    subscription = robot.node.create_subscription(
+        String, "/indicator_lights/command", lambda message: told.append(message.data), 10
+    )
+    battery = robot.node.create_publisher(BatteryState, "/battery_state", 10)
+    with example("battery_light.py") as printed:
+        said: list[str] = []
+        for charge, pattern in (
+            (0.15, "warning"), (0.21, "warning"), (0.04, "alarm"), (0.06, "alarm"), (0.1, "warning"),
+            (float("nan"), "warning"), (0.9, "off"),
+        ):  # fmt: skip
+            told.clear()
+            if pattern != (said or ["off"])[-1]:
+                said.append(pattern)
+
+            def publish(charge: float = charge) -> None:
+                battery.publish(BatteryState(percentage=charge))
+                robot.spin(0.05)
+
+            wait_until(lambda pattern=pattern: told[-1:] == [pattern] and printed() == said, publish, pattern)
+        assert robot.node.count_subscribers("/indicator_lights/command") >= 2  # the robot, and this test
+    robot.node.destroy_subscription(subscription)
+    robot.node.destroy_publisher(battery)
 
 
 def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
