@@ -147,7 +147,8 @@ def test_pictures_go_on_when_the_process_that_stands_by_is_killed(robot, monkeyp
     assert worker.standby_pid is not None
     os.kill(worker.standby_pid, signal.SIGKILL)
     robot.kill_sensors()
-    robot.run_until(lambda: robot.sensors.report()["sensor_restarts"] == 1, "a restart")
+    # two restarts if the end of the process that stood by is seen only when it should take over
+    robot.run_until(lambda: robot.sensors.report()["sensor_restarts"] >= 1, "a restart")
     robot.run_for_pictures(1)
 
 

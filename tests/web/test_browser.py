@@ -103,7 +103,15 @@ def test_the_live_vineyard_in_a_browser():
         assert len(live.world.scene()) <= MAX_BYTES
         page.run("vinesim.viewer.world.budget = 60000, vinesim.viewer.world.listedAt = null")  # for a slow machine
         wait(lambda: page.run("vinesim.triangles") <= 60_000, "fewer triangles are drawn")
-        before = page.picture()
+        page.run("document.getElementById('notices').style.display = 'none'")  # they come and go
+        pictures = [page.picture()]
+
+        def is_settled():
+            pictures.append(page.picture())
+            return np.abs(pictures[-1].astype(float) - pictures[-2]).mean() < 1.0
+
+        wait(is_settled, "a picture in which shadows and lists of leaves are up to date")
+        before = pictures[-1]
         assert before.std() > 30.0, "a vineyard, not one colour"
 
         # a page whose loop stands still gets no more than the window

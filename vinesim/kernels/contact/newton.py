@@ -1,15 +1,15 @@
 """Active-set Newton step on the contacts of one island, from the impulses that projected Gauss-Seidel has reached.
 
-Which contacts are open, stick or slide is taken as it is, and the direction in which they slide is linearised: then the
-conditions are a linear system, B x + J_r w = r with one matrix B for each block, and w = H^-1 J_r^T x of the rigid bodies. Each block is
+Which contacts are open, stick or slide, and in which direction they slide, is taken as it is: then the conditions are a
+linear system, B x + J_r w = r with one matrix B for each block, and w = H^-1 J_r^T x of the rigid bodies. Each block is
 eliminated by itself; what is left is a system as large as the degrees of freedom of the rigid bodies (Woodbury). See
 ``docs/decisions/contact-solver.md``.
 """
 
 import warp as wp
 
-from vinesim.kernels.contact.row_velocity import row_residual, tangential_eigenvalue, update_rigid_velocity
-from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, RigidBodies, Rows, SolverScratch
+from vinesim.kernels.contact.row_velocity import update_rigid_velocity
+from vinesim.kernels.contact.structs import Contacts, Islands, Rows, SolverScratch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,80 +18,11 @@ SLIDING_SHARE = wp.constant(wp.float64(0.999999))
 
 
 @wp.func
-def write_sliding_rows(
-    c: int,
-    place: int,
-    at: int,
-    size: int,
-    island: int,
-    geoms: Geoms,
-    rigid: RigidBodies,
-    contacts: Contacts,
-    islands: Islands,
-    rows: Rows,
-    scratch_out: SolverScratch,
-):
-    """Write both friction rows of a sliding contact, whose matrix rows begin at ``at`` and ``at + size``.
-
-    Friction is the projection of f = x_t - r_t / e on the disk of radius mu x_n, where r_t is the residual velocity along
-    the tangents and e their eigenvalue. Linearised about the present f, with d = f / |f|, P = 1 - d d^T and
-    s = mu x_n / |f|:  x_t - s P (x_t - r_t / e) - mu d x_n = 0 (Alart and Curnier, A mixed formulation for frictional
-    contact problems prone to Newton like solution methods, 1991).
-    """
-    one = wp.float64(1.0)
-    u = 3 * c + 1
-    eigenvalue = tangential_eigenvalue(c, geoms, rigid, contacts, islands, rows)
-    fu = rows.impulse[u] - row_residual(u, geoms, rigid, contacts, islands, rows) / eigenvalue
-    fv = rows.impulse[u + 1] - row_residual(u + 1, geoms, rigid, contacts, islands, rows) / eigenvalue
-    friction = contacts.friction[c]
-    length = wp.max(wp.sqrt(fu * fu + fv * fv), wp.float64(1.0e-30))
-    share = wp.min(friction * rows.impulse[u - 1] / length, one)
-    du = fu / length
-    dv = fv / length
-    uu = share * (one - du * du)
-    uv = -share * du * dv
-    vv = share * (one - dv * dv)
-    for k in range(size):
-        along_u = rows.delassus[at + k] / eigenvalue
-        along_v = rows.delassus[at + size + k] / eigenvalue
-        scratch_out.matrix[at + k] = uu * along_u + uv * along_v
-        scratch_out.matrix[at + size + k] = uv * along_u + vv * along_v
-    softer = one - contacts.compliance[c] / eigenvalue
-    n = at + 3 * place
-    scratch_out.matrix[n] = scratch_out.matrix[n] - friction * du
-    scratch_out.matrix[n + 1] = scratch_out.matrix[n + 1] + one - softer * uu
-    scratch_out.matrix[n + 2] = scratch_out.matrix[n + 2] - softer * uv
-    n = n + size
-    scratch_out.matrix[n] = scratch_out.matrix[n] - friction * dv
-    scratch_out.matrix[n + 1] = scratch_out.matrix[n + 1] - softer * uv
-    scratch_out.matrix[n + 2] = scratch_out.matrix[n + 2] + one - softer * vv
-    along_u = -(rows.velocity_free[u] + rows.bias[u]) / eigenvalue
-    along_v = -(rows.velocity_free[u + 1] + rows.bias[u + 1]) / eigenvalue
-    scratch_out.columns[u, 0] = uu * along_u + uv * along_v
-    scratch_out.columns[u + 1, 0] = uv * along_u + vv * along_v
-    for k in range(islands.first_dof[island + 1] - islands.first_dof[island]):
-        dof = islands.dof[islands.first_dof[island] + k]
-        along_u = -rows.rigid_jacobian[u, dof] / eigenvalue
-        along_v = -rows.rigid_jacobian[u + 1, dof] / eigenvalue
-        scratch_out.columns[u, 1 + k] = uu * along_u + uv * along_v
-        scratch_out.columns[u + 1, 1 + k] = uv * along_u + vv * along_v
-
-
-@wp.func
-def write_block(
-    block: int,
-    island: int,
-    geoms: Geoms,
-    rigid: RigidBodies,
-    contacts: Contacts,
-    islands: Islands,
-    rows: Rows,
-    scratch_out: SolverScratch,
-):
+def write_block(block: int, island: int, contacts: Contacts, islands: Islands, rows: Rows, scratch_out: SolverScratch):
     """Write the linear system of one block: its matrix, and right-hand sides for w = 0 and for each entry of w.
 
     Sticking rows: (B + compliance) x = -velocity - bias - J_r w. Rows of open contacts: x = 0. Friction of sliding
-    contacts: see :func:`write_sliding_rows`.
+    contacts: a fixed share of the normal impulse.
     """
     zero = wp.float64(0.0)
     start = islands.block_start[block]
@@ -102,17 +33,19 @@ def write_block(
         n = 3 * c
         normal = rows.impulse[n]
         tangential = wp.sqrt(rows.impulse[n + 1] * rows.impulse[n + 1] + rows.impulse[n + 2] * rows.impulse[n + 2])
-        slides = normal > zero and tangential >= contacts.friction[c] * normal * SLIDING_SHARE
+        slides = tangential >= contacts.friction[c] * normal * SLIDING_SHARE
         for axis in range(3):
             row = n + axis
             at = islands.matrix_start[block] + (3 * p + axis) * size
-            if normal <= zero:
+            if normal <= zero or (axis > 0 and slides):
                 for k in range(size):
                     scratch_out.matrix[at + k] = zero
                 for k in range(1 + dofs):
                     scratch_out.columns[row, k] = zero
                 scratch_out.matrix[at + 3 * p + axis] = wp.float64(1.0)
-            elif axis == 0 or not slides:
+                if normal > zero:
+                    scratch_out.matrix[at + 3 * p] = -rows.impulse[row] / normal
+            else:
                 for k in range(size):
                     scratch_out.matrix[at + k] = rows.delassus[at + k]
                 scratch_out.matrix[at + 3 * p + axis] = scratch_out.matrix[at + 3 * p + axis] + contacts.compliance[c]
@@ -120,11 +53,6 @@ def write_block(
                 for k in range(dofs):
                     dof = islands.dof[islands.first_dof[island] + k]
                     scratch_out.columns[row, 1 + k] = -rows.rigid_jacobian[row, dof]
-        if slides:
-            at = islands.matrix_start[block] + (3 * p + 1) * size
-            write_sliding_rows(
-                c, p, at, size, island, geoms, rigid, contacts, islands, rows, scratch_out
-            )  # fmt: skip
 
 
 @wp.func_native("""
@@ -259,8 +187,6 @@ def project_into_cones(island: int, contacts: Contacts, islands: Islands, rows_o
 @wp.func
 def newton_step(
     island: int,
-    geoms: Geoms,
-    rigid: RigidBodies,
     contacts: Contacts,
     islands: Islands,
     scratch_out: SolverScratch,
@@ -270,7 +196,7 @@ def newton_step(
     first = islands.first_dof[island]
     dofs = islands.first_dof[island + 1] - first
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
-        write_block(block, island, geoms, rigid, contacts, islands, rows_out, scratch_out)
+        write_block(block, island, contacts, islands, rows_out, scratch_out)
         solve_block(block, 1 + dofs, islands, scratch_out)
     solve_rigid(island, contacts, islands, rows_out, scratch_out)
     for m in range(islands.start[island], islands.start[island + 1]):

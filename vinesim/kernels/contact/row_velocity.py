@@ -60,26 +60,6 @@ def delassus_entry(
 
 
 @wp.func
-def row_residual(row: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows):
-    """Velocity [m/s] along a row, bias and compliance included, with the impulses of its island."""
-    r = rows.velocity_free[row] + rows.bias[row] + contacts.compliance[row // 3] * rows.impulse[row]
-    return velocity_along(r, row, geoms, rigid, contacts, islands, rows)
-
-
-@wp.func
-def tangential_eigenvalue(c: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows):
-    """The larger eigenvalue [1/kg] of the tangential block of a contact, compliance included: a step of friction by the
-    residual over it stays inside the cone's convergence."""
-    u = 3 * c + 1
-    uu = delassus_entry(u, 1, geoms, rigid, contacts, islands, rows)
-    vv = delassus_entry(u + 1, 2, geoms, rigid, contacts, islands, rows)
-    uv = delassus_entry(u, 2, geoms, rigid, contacts, islands, rows)
-    mean = wp.float64(0.5) * (uu + vv) + contacts.compliance[c]
-    spread = wp.float64(0.5) * (uu - vv)
-    return mean + wp.sqrt(spread * spread + uv * uv)
-
-
-@wp.func
 def add_impulse(row: int, change: wp.float64, island: int, contacts: Contacts, islands: Islands, rows_out: Rows):
     """Change the impulse along a row by so many N s; the rigid velocities follow."""
     rows_out.impulse[row] = rows_out.impulse[row] + change
