@@ -116,10 +116,7 @@ def nanoseconds(message: Clock) -> int:
 def test_every_step_is_published_once_and_in_order_or_counted_as_lost(robot):
     """Exactly by the counts of the process. A stock reader receives all within one of a few windows of 3 s: without
     a processor for a second it loses messages, as the publisher keeps no more than a hundred."""
-    wanted: list[np.ndarray] = []
-    robot.client.post_step.append(
-        lambda _: wanted.append(robot.processes.ros.worker.current().shared.wanted["steps"].copy())
-    )
+    wanted = wanted_topics(robot)
     clocks, joints = robot.subscribe(Clock, "/clock", 1000), robot.subscribe(JointState, "/joint_states")
     robot.run_until(lambda: len(clocks) >= 20 and joints)
     missing = []
@@ -132,11 +129,7 @@ def test_every_step_is_published_once_and_in_order_or_counted_as_lost(robot):
         assert times == sorted(set(times))
         assert {t % 10**7 for t in times} == {0}
     assert 0 in missing
-    # One more or less: the subscription may be seen between the step and its count. And a step that is passed for
-    # another topic is published on /clock as soon as the process has seen its subscriber, which the client is told later.
-    at_least, at_most = sum(topics[0] for topics in wanted), sum(topics.any() for topics in wanted)
-    wait_until(lambda: robot.processes.sent_messages()["/clock"] + lost_clocks(robot) >= at_least - 1)
-    assert robot.processes.sent_messages()["/clock"] + lost_clocks(robot) <= at_most + 1
+    check_clock_counts(robot, wanted)
 
 
 def test_default_subscribers_receive_pictures_and_clouds(robot):
@@ -179,10 +172,7 @@ def test_killed_processes_come_back_and_diagnostics_say_so(robot):
 
 
 def test_of_a_process_that_stops_for_a_while_every_step_is_sent_or_counted_as_lost(robot):
-    wanted: list[np.ndarray] = []
-    robot.client.post_step.append(
-        lambda _: wanted.append(robot.processes.ros.worker.current().shared.wanted["steps"].copy())
-    )
+    wanted = wanted_topics(robot)
     clocks = robot.subscribe(Clock, "/clock")
     robot.run_until(lambda: len(clocks) >= 5)
     process = robot.processes.ros.worker.current().process
@@ -195,9 +185,27 @@ def test_of_a_process_that_stops_for_a_while_every_step_is_sent_or_counted_as_lo
     robot.run_until(lambda: nanoseconds(clocks[-1]) > last + 2 * 10**9)
     times = list(map(nanoseconds, clocks))
     assert times == sorted(set(times))
-    steps = sum(wanted)  # one more or less: the subscription may be seen between the step and its count
-    wait_until(lambda: robot.processes.sent_messages()["/clock"] + lost_clocks(robot) >= steps - 1)
-    assert robot.processes.sent_messages()["/clock"] + lost_clocks(robot) <= steps + 1
+    check_clock_counts(robot, wanted)
+
+
+def wanted_topics(robot: Robot) -> list[np.ndarray]:
+    """Of every step from now on, which topics of steps the process asks for."""
+    wanted: list[np.ndarray] = []
+    robot.client.post_step.append(
+        lambda _: wanted.append(robot.processes.ros.worker.current().shared.wanted["steps"].copy())
+    )
+    return wanted
+
+
+def check_clock_counts(robot: Robot, wanted: list[np.ndarray]) -> None:
+    """Each step that was wanted on /clock was sent or counted as lost.
+
+    One more or less: the subscription may be seen between the step and its count. And a step that is passed for another
+    topic is published on /clock as soon as the process has seen its subscriber, which the client is told later.
+    """
+    at_least, at_most = sum(int(topics[0]) for topics in wanted), sum(int(topics.any()) for topics in wanted)
+    wait_until(lambda: robot.processes.sent_messages()["/clock"] + lost_clocks(robot) >= at_least - 1)
+    assert robot.processes.sent_messages()["/clock"] + lost_clocks(robot) <= at_most + 1
 
 
 def lost_clocks(robot: Robot) -> int:
