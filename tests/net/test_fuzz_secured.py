@@ -52,6 +52,7 @@ def test_over_tls_no_message_of_any_kind_or_key_stops_a_thread_or_is_believed_ag
             return ATTACKER in ada.robots and "ada" in evil.robots
 
         wait(both_see_each_other, "the two to join")
+        threads = {thread.name for thread in threading.enumerate()}
         locator = parse(server.endpoint, secured=True).locator
         strangers = {"connect__endpoints": [locator], "connect__timeout_ms": 300, "connect__exit_on_failure": False}
         heard = ada.replicator.counters.to_report(), server.figures()
@@ -73,7 +74,6 @@ def test_over_tls_no_message_of_any_kind_or_key_stops_a_thread_or_is_believed_ag
             assert ada.replicator.counters.to_report()[what] == heard[0][what], "and nothing at a client"
 
         raw = open_session(config("client", connect__endpoints=[locator], **tls_config(certs, ATTACKER)))
-        threads = {thread.name for thread in threading.enumerate()}
         before = ada.replicator.counters.malformed
         publishers: dict = {}
         for number, (key, payload) in enumerate(itertools.islice(storm(model, evil, 7, time.monotonic()), 600)):
