@@ -1,4 +1,4 @@
-"""What tasks of a carrier with a clamp at either end have in common: take a box, carry it, know what lies in it.
+"""What tasks of a carrier with a clamp at either end have in common: take a box, carry it, list the bunches in it.
 
 The poses of base, clamps and boxes are read from the physics; boxes are held by friction alone.
 """
