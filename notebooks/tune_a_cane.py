@@ -57,17 +57,12 @@ print(f"log decrement {features.log_decrement:.3f}")
 fit = tune(guess, track)
 print("\n".join(fit.lines()))
 
-# %%
-figure, (above, below) = plt.subplots(2, 1, figsize=(8, 5), sharex=True, height_ratios=[2, 1])
-plots.draw_track(fit, above)
-plots.draw_residuals(fit, below)
-
 # %% [markdown]
-# Posterior and prior: the data know the modulus hundreds of times better than a book does.
+# Track with its 90 % band and what is left over; posterior and prior: the data know the modulus hundreds of times
+# better than a book does.
 
 # %%
-figure, grid = plt.subplots(2, 2, figsize=(7, 5))
-plots.draw_posterior(fit, grid)
+plots.draw_fit(fit, plt.figure(figsize=plots.SIZE, layout="constrained"))
 
 # %% [markdown]
 # ## A release that the fit has not seen

@@ -12,7 +12,7 @@ import tempfile
 import matplotlib.pyplot as plt
 import numpy as np
 
-from vinesim.tune import Experiment, extract_features, load_specimen, measure, plots, tune, with_values
+from vinesim.tune import Experiment, load_specimen, measure, plots, tune, with_values
 
 FOLDER = pathlib.Path(tempfile.mkdtemp())
 
@@ -33,35 +33,25 @@ guess = load_specimen(FOLDER / "bunch.toml")
 truth = with_values(guess, modulus=0.45e9, damping=0.03)
 seen = Experiment(seed=3, displacement=0.04, duration=4.0, axes="xy")  # from below: z is not seen
 track = measure(truth, seen)
-features = extract_features(track)
-print(f"{features.frequency:.3f} Hz, damping ratio {features.damping_ratio:.4f}")
-print(f"log decrement {features.log_decrement:.3f}")
 
 # %%
-fit = tune(guess, track)
+fit = tune(guess, track, samples=512, seed=1)
 print("\n".join(fit.lines()))
-figure, (above, below) = plt.subplots(2, 1, figsize=(8, 5), sharex=True, height_ratios=[2, 1])
-plots.draw_track(fit, above)
-plots.draw_residuals(fit, below)
-
-# %%
-figure, grid = plt.subplots(2, 2, figsize=(7, 5))
-plots.draw_posterior(fit, grid)
+plots.draw_fit(fit, plt.figure(figsize=plots.SIZE, layout="constrained"))
 
 # %% [markdown]
 # ## How much the weight hides
 #
 # The interval of the modulus is wider than a cane's: a tenth more of it changes the frequency by a few percent only.
-# Draws from the posterior itself, each a simulated bunch, say whether the normal approximation is to be trusted.
+# Draws from the posterior itself, each a simulated bunch, say whether the normal approximation is to be trusted; the
+# interval above is theirs.
 
 # %%
-drawn = tune(guess, track, samples=512, seed=1)
-assert drawn.sample is not None
-modulus = guess.modulus.value * np.exp(drawn.sample.draws[:, 0]) / 1e9
-low, high = np.quantile(modulus, [0.05, 0.95])
+assert fit.sample is not None
 own = fit.estimate("modulus")
-print(f"modulus {low:.3f} to {high:.3f} GPa by draws worth {drawn.sample.effective:.0f}")
-print(f"{own.low / 1e9:.3f} to {own.high / 1e9:.3f} GPa by the normal approximation")
+low, high = np.exp(fit.posterior.interval("modulus")) * guess.modulus.value / 1e9
+print(f"modulus {own.low / 1e9:.3f} to {own.high / 1e9:.3f} GPa by draws worth {fit.sample.effective:.0f}")
+print(f"{low:.3f} to {high:.3f} GPa by the normal approximation")
 
 # %% [markdown]
 # ## A release that the fit has not seen
@@ -81,7 +71,7 @@ assert fit.ok
 assert held_out.ok
 assert abs(fit.estimate("modulus").value / 0.45e9 - 1.0) < 0.1
 assert abs(fit.estimate("damping").value / 0.03 - 1.0) < 0.15
-assert abs(fit.frequency / features.frequency - 1.0) < 0.01
-assert drawn.sample.effective > 100
+assert abs(fit.frequency / fit.features.frequency - 1.0) < 0.01
+assert fit.sample.effective > 100
 assert held_out.noise < 1.2 * 2e-3
 plt.close("all")

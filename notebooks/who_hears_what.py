@@ -43,6 +43,12 @@ scene = vinesim.load_scene("hedge.toml")
 places = {"ada": (3.0, -0.7, np.pi / 2), "bob": (1.5, -3.4, np.pi / 2), "eve": (28.0, -0.7, np.pi / 2)}
 
 
+try:
+    from IPython.display import display
+except ImportError:  # run as a script
+    display = print
+
+
 # %%
 def displacement(client: vinesim.Client, rest: np.ndarray) -> np.ndarray:
     """By how much each body of the plants has moved in a client's copy [body] m."""
@@ -54,6 +60,7 @@ with vinesim.Server("tcp/127.0.0.1:0") as server:
         name: vinesim.Client(scene, name=name, connect=server.endpoint, pose=place) for name, place in places.items()
     }
     ada, bob, eve = clients.values()
+    display(ada.page())  # the hedge, live: fly with W A S D and the mouse
     rest = {name: client.state.body_q[:, :3].copy() for name, client in clients.items()}
     history = []
     for step in range(3000):

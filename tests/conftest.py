@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Generator
 
 import pytest
 
@@ -29,18 +30,13 @@ SLOW = (
 """Files and folders that ``make check`` leaves out: each takes more than about ten seconds."""
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_configure(config: pytest.Config) -> None:
-    """With ``-n`` alone, too, tests that share a fixture run in one process, which sets it up once."""
-    if getattr(config.option, "dist", "no") == "load":
-        config.option.dist = "loadgroup"
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
+@pytest.hookimpl(wrapper=True)  # else xdist reads the groups before they are there
+def pytest_collection_modifyitems(items: list[pytest.Function]) -> Generator[None]:
     for item in items:
         if item.nodeid.startswith(SLOW):
             item.add_marker("slow")
+        if item.get_closest_marker("xdist_group"):
+            continue
         fixtures = item._fixtureinfo.name2fixturedefs.values()
         if any(one.scope in ("module", "class") for found in fixtures for one in found):
             # tests that share such a fixture run in one process, which sets it up once
@@ -53,6 +49,7 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
         for item in items:
             if "ros" in item.keywords:
                 item.add_marker(skip)
+    yield
 
 
 def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport) -> None:

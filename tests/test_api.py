@@ -4,8 +4,11 @@ formulas."""
 import ast
 import inspect
 import pathlib
+import re
 import subprocess
 import sys
+import urllib.error
+import urllib.request
 
 import numpy as np
 import pytest
@@ -364,6 +367,20 @@ def test_a_client_without_peers_drives_its_robot():
         assert client.actor_pose("ada")[0] > -1.85
         with pytest.raises(KeyError, match="no actor 'bob'; there are: ada"):
             client.actor_pose("bob")
+
+
+def test_the_vineyard_of_a_client_in_a_cell_of_a_notebook():
+    with vinesim.Client("demo", name="ada", pose=(-2.0, 0.0, 0.0)) as client:
+        page = client.page()
+        (address,) = re.findall(r'<iframe src="([^"]+)"', page._repr_html_())
+        assert address.startswith(page.address)
+        with urllib.request.urlopen(address, timeout=60.0) as answer:
+            assert b"vinesim" in answer.read()
+            assert "frame-ancestors" not in answer.headers["Content-Security-Policy"]
+            assert "X-Frame-Options" not in answer.headers
+        client.step()
+    with pytest.raises(urllib.error.URLError, match="refused"):  # the page ends with the client
+        urllib.request.urlopen(address, timeout=60.0)
 
 
 # ---------------------------------------------------------------- robots

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from vinesim.api.client import Client as Client
     from vinesim.api.energy import Energy as Energy
     from vinesim.api.energy import Momentum as Momentum
+    from vinesim.api.page import Page as Page
     from vinesim.api.picking import Grasp as Grasp
     from vinesim.api.picking import PickAttempt as PickAttempt
     from vinesim.api.picking import attempt_pick as attempt_pick
@@ -42,6 +43,8 @@ if TYPE_CHECKING:
     from vinesim.scene.ids import Organ as Organ
     from vinesim.scene.model import Model as Model
     from vinesim.scene.physics_parameters import PhysicsParameters as PhysicsParameters
+    from vinesim.scene.plant_import.imported_plant import ImportedPlant as ImportedPlant
+    from vinesim.scene.plant_import.imported_plant import import_plant as import_plant
     from vinesim.scene.spec import Scene as Scene
     from vinesim.scene.spec import load_scene as load_scene
     from vinesim.scene.state import State as State
@@ -52,10 +55,12 @@ _MODULES = {
     "Client": "api.client",
     "Energy": "api.energy",
     "Grasp": "api.picking",
+    "ImportedPlant": "scene.plant_import.imported_plant",
     "Lidar": "api.sensors",
     "Model": "scene.model",
     "Momentum": "api.energy",
     "Organ": "scene.ids",
+    "Page": "api.page",
     "PhysicsParameters": "scene.physics_parameters",
     "PickAttempt": "api.picking",
     "RecordedMessage": "api.recording",
@@ -71,6 +76,7 @@ _MODULES = {
     "cane": "scene.cane",
     "frames": "frames",
     "generate": "scene.generation.vineyard",
+    "import_plant": "scene.plant_import.imported_plant",
     "load_scene": "scene.spec",
     "look_at": "api.sensors",
     "reachable_grasps": "api.picking",
@@ -84,10 +90,12 @@ __all__ = [
     "Client",
     "Energy",
     "Grasp",
+    "ImportedPlant",
     "Lidar",
     "Model",
     "Momentum",
     "Organ",
+    "Page",
     "PhysicsParameters",
     "PickAttempt",
     "RecordedMessage",
@@ -104,6 +112,7 @@ __all__ = [
     "cane",
     "frames",
     "generate",
+    "import_plant",
     "load_scene",
     "look_at",
     "reachable_grasps",

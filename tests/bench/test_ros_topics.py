@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vinesim.bench.process_memory import ProcessHistory, ProcessSample
+from vinesim.bench.ros_resets import growth_by_reset, reset_rows
 from vinesim.bench.ros_topics import PERIOD, TOPICS, Arrivals, action_rows, delay_ms, loss_rows, share_on_time
 
 STEP = round(1e9 * PERIOD)
@@ -69,3 +71,34 @@ def test_goals_that_ended_wrongly_are_not_counted_as_right() -> None:
     assert found["goals: farthest joint from its goal"].value == 0.2
     leaked = found["goals whose handles a server knows for good"]
     assert (leaked.value, leaked.peer_value) == (1, 0.0)
+
+
+@pytest.mark.ros
+def test_velocities_are_compared_where_the_joints_are_not_when() -> None:
+    pytest.importorskip("rclpy")
+    from vinesim.bench.goal_sender import Plan
+
+    times, positions = np.array([1.0, 2.5]), np.array([[0.4, -0.2], [0.1, 0.3]])
+    plan = Plan("head_controller", ["a", "b"], times, positions, np.array([[0.3, -0.1], [0.0, 0.0]]))
+    begin = np.array([0.0, 0.1])
+    for time in (0.0, 0.313, 1.0, 2.2, 2.5):
+        place, velocity = (values[0] for values in plan.at(begin, np.array([time])))
+        assert plan.velocity_off(begin, place, velocity) < 5e-3
+        assert plan.velocity_off(begin, place, velocity + np.array([0.0, 0.2])) > 0.15
+    ahead = 1e-5  # the splines' velocity is the derivative of their position
+    low, high = plan.at(begin, np.array([1.7 - ahead, 1.7 + ahead]))[0]
+    np.testing.assert_allclose(plan.at(begin, np.array([1.7]))[1][0], (high - low) / (2.0 * ahead), atol=1e-6)
+    np.testing.assert_allclose(plan.at(begin, np.r_[0.0, times])[0], [begin, *positions], atol=1e-12)
+
+
+def test_what_a_reset_leaves_behind_is_counted() -> None:
+    reset = {"right": True, "s": 0.4, "sensors_s": 0.3, "stamps_back": 0, "nodes": 3, "publishers": 70, "services": 20}
+    leaks = ProcessHistory([float(i) for i in range(8)], [ProcessSample(90.0, 50.0 + 2.0 * i, 9, 40) for i in range(8)])
+    assert growth_by_reset(leaks) == pytest.approx(2.0)
+    rows = [reset] * 6 + [reset | {"right": False, "publishers": 71, "stamps_back": 1}] * 2
+    found = {row.case: row.value for row in reset_rows(rows, {"client": leaks})}
+    assert found["resets: world as in the beginning, goal aborted"] == 6
+    assert found["resets: publishers in the ROS graph, more in the second half"] == 1
+    assert found["resets: nodes in the ROS graph, more in the second half"] == 0
+    assert found["resets: stamps that went back"] == 1
+    assert found["resets: handles of client, more in the second half"] == 0

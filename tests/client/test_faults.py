@@ -20,7 +20,7 @@ from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
 
-WITHOUT_SENSORS = {"frames_dropped": 0, "messages_dropped": 0}
+WITHOUT_SENSORS = {"frames_dropped": 0, "messages_dropped": 0, "sound_lost": 0}
 
 
 @pytest.fixture

@@ -154,6 +154,7 @@ def options(file: pathlib.Path, out: pathlib.Path, **changes) -> dict:
         "speed": 1.0,
         "start": 0.0,
         "end": None,
+        "page": None,
         "ros": False,
     }
     return defaults | {"file": file, "out": out, "pose": None, "scene": None, "seed": None} | changes

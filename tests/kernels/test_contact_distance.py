@@ -13,6 +13,7 @@ from vinesim import frames
 from vinesim.kernels.contact import distance
 
 KINDS = {
+    "plane": (0, (0.0, 0.0, 0.0)),
     "sphere": (2, (0.05, 0.0, 0.0)),
     "capsule": (3, (0.04, 0.1, 0.0)),
     "ellipsoid": (4, (0.05, 0.08, 0.1)),
@@ -74,6 +75,16 @@ def test_distance_of_segments_is_mujocos(kind, length):
             compared += 1
     assert compared > 80
     np.testing.assert_allclose(np.linalg.norm(mine[:, :3], axis=1), 1.0, atol=1e-12)
+
+
+def test_the_lowest_point_of_a_segment_is_closest_to_a_plane():
+    start, end = (
+        np.array([[0, 0, 0.2], [0, 0, 0.1], [0.3, 0, 0.1]]),
+        np.array([[1, 0, 0.1], [1, 0, 0.3], [0.9, 0, 0.1]]),
+    )
+    found = closest("plane", start, end)
+    np.testing.assert_allclose(found[:, 3], 0.1, atol=1e-15)
+    np.testing.assert_array_equal(found[:, :3], [[0, 0, 1]] * 3)
 
 
 def test_distance_of_segments_and_a_box_equals_dense_sampling():

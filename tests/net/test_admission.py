@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import types
+from collections.abc import Callable
 
 import msgspec
 import pytest
@@ -131,8 +132,8 @@ class _SlowlyRouted:
     def declare_querier(self, _key: str) -> _SlowlyRouted:
         return self
 
-    def declare_matching_listener(self, _callback: object) -> None:
-        return None
+    def declare_matching_listener(self, callback: Callable[[object], None]) -> None:
+        self.on_matching = callback
 
     def get(self, _key: str, **_: object) -> list[types.SimpleNamespace]:
         self.queries += 1
@@ -143,18 +144,45 @@ class _SlowlyRouted:
         return [types.SimpleNamespace(ok=types.SimpleNamespace(payload=payload), replier_id=server)]
 
 
-def test_a_hello_is_repeated_until_the_server_that_is_announced_replies(monkeypatch):
-    """However long that takes, and without keeping the thread from its other tasks."""
-    monkeypatch.setattr(zenoh_admission, "RETRY_PERIOD", 0.0)
-    monkeypatch.setattr(zenoh_admission, "CONNECT_TIMEOUT", 0.0)
+def start_admission(session: _SlowlyRouted) -> tuple[zenoh_admission.ServerAdmission, collections.deque]:
     tasks = collections.deque()
-    session = _SlowlyRouted(lost=50)
     admission = zenoh_admission.ServerAdmission(
         session, "vs/1/w/", name="ada", world="w", endpoint="tcp/h:1", is_secured=False, submit=tasks.append
     )
     admission.join(b"hello")
+    return admission, tasks
+
+
+def do_all(tasks: collections.deque) -> None:
     while tasks:
         assert len(tasks) == 1
         tasks.popleft()()
+
+
+def test_a_hello_is_repeated_until_the_server_that_is_announced_replies(monkeypatch):
+    """However long that takes, and without keeping the thread from its other tasks."""
+    monkeypatch.setattr(zenoh_admission, "RETRY_PERIOD", 0.0)
+    monkeypatch.setattr(zenoh_admission, "CONNECT_TIMEOUT", 0.0)
+    session = _SlowlyRouted(lost=50)
+    admission, tasks = start_admission(session)
+    do_all(tasks)
     assert session.queries == 51
     assert admission.rejection == ""
+
+
+def test_a_server_that_came_before_its_predecessor_went_admits_again():
+    session = _SlowlyRouted(lost=0)
+    admission, tasks = start_admission(session)
+    for matching in (True, False):  # in this order, although the server is there now
+        session.on_matching(types.SimpleNamespace(matching=matching))
+    do_all(tasks)
+    count = admission.count
+    session.on_matching(types.SimpleNamespace(matching=False))
+    session.matching_status.matching = False
+    admission.watch()
+    do_all(tasks)
+    assert (admission.is_served, admission.count) == (False, count)
+    session.matching_status.matching = True
+    admission.watch()
+    do_all(tasks)
+    assert (admission.is_served, admission.count) == (True, count + 1)

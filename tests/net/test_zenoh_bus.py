@@ -20,7 +20,7 @@ from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.server.server import Server
-from vinesim.net.transport import zenoh_bus, zenoh_entities
+from vinesim.net.transport import zenoh_bus, zenoh_entities, zenoh_session
 from vinesim.net.transport.bus import KEEP_ALL, NameTaken
 from vinesim.net.transport.certificates import create
 from vinesim.net.transport.endpoints import resolve_ports
@@ -88,6 +88,19 @@ def test_samples_arrive_with_the_depth_of_their_subscription(server):
         assert [payload[0] for key, payload in received if key == "own/0/0/ada"] == list(range(100))
         assert [payload[0] for key, payload in received if key == "c/0/0/ada"] == [99]
         assert (ada.bytes_out, bob.bytes_in) == (200, 200)
+
+
+def test_subscriptions_take_no_thread(server):
+    """A client has a hundred of them, and two cores."""
+    others = set(zenoh_session._direct)
+    with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
+        before = threading.active_count()
+        for i in range(50):
+            bob.subscribe(f"c/{i}/0/*")
+        last = ada.publisher("c/49/0/ada")
+        wait(lambda: last.matching, "all subscriptions to be known")
+        assert threading.active_count() == before
+    assert zenoh_session._direct <= others  # what the exit of the program waits for
 
 
 def test_without_a_subscriber_zenoh_sends_no_byte(server):

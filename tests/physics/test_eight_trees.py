@@ -57,7 +57,7 @@ def run(model: Model, trees: np.ndarray, steps: int = 12) -> dict[int, list[byte
     for tick in range(steps):
         plants.predict()
         bodies = model.tree_first[trees] + 4
-        response = plants.impulse_response_by_tree(bodies).copy()
+        response = plants.impulse_response(bodies)
         if tick in (3, 4):
             plants.integrate(bodies, np.tile([0.1, -0.2, 0.3, 0.0, 0.01, 0.0], (len(bodies), 1)))
         else:
@@ -65,7 +65,7 @@ def run(model: Model, trees: np.ndarray, steps: int = 12) -> dict[int, list[byte
         for k, tree in enumerate(trees):
             of_tree = model.bodies_of(int(tree))
             arrays = (plants.state.body_q, plants.state.joint_q, plants.velocity_free, plants.acceleration)
-            seen[int(tree)] += [x[of_tree].tobytes() for x in arrays] + [response[k, :, 0].tobytes()]
+            seen[int(tree)] += [x[of_tree].tobytes() for x in arrays] + [response[k, :, k].tobytes()]
     return seen
 
 

@@ -181,6 +181,27 @@ def test_camera_info_projects_like_the_camera():
     assert list(message.d) == [0.0] * 5
 
 
+@pytest.mark.parametrize(
+    ("model", "distortion"),
+    [
+        ("plumb_bob", (-0.28, 0.09, 0.0011, -0.0008, -0.012)),
+        ("rational_polynomial", (0.42, -0.11, 0.0003, -0.0002, 0.004, 0.75, -0.06, 0.002)),
+    ],
+)
+def test_a_camera_with_distortion_says_so_and_its_cloud_projects_onto_its_pixels(model, distortion):
+    frame = camera_frame()
+    frame = dataclasses.replace(frame, info=dataclasses.replace(INFO, distortion=distortion))
+    message = over_the_wire(convert.camera_info(frame.info, 3.0))
+    assert (message.distortion_model, tuple(message.d)) == (model, distortion)
+    cloud = points(over_the_wire(convert.depth_cloud(frame)))
+    seen = np.isfinite(cloud["z"])
+    xyz = np.stack([cloud[axis][seen] for axis in "xyz"], -1).astype(float)
+    matrix = np.array(message.k).reshape(3, 3)
+    pixels = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), matrix, np.array(message.d))[0].reshape(-1, 2)
+    v, u = np.nonzero(seen)
+    assert np.abs(pixels - np.stack([u, v], -1)).max() < 1e-3
+
+
 def test_depth_cloud_projects_back_onto_its_pixels():
     frame = camera_frame()
     message = over_the_wire(convert.depth_cloud(frame))

@@ -35,6 +35,7 @@ from vinesim.ros.commands.types import BaseVelocity, ForwardCommand
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
 from vinesim.ros.robot_node import RobotNode
 from vinesim.ros.sensor_node import SensorNode
+from vinesim.ros.tools.subscribing import message_class
 from vinesim.ros.tools.topic_monitor import SimulationClock, TopicStats
 from vinesim.scene.values import (
     CameraFrame,
@@ -183,6 +184,7 @@ def test_every_topic_is_heard_with_its_official_type():
     ):
         robot.publish_environment_static(("pole_0",), poses[:1])
         robot.publish_intentions(())
+        robot.publish_lights(None)
         ticks = iter(range(10**6))
 
         def tick() -> None:
@@ -194,12 +196,27 @@ def test_every_topic_is_heard_with_its_official_type():
             sensors.publish_lidar(lidar_scan(t, 10))
             robot.publish_environment(t, names, poses)
             robot.publish_diagnostics(t, [ComponentStatus("simulation")])
-            time.sleep(0.01)
 
         def sent() -> dict[str, int]:
             return robot.sent | sensors.sent
 
+        # only the monitor subscribes, so what is sent is for it
         wait_until(lambda: all(count >= 20 or name in LATCHED for name, count in sent().items()), tick)
+        with StockNode() as peer:
+            asked = {(topic, qos) for topic in TYPES if topic[1:] not in LATCHED for qos in ("default", "sensor")}
+            received_by: set[tuple[str, str]] = set()
+            for topic, qos in asked:
+                peer.node.create_subscription(
+                    message_class(TYPES[topic]), topic, lambda _, key=(topic, qos): received_by.add(key),
+                    10 if qos == "default" else rclpy.qos.qos_profile_sensor_data, raw=True,
+                )  # fmt: skip
+
+            def tick_and_hear() -> None:
+                tick()
+                for _ in range(20):
+                    peer.spin(0.0)
+
+            wait_until(lambda: received_by == asked, tick_and_hear)
         received = report()
     assert {name: heard["type"] for name, heard in received.items()} == TYPES
     assert all(heard["count"] for heard in received.values()), received
@@ -207,7 +224,7 @@ def test_every_topic_is_heard_with_its_official_type():
 
 
 LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static", "human_intention",
-           "audio_info")  # fmt: skip
+           "audio_info", "indicator_lights/markers")  # fmt: skip
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/robot_description": "std_msgs/msg/String",
@@ -215,6 +232,7 @@ TYPES = {
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/human_intention": "std_msgs/msg/String",
+    "/indicator_lights/markers": "visualization_msgs/msg/MarkerArray",
     "/audio": "audio_common_msgs/msg/AudioData",
     "/audio_stamped": "audio_common_msgs/msg/AudioDataStamped",
     "/audio_info": "audio_common_msgs/msg/AudioInfo",

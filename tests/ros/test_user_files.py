@@ -29,13 +29,21 @@ if middleware.unavailable_reason() is not None:
 import yaml
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import BatteryState
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import String
+from visualization_msgs.msg import Marker, MarkerArray
 
 from tests.support.stock_node import StockNode, wait_until
+from vinesim.bench.ros_resets import reset_rows
 from vinesim.bench.ros_topics import action_rows
 from vinesim.client.processes.child_process import process_group
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.drives.joint_servos import series_stiffness
 from vinesim.ros.messages import message_packages
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Organ
+from vinesim.scene.spec import load_scene
 
 ROOT = pathlib.Path(__file__).parents[2]
 EXAMPLES, FOLDER = ROOT / "examples" / "ros", ROOT / "ros"
@@ -99,6 +107,45 @@ def example(name: str, *arguments: str) -> Iterator[Callable[[], list[str]]]:
         reader.join()
 
 
+def test_poles_and_elastic_elements_are_those_of_the_scene_and_the_drives(robot: StockNode) -> None:
+    """F56: poles in tf_environment_static. F20: torque of each spring is its stiffness times its deflection."""
+    from tf2_msgs.msg import TFMessage
+
+    joint = "arm_left_4_joint"
+    static: list[TFMessage] = []
+    links: dict[tuple[int, int], JointState] = {}
+    springs: dict[tuple[int, int], JointState] = {}
+
+    def stamp_of(message: JointState) -> tuple[int, int]:
+        return message.header.stamp.sec, message.header.stamp.nanosec
+
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    subscriptions = [
+        robot.node.create_subscription(TFMessage, "/tf_environment_static", static.append, latched),
+        robot.node.create_subscription(JointState, "/joint_states", lambda m: links.update({stamp_of(m): m}), 10),
+        robot.node.create_subscription(
+            JointState, f"/see/{joint}/state", lambda m: springs.update({stamp_of(m): m}), 10
+        ),
+    ]
+    wait_until(lambda: static and len(links.keys() & springs.keys()) >= 5, lambda: robot.spin(0.05), "springs")
+    for one in subscriptions:
+        robot.node.destroy_subscription(one)
+    model = generate(load_scene("demo"))
+    poles = model.fixed_start[model.fixed_organ == Organ.POLE]
+    told = {one.child_frame_id: one.transform.translation for one in static[-1].transforms}
+    assert list(told) == [f"pole_{i:04d}" for i in range(len(poles))]
+    np.testing.assert_allclose([[one.x, one.y, one.z] for one in told.values()], poles, atol=1e-6)
+    description = load_description("vinebot")
+    stiffness = series_stiffness(description.drives)[description.joints.index(joint)]
+    for stamp in links.keys() & springs.keys():
+        link, spring = links[stamp], springs[stamp]
+        place = link.name.index(joint)
+        assert spring.name == [joint]
+        assert spring.effort[0] == pytest.approx(stiffness * (spring.position[0] - link.position[place]), abs=1e-6)
+        assert spring.effort[0] == pytest.approx(link.effort[place], abs=1e-9)
+        assert abs(spring.effort[0]) > 0.5  # N m: it carries the forearm
+
+
 def driver(peer: StockNode) -> Callable[[float, float], None]:
     """A function that commands a velocity of the base [m/s, rad/s] and takes messages for a moment."""
     commands = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 1)
@@ -135,12 +182,25 @@ def test_an_arm_gives_way_and_comes_back(robot: StockNode) -> None:
         wait_until(lambda: "back" in printed()[count - 1 :], lambda: drive(0.0, 0.0), "rest")
 
 
+def _lamps_of(messages: list[MarkerArray]) -> tuple[float, float, float] | str | None:
+    """The colour of the lamps by the newest message, None if they are off."""
+    if not messages:
+        return "not known"
+    if messages[-1].markers[0].action == Marker.DELETEALL:
+        return None
+    colour = messages[-1].markers[0].color
+    return round(colour.r, 3), round(colour.g, 3), round(colour.b, 3)
+
+
 def test_a_low_battery_lights_the_signal_tower(robot: StockNode) -> None:
     """The pattern follows the charge with a margin, and the robot takes the command."""
     told: list[str] = []
     subscription = robot.node.create_subscription(
         String, "/indicator_lights/command", lambda message: told.append(message.data), 10
     )
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    shown: list[MarkerArray] = []
+    lamps = robot.node.create_subscription(MarkerArray, "/indicator_lights/markers", shown.append, latched)
     battery = robot.node.create_publisher(BatteryState, "/battery_state", 10)
     with example("battery_light.py") as printed:
         said: list[str] = []
@@ -157,8 +217,14 @@ def test_a_low_battery_lights_the_signal_tower(robot: StockNode) -> None:
                 robot.spin(0.05)
 
             wait_until(lambda pattern=pattern: told[-1:] == [pattern] and printed() == said, publish, pattern)
+            colour = {"warning": (1.0, 0.588, 0.0), "alarm": (1.0, 0.0, 0.0), "off": None}[pattern]
+            wait_until(lambda colour=colour: _lamps_of(shown) == colour, publish, f"{pattern} lamps")
+            if colour is not None:  # the tower's three lamps, where the URDF has them
+                places = [(one.header.frame_id, round(one.pose.position.z, 3)) for one in shown[-1].markers]
+                assert places == [("base_link", 0.356), ("base_link", 0.392), ("base_link", 0.428)]
         assert robot.node.count_subscribers("/indicator_lights/command") >= 2  # the robot, and this test
     robot.node.destroy_subscription(subscription)
+    robot.node.destroy_subscription(lamps)
     robot.node.destroy_publisher(battery)
 
 
@@ -226,7 +292,38 @@ def test_goals_from_another_process_end_as_they_should(robot: StockNode) -> None
         assert row.ratio is None or row.ratio >= 1.0, row
 
 
+@pytest.mark.slow
+def test_resets_from_another_process_leave_nothing_behind(robot: StockNode) -> None:
+    """A small version of the resets of ``vinesim bench ros``: spawned, driven and commanded before each."""
+    done = subprocess.run(
+        [sys.executable, "-m", "vinesim.bench.reset_caller", "--resets", "2"],
+        capture_output=True, text=True, timeout=600, check=False, input="\n\n",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(rows) == 2
+    for row in reset_rows(rows, {}):
+        assert row.peer != "bar, at most" or row.value <= row.peer_value, row
+        assert row.peer != "bar, at least" or row.value >= row.peer_value, row
+
+
 # ---------------------------------------------------------------- the folder ros/
+
+
+RVIZ_TYPES = {
+    "RobotModel": "std_msgs/msg/String", "Odometry": "nav_msgs/msg/Odometry", "Image": "sensor_msgs/msg/Image",
+    "PointCloud2": "sensor_msgs/msg/PointCloud2", "LaserScan": "sensor_msgs/msg/LaserScan",
+    "MarkerArray": "visualization_msgs/msg/MarkerArray",
+}  # fmt: skip
+"""What displays of rviz_default_plugins subscribe to."""
+FOXGLOVE_PANELS = ("3D", "Image", "Plot", "DiagnosticSummary", "RawMessages", "StateTransitions")
+
+
+def _panels_of(layout: dict | str) -> set[str]:
+    """Panels that a Foxglove layout arranges."""
+    if isinstance(layout, str):
+        return {layout}
+    return _panels_of(layout["first"]) | _panels_of(layout["second"])
 
 
 def test_files_name_topics_that_there_are(robot: StockNode) -> None:
@@ -235,8 +332,31 @@ def test_files_name_topics_that_there_are(robot: StockNode) -> None:
     layout = json.loads((FOLDER / "foxglove.json").read_text())
     named = set(re.findall(r'"(/[\w/]+)', json.dumps(rviz) + json.dumps(layout)))
     assert {"/robot_description", "/head_front_camera/depth/points", "/tf_environment"} <= named
+    displays = {
+        one.get("Topic", one.get("Description Topic"))["Value"]: one
+        for one in rviz["Visualization Manager"]["Displays"] if "Topic" in one or "Description Topic" in one
+    }  # fmt: skip
+    assert displays.keys() <= named
     wait_until(lambda: named <= {name for name, _ in robot.node.get_topic_names_and_types()},
                lambda: robot.spin(0.05), f"topics {sorted(named)}")  # fmt: skip
+    types = dict(robot.node.get_topic_names_and_types())
+    for topic, one in displays.items():
+        name = one["Class"].removeprefix("rviz_default_plugins/")
+        assert types[topic] == [RVIZ_TYPES[name]], topic
+        (publisher,) = robot.node.get_publishers_info_by_topic(topic)
+        asked = one.get("Topic", one.get("Description Topic"))
+        is_latched = publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        assert asked["Durability Policy"] == ("Transient Local" if is_latched else "Volatile"), topic
+        assert asked["Reliability Policy"] in ("Reliable", "Best Effort"), topic
+    for panel, options in layout["configById"].items():
+        kind = panel.split("!")[0]
+        assert kind in FOXGLOVE_PANELS, panel
+        if kind == "Image":
+            mode = options["imageMode"]
+            assert types[mode["imageTopic"]] == ["sensor_msgs/msg/Image"]
+            assert types[mode["calibrationTopic"]] == ["sensor_msgs/msg/CameraInfo"]
+            assert mode["imageTopic"].rpartition("/")[0] == mode["calibrationTopic"].rpartition("/")[0]
+    assert _panels_of(layout["layout"]) == set(layout["configById"])
     assert rviz["Visualization Manager"]["Global Options"]["Fixed Frame"] == "map"
 
 

@@ -1,12 +1,16 @@
-"""Pinhole geometry of pictures."""
+"""Geometry of pictures."""
 
 from __future__ import annotations
 
+import dataclasses
+
+import cv2
 import numpy as np
 import pytest
 
 from vinesim.scene.camera_geometry import (
     depth_millimetres,
+    distortion_model,
     intrinsic_matrix,
     measured_points,
     pixel_rays,
@@ -56,5 +60,32 @@ def test_a_point_behind_the_camera_has_no_pixel() -> None:
 def test_rays_and_matrix_agree() -> None:
     across, down = pixel_rays(INFO)
     matrix = np.array(intrinsic_matrix(INFO)).reshape(3, 3)
-    u, v, w = matrix @ [across[4], down[3], 1.0]
+    u, v, w = matrix @ [across[0, 4], down[3, 0], 1.0]
     assert (u, v, w) == pytest.approx((4.0, 3.0, 1.0), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [(), (-0.28, 0.09, 0.0011, -0.0008, -0.012), (0.42, -0.11, 0.0003, -0.0002, 0.004, 0.75, -0.06, 0.002)],
+    ids=["none", "plumb_bob", "rational_polynomial"],
+)
+def test_points_project_as_by_opencv_and_rays_lead_back(distortion: tuple[float, ...]) -> None:
+    info = CameraInfo(64, 48, 60.0, 61.0, 30.0, 25.0, "optical", distortion)
+    model, coefficients = distortion_model(info)
+    assert model == ("rational_polynomial" if len(distortion) == 8 else "plumb_bob")
+    rng = np.random.default_rng(3)
+    points = np.c_[rng.uniform(-0.6, 0.6, (200, 2)), np.ones(200)] * rng.uniform(0.3, 9.0, (200, 1))
+    matrix = np.array(intrinsic_matrix(info)).reshape(3, 3)
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))
+    assert project_points(points, info) == pytest.approx(theirs.reshape(-1, 2), abs=1e-9)
+    across, down = pixel_rays(info)
+    rays = np.stack(np.broadcast_arrays(across, down, np.ones((48, 64))), -1)
+    rows, columns = np.mgrid[:48, :64]
+    assert project_points(rays * 2.5, info) == pytest.approx(np.stack([columns, rows], -1), abs=1e-4)
+
+
+def test_a_map_that_folds_over_itself_has_no_rays_there() -> None:
+    info = dataclasses.replace(INFO, fx=3.0, fy=3.0, distortion=(-0.8, 0.0, 0.0, 0.0, 0.0))
+    across, _ = pixel_rays(info)
+    assert np.isnan(across[0, 5])
+    assert np.isfinite(across[1:3, 2:4]).all()

@@ -53,6 +53,12 @@ def test_it_sees_the_same(scene, raster, where: str) -> None:
     assert np.quantile(error, 0.99) < 1e-4  # the rest: leaves seen edge-on, from some centimetres
 
 
+def test_denormal_numbers_are_as_without_it(raster) -> None:
+    """Physics in the same process has the same bits: Taichi itself sets them to zero in the thread that starts it."""
+    tiny = np.array([1e-40, 1e-30], np.float32) * np.array([1.0, 1e-10], np.float32)
+    assert (tiny > 0.0).all()
+
+
 def test_every_kind_is_seen(scene, raster) -> None:
     """None is missing from the comparison above."""
     found = set()

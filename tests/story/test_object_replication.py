@@ -181,8 +181,9 @@ def test_motion_of_a_hanging_bunch_is_replicated_only_nearby(is_near):
     world, ada, bob = two_clients((0.25, 0.0), (1.0, -2.0) if is_near else (1.0, -20.0))
     before = [bob.physics.state.body_q[bob.model.bodies_of(tree)].tobytes() for tree in range(2)]
     body = ada.model.bunch_body[0]
-    command_hand(ada, 0.2, 0.07)
-    world.run(0.8)
+    for fingers in (0.0, 0.07):  # raised first: a hand that closes on its way up would toss the bunch
+        command_hand(ada, 0.2, fingers)
+        world.run(0.4)
     drive(ada, 0.1)
     world.run(0.8)
     for client in (ada, bob):
@@ -197,7 +198,7 @@ def test_motion_of_a_hanging_bunch_is_replicated_only_nearby(is_near):
     )
     assert np.linalg.norm(here - rest) > 0.05
     if is_near:
-        assert np.linalg.norm(here - there) < 0.01
+        assert np.linalg.norm(here - there) < 0.006
         assert bytes_received(bob) > 0
     else:
         assert bytes_received(bob) == bytes_sent(ada) == 0
@@ -369,7 +370,7 @@ def test_a_box_stays_when_the_robot_that_carries_it_leaves():
 
 
 def test_a_bunch_pulled_off_carried_and_dropped_by_a_human_is_replicated():
-    """F74, F76 by hand: pulled off, replicated while it is carried, no traffic at rest."""
+    """F74, F76 by hand: pulled off, replicated while it is carried, falls when a still hand opens."""
     weak = vineyard.__wrapped__()
     weak.bunch_pull[:] = 20.0
     world = World(weak)
@@ -381,7 +382,7 @@ def test_a_bunch_pulled_off_carried_and_dropped_by_a_human_is_replicated():
         approach, carry = np.clip((time - 0.5) / 0.5, 0.0, 1.0), np.clip((time - 1.4) / 1.2, 0.0, 1.0)
         at = hang + np.array([0.075 + 0.25 * (1.0 - approach) + 0.1 * carry, -0.8 * carry, -0.2 * carry])
         return dataclasses.replace(
-            standing_pose(standing), right=frames.pose(at, facing), right_closed=1.1 < time < 2.8
+            standing_pose(standing), right=frames.pose(at, facing), right_closed=1.1 < time < 5.0
         )
 
     eva = Client(
@@ -397,6 +398,8 @@ def test_a_bunch_pulled_off_carried_and_dropped_by_a_human_is_replicated():
         assert not client.physics.state.bunch_attached[0]
         assert client.replicator.owner(BUNCH(0)) == "eva"
         assert position_difference(eva, client, BUNCH(0)) < 0.06
+    world.run(4.8 - eva.physics.time)  # held still for longer than an object takes to count as at rest
+    assert not at_rest(world)
     world.until(lambda: eva.physics.hand("eva", "right").held is None, 2.0)
     world.until(lambda: at_rest(world), 8.0)
     world.run(0.1)

@@ -69,10 +69,10 @@ def test_only_modulus_over_mass_shows_in_a_free_swing() -> None:
     assert np.ptp(one[:, 0, 2]) > 0.1
 
 
-@pytest.mark.parametrize(("specimen", "within"), [(cane(), 1e-3), (bunch(), 5e-3)], ids=["cane", "bunch"])
-def test_the_jacobian_is_that_of_the_adjoint(specimen, within: float) -> None:
+@pytest.mark.parametrize("specimen", [cane(), bunch()], ids=["cane", "bunch"])
+def test_the_jacobian_is_that_of_the_adjoint(specimen) -> None:
     """The gradient of a loss by modulus and damping: by candidates side by side, and by the adjoints of the same
-    kernels through 250 ticks. Of a bunch the adjoints in single precision are off by 0.4 %, whatever the difference."""
+    kernels through 250 ticks."""
     track = measure(specimen, Experiment(hold=0.0, duration=1.0, noise=0.0, displacement=0.05))
     features = extract_features(track, 0.0)
     problem = Problem(specimen, track, features, ("modulus", "damping"), physical_priors(specimen), DT)
@@ -84,7 +84,7 @@ def test_the_jacobian_is_that_of_the_adjoint(specimen, within: float) -> None:
     found = problem.evaluate(theta)
     for k in range(2):  # seeded with the column itself, so that nothing cancels
         off = found.jacobian[:, k]
-        assert (found.jacobian.T @ off)[k] == pytest.approx(_adjoint(problem, theta, off)[k], rel=within)
+        assert (found.jacobian.T @ off)[k] == pytest.approx(_adjoint(problem, theta, off)[k], rel=1e-3)
 
 
 def _adjoint(problem: Problem, theta: np.ndarray, off: np.ndarray) -> np.ndarray:
@@ -108,7 +108,7 @@ def _adjoint(problem: Problem, theta: np.ndarray, off: np.ndarray) -> np.ndarray
     for sample, time in enumerate(problem.track.time):
         tick = int(np.floor(time / DT + 1e-6))
         s = time - tick * DT
-        g = off[rows_of[sample]]
+        g = np.where(problem.seen[sample], off[rows_of[sample]], 0.0)  # left out as a gross error: no residual
         q, w0, w1 = seen.body_q[tick, 0], seen.body_qd[tick, 0], seen.body_qd[tick + 1, 0]
         _add_marker(by_q[tick, 0], by_qd[tick, 0], by_qd[tick + 1, 0], q, w0, w1, point[0], s, g)
     gradient = rollout.gradient(by_q, by_qd)

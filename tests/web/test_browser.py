@@ -7,11 +7,12 @@ import threading
 import numpy as np
 import pytest
 
-from tests.support.browser import browser_page
+from tests.support.recorded_pick import PICKED_AT, replay_of_a_pick
 from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.avatar.gestures import GESTURES, Gestures
 from vinesim.avatar.tracked_human import TrackedHuman
+from vinesim.bench.support.browser import browser_page
 from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import Spectator
@@ -81,21 +82,27 @@ class LiveVineyard:
         self.server.__exit__(*exception)
 
 
+@pytest.fixture(scope="module")
+def page():
+    """One browser for all tests."""
+    with browser_page() as page:
+        yield page
+
+
 def open_page(page, live, before=""):
     """Open the page, and let it draw little: the browser of a test has no graphics card."""
-    page.call("Emulation.setDeviceMetricsOverride", width=320, height=240, deviceScaleFactor=1, mobile=False)
-    page.open(live.server.address + "?triangles=30000", before=before)
+    page.resize(320, 240)
+    page.open(live.server.address + "?triangles=10000&rate=10&shadows=0", before=before)
     wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
     assert page.run("vinesim.failure") is None
-    page.run("vinesim.viewer.shadowAt = Infinity, 0")  # no shadows
     assert page.errors == []
 
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
-def test_the_live_vineyard_in_a_browser():
-    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live, browser_page() as page:
-        page.open(live.server.address)
+def test_the_live_vineyard_in_a_browser(page):
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
+        page.open(live.server.address + "?rate=10")
         wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
         assert page.run("vinesim.failure") is None
         assert 0 < page.run("vinesim.calls") <= MAX_CALLS
@@ -145,8 +152,8 @@ def test_the_live_vineyard_in_a_browser():
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
-def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
-    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, browser_page() as page:
+def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch(page):
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live:
         open_page(page, live)
         physics, body = live.client.physics, live.client.model.bunch_body[BUNCH]
         here = physics.state.body_q[body, :3].copy()
@@ -188,11 +195,11 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch():
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
-def test_a_headset_moves_head_and_hands():
+def test_a_headset_moves_head_and_hands(page):
     """An emulated headset (iwer) at known places: the person in the physics is there, in the world's axes."""
     device = ";window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
     device += "device.installRuntime({forceInstall: true});"
-    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, browser_page() as page:
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live:
         open_page(page, live, HEADSET.read_text() + device)
         human = live.client.humans["viewer"]
         start = human.pose.head.copy()
@@ -245,44 +252,102 @@ def test_a_headset_moves_head_and_hands():
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
-def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile():
+def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile(page):
     """Its tab is hidden, its connection is cut, its client is started again; and what a browser lacks is said."""
-    with browser_page() as page:
-        with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
-            open_page(page, live, "Object.defineProperty(window, 'isSecureContext', {value: false});")
-            assert "--page-lan" in page.run("document.getElementById('notices').textContent")
-            hosts = "[...new Set(performance.getEntriesByType('resource').map(entry => new URL(entry.name).origin))]"
-            assert page.run(hosts) == [page.run("location.origin")]
-            page.run("vinesim.viewer.absence.long = 0.3, 0")
-            told = "vinesim.viewer.absence.told.join(' ')"
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
+        open_page(page, live, "Object.defineProperty(window, 'isSecureContext', {value: false});")
+        assert "--page-lan" in page.run("document.getElementById('notices').textContent")
+        hosts = "[...new Set(performance.getEntriesByType('resource').map(entry => new URL(entry.name).origin))]"
+        assert page.run(hosts) == [page.run("location.origin")]
+        page.run("vinesim.viewer.absence.long = 0.3, 0")
+        wait(lambda: page.run("vinesim.viewer.absence.pictures") > 5, "its first pictures are drawn")
+        told = "vinesim.viewer.absence.told.join(' ')"
 
-            page.run("vinesim.viewer.renderer.setAnimationLoop(null), 0")  # as browsers do with tabs that are hidden
-            sent, tick = live.server.states_sent, live.client.physics.tick
-            live.due.append(lambda: live.client.physics.pick(BUNCH))
-            wait(lambda: live.client.physics.tick > tick + 60, "0.6 s pass while the tab is hidden")
-            assert live.server.states_sent - sent <= WINDOW
-            page.run("vinesim.viewer.renderer.setAnimationLoop(() => vinesim.viewer.draw())")
-            wait(lambda: "unseen: 1 bunch was picked." in page.run(told), "the page tells of the picked bunch")
-            assert "1 bunch was picked" in page.run("document.getElementById('notices').textContent")
+        page.run("vinesim.viewer.renderer.setAnimationLoop(null), 0")  # as browsers do with tabs that are hidden
+        sent, tick = live.server.states_sent, live.client.physics.tick
+        live.due.append(lambda: live.client.physics.pick(BUNCH))
+        hidden = 60 + round(1000 * page.run("vinesim.viewer.absence.usual"))  # long beside what is usual here
+        wait(lambda: live.client.physics.tick > tick + hidden, "0.6 s and more pass while the tab is hidden")
+        assert live.server.states_sent - sent <= WINDOW
+        page.run("vinesim.viewer.renderer.setAnimationLoop(() => vinesim.viewer.draw())")
+        wait(lambda: "unseen: 1 bunch was picked." in page.run(told), "the page tells of the picked bunch")
+        assert "1 bunch was picked" in page.run("document.getElementById('notices').textContent")
 
-            page.run("vinesim.viewer.absence.told.length = 0, vinesim.viewer.socket.close(), 0")
-            wait(lambda: "unseen" in page.run(told), "the page connects again")
-            tree = live.client.model.body_tree[live.client.model.bunch_body[BUNCH]]
-            body, port = live.client.model.bodies_of(tree).stop - 1, live.server.port
-            rest = live.client.model.forward_kinematics(live.client.model.joint_settled)[body, :3]
-            carried = f"vinesim.viewer.world.place({body}).toArray()"
-            page.run(f"vinesim.viewer.world.poses.image.data[{8 * body}] += 1, 0")  # as if it had moved for good
-        with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, port=port) as live:
-            wait(lambda: "started again" in page.run(told), "the page knows that the client is a new one")
-            assert page.run("vinesim.viewer.world.picked.size") == 0
-            np.testing.assert_allclose(page.run(carried), rest, atol=0.02)
+        page.run("""(({ absence }) => {
+          absence.told.length = 0;
+          Object.assign(absence, { long: 0.02, usual: 0 });
+          window.cut = vinesim.viewer.socket;
+          cut.close();
+        })(vinesim.viewer)""")
+        wait(
+            lambda: page.run("vinesim.viewer.socket !== cut && vinesim.viewer.socket.readyState === 1"), "a new socket"
+        )
+        wait(lambda: "unseen" in page.run(told), "the page tells that it was away")
+        tree = live.client.model.body_tree[live.client.model.bunch_body[BUNCH]]
+        body, port = live.client.model.bodies_of(tree).stop - 1, live.server.port
+        rest = live.client.model.forward_kinematics(live.client.model.joint_settled)[body, :3]
+        carried = f"vinesim.viewer.world.place({body}).toArray()"
+        page.run(f"vinesim.viewer.world.poses.image.data[{8 * body}] += 1, 0")  # as if it had moved for good
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, port=port) as live:
+        wait(lambda: "started again" in page.run(told), "the page knows that the client is a new one")
+        assert page.run("vinesim.viewer.world.picked.size") == 0
+        np.testing.assert_allclose(page.run(carried), rest, atol=0.02)
+        assert page.run("vinesim.failure") is None
+        assert page.errors == []
+
+        missing = "document.querySelector('#failure:not([hidden])')?.textContent"
+        for lacks, said in (
+            ("HTMLCanvasElement.prototype.getContext = () => null;", "no WebGL 2"),
+            ("delete HTMLScriptElement.prototype.noModule;", "too old"),
+        ):
+            page.open(live.server.address, before=lacks)
+            wait(lambda said=said: said in (page.run(missing) or ""), said)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_the_timeline_of_a_recording(page, tmp_path):
+    """Buttons and slider of the page: the recording plays, pauses, goes back to before a pick and on to after it."""
+    replay, _ = replay_of_a_pick(tmp_path / "run.mcap")
+    stop = threading.Event()
+
+    def run(server):
+        while not stop.wait(0.005):
+            replay.step(server)
+
+    def go_to(seconds):
+        page.run(f"""(({{ slider }}) => {{
+          slider.value = {seconds};
+          slider.dispatchEvent(new Event("input"));
+          slider.dispatchEvent(new Event("change"));
+        }})(vinesim.viewer.timeline)""")
+
+    def is_at(seconds):
+        shown, told = page.run(
+            "[Number(vinesim.viewer.timeline.slider.value), vinesim.viewer.timeline.status.position]"
+        )
+        return abs(shown - told) < 0.11 and abs(told - seconds) < 0.05
+
+    with PageServer(replay.world) as server:
+        thread = threading.Thread(target=run, args=(server,))
+        thread.start()
+        try:
+            page.resize(640, 320)
+            page.open(server.address + "?triangles=10000&rate=10&shadows=0")
+            wait(lambda: page.run("window.vinesim?.drawn >= 1 || window.vinesim?.failure"), "a state is drawn")
             assert page.run("vinesim.failure") is None
+            picked, button = "vinesim.viewer.world.picked.size", "document.querySelector('#timeline button')"
+            if not replay.is_paused:  # a slow machine may have reached its end
+                page.run(f"{button}.click()")
+            wait(lambda: page.run(f"{button}.textContent") == "play", "it pauses")
+            go_to(PICKED_AT + 0.6)
+            wait(lambda: is_at(PICKED_AT + 0.6) and page.run(picked) == 1, "the bunch is picked there")
+            go_to(PICKED_AT - 0.6)
+            wait(lambda: is_at(PICKED_AT - 0.6) and page.run(picked) == 0, "it hangs there")
+            assert page.run("vinesim.viewer.absence.told.length") == 0, "nothing passed unseen: it was asked for"
+            page.run(f"{button}.click()")
+            wait(lambda: page.run(picked) == 1, "it plays on to the pick")
             assert page.errors == []
-
-            missing = "document.querySelector('#failure:not([hidden])')?.textContent"
-            for lacks, said in (
-                ("HTMLCanvasElement.prototype.getContext = () => null;", "no WebGL 2"),
-                ("delete HTMLScriptElement.prototype.noModule;", "too old"),
-            ):
-                page.open(live.server.address, before=lacks)
-                wait(lambda said=said: said in (page.run(missing) or ""), said)
+        finally:
+            stop.set()
+            thread.join()

@@ -241,6 +241,9 @@ def test_other_machines_need_the_token_and_get_https(tmp_path, monkeypatch):
         for path in ("", "scene", "main.js", "?token=", "?token=x", "state"):
             with pytest.raises(urllib.error.HTTPError, match="403"):
                 urllib.request.urlopen(plain + path, timeout=10, context=trusting)
+        with pytest.raises(urllib.error.HTTPError, match="400") as refusal:
+            urllib.request.urlopen(plain.replace("https", "http"), timeout=10)
+        assert "needs https" in refusal.value.read().decode(), "a sentence for plain http"
         browser = urllib.request.build_opener(
             urllib.request.HTTPSHandler(context=trusting), urllib.request.HTTPCookieProcessor()
         )

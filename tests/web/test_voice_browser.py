@@ -2,19 +2,18 @@
 
 import threading
 import time
-import wave
 
 import numpy as np
 import pytest
 
 from tests.audio.test_microphone import amplitude
-from tests.support.browser import browser_page
 from tests.support.contact_scenes import cane
 from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.audio import opus
 from vinesim.audio.frame import SAMPLE_RATE, to_pcm
 from vinesim.avatar.tracked_human import TrackedHuman
+from vinesim.bench.support.browser import AS_RECORDED, browser_page, microphone, write_tone
 from vinesim.bench.support.ear import Ear
 from vinesim.client.client import Client
 from vinesim.client.page_sound import PageSound
@@ -25,23 +24,6 @@ from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import LightPattern, Lights
 from vinesim.web.page_server import PageServer
-
-AS_RECORDED = """
-  const media = navigator.mediaDevices, open = media.getUserMedia.bind(media);
-  const raw = { echoCancellation: false, noiseSuppression: false, autoGainControl: false };
-  media.getUserMedia = () => open({ audio: raw });
-"""
-"""A tone is noise to the filters of a browser, which remove it: the test needs it as it is."""
-
-
-def write_tone(path, frequency, level):
-    """A second of a tone at 48 kHz that may be repeated without a gap."""
-    samples = level * np.sin(2.0 * np.pi * frequency * np.arange(48_000) / 48_000)
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(1)
-        file.setsampwidth(2)
-        file.setframerate(48_000)
-        file.writeframes(to_pcm(samples))
 
 
 class LiveTalk:
@@ -110,14 +92,10 @@ class LiveTalk:
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
 def test_a_word_in_a_page_reaches_a_robot_and_a_robots_loudspeaker_reaches_the_page(tmp_path):
-    write_tone(tmp_path / "tone.wav", 440.0, 0.5)
-    options = (
-        "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
-        f"--use-file-for-fake-audio-capture={tmp_path / 'tone.wav'}", "--autoplay-policy=no-user-gesture-required",
-    )  # fmt: skip
-    with LiveTalk() as live, browser_page(*options) as page:
+    speaks = microphone(write_tone(tmp_path / "tone.wav", 440.0, 0.5))
+    with LiveTalk() as live, browser_page(*speaks) as page:
         page.call("Emulation.setDeviceMetricsOverride", width=320, height=240, deviceScaleFactor=1, mobile=False)
-        page.open(live.server.address + "?triangles=3000", before=AS_RECORDED)
+        page.open(live.server.address + "?triangles=3000&rate=10", before=AS_RECORDED)
         wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
         assert page.run("vinesim.voice.counts.sent") == 0
         page.run("document.querySelectorAll('#sound button')[1].click()")

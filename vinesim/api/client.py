@@ -14,7 +14,7 @@ import pathlib
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
+
+if TYPE_CHECKING:
+    from vinesim.api.page import Page
 
 
 class Client:
@@ -132,6 +135,15 @@ class Client:
         for number in range(round(seconds / dt)):
             self.step()
             time.sleep(max(begin + (number + 1) * dt - time.monotonic(), 0.0))
+
+    def page(self, port: int = 0) -> Page:
+        """Show this client's vineyard in browsers of this machine, and in a cell of a notebook, until it is closed or
+        the client leaves; ``port`` 0: any that is free."""
+        from vinesim.api.page import Page
+
+        page = Page(self._client, port)
+        self._stack.callback(page.close)
+        return page
 
     def close(self) -> None:
         """Leave the world; further calls do nothing."""

@@ -89,6 +89,11 @@ class Microphone:
         self._tones: dict[str, tuple[int, float, float]] = {}
         """Sample up to which a tone is mixed, its amplitude there and its frequency [Hz]."""
 
+    @property
+    def missed(self) -> int:
+        """Frames that are not in what was recorded."""
+        return self.lost + self.late + self.undecoded
+
     def hear(self, frame: HeardFrame) -> None:
         """Mix a frame that has arrived."""
         voice = self._voices.pop(frame.speaker, None)

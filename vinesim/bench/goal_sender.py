@@ -49,6 +49,8 @@ FORGOTTEN = 60.0
 A server keeps a result for 10 s and, like any of rcl_action, forgets it within 20: whenever a goal ends, the timer
 starts anew with the period that it had before.
 """
+PLACE_STEP = 0.001
+"""Between two places of the splines that are compared with a message [s]."""
 MOMENT = 0.4
 """After a trajectory's start, when it is cancelled or preempted [s]."""
 UNKNOWN, SUCCEEDED, CANCELED, ABORTED = 0, 4, 5, 6
@@ -68,18 +70,29 @@ class Plan:
     velocities: np.ndarray
     """[point, joint]"""
 
-    def at(self, begin: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Position and velocity [joint] of the cubic splines at a time [s] after the start, which is at ``begin``."""
-        times = np.r_[0.0, self.times]
+    def at(self, begin: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and velocities [time, joint] of the cubic splines at ``times`` [time] s after the start, which is
+        at ``begin`` [joint]."""
+        knots = np.r_[0.0, self.times]
         places, speeds = np.vstack([begin, self.positions]), np.vstack([0.0 * begin, self.velocities])
-        i = int(np.clip(np.searchsorted(times, time) - 1, 0, len(self.times) - 1))
-        h = times[i + 1] - times[i]
-        s = (time - times[i]) / h
+        i = np.clip(np.searchsorted(knots, times) - 1, 0, len(self.times) - 1)
+        h = (knots[i + 1] - knots[i])[:, None]
+        s = (times - knots[i])[:, None] / h
         p0, p1, m0, m1 = places[i], places[i + 1], h * speeds[i], h * speeds[i + 1]
         position = (2 * s**3 - 3 * s**2 + 1) * p0 + (s**3 - 2 * s**2 + s) * m0
         position = position + (3 * s**2 - 2 * s**3) * p1 + (s**3 - s**2) * m1
         velocity = (6 * s**2 - 6 * s) * (p0 - p1) + (3 * s**2 - 4 * s + 1) * m0 + (3 * s**2 - 2 * s) * m1
         return position, velocity / h
+
+    def velocity_off(self, begin: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float:
+        """How far a ``velocity`` [joint] is from that of the splines where they have a ``position`` [joint].
+
+        By place, not by time: the time of a client that is slower than real time skips ahead, its physics does not.
+        """
+        places, velocities = self.at(begin, np.arange(0.0, self.times[-1] + 0.5 * PLACE_STEP, PLACE_STEP))
+        away = np.abs(places - position).max(1)
+        here = away <= away.min() + 1e-4
+        return float(np.abs(velocities[here] - velocity).max(1).min())
 
 
 def plan(random: np.random.Generator, controller: str, joints: dict[str, Joint], start: np.ndarray) -> Plan:
@@ -233,15 +246,12 @@ def wait_until_forgotten(status: Callable[[Any], int], handles: list[Any], longe
 def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, int, str]) -> dict[str, Any]:
     """Whether a goal that ran to its end did what it says."""
     columns = [sender.names.index(name) for name in one.joints]
-    # On a busy machine a result comes before the joint states of up to a second.
-    end = begin + one.times[-1] + 1.0
-    sender.until(lambda: sender.history[-1][0] >= end, "the robot's time")
+    sender.wait(0.2)  # on a busy machine a result comes before the joint states of up to a second
     wanted, measured = 0.0, 0.0
     first = np.array(sender.feedback[0].desired.positions) if sender.feedback else one.positions[0]
     for told in sender.feedback:
-        t = told.header.stamp.sec + 1e-9 * told.header.stamp.nanosec - begin
-        if 0.0 < t < one.times[-1]:
-            wanted = max(wanted, float(np.abs(one.at(first, t)[1] - told.desired.velocities).max()))
+        desired, speed = np.array(told.desired.positions), np.array(told.desired.velocities)
+        wanted = max(wanted, one.velocity_off(first, desired, speed))
     stamps = np.array([row[0] for row in sender.history]) - begin
     speeds = np.array([row[2][columns] for row in sender.history])
     for t, velocity in zip(one.times[:-1], one.velocities[:-1], strict=True):

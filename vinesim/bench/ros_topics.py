@@ -1,4 +1,4 @@
-"""``vinesim bench ros``: topics of a real robot client as another process receives them, and its actions.
+"""``vinesim bench ros``: topics of a real robot client as another process receives them, its actions and resets.
 
 A client as its users start it, physics and renderer included; a stock node in a second process that subscribes to the
 topics of every step; and a third that reads them too, pictures and clouds besides, until it is stopped with SIGSTOP.
@@ -20,6 +20,7 @@ import numpy as np
 
 from vinesim.bench import stock_publisher
 from vinesim.bench.live_client import CLOCK, DEPTH, LIDAR, RGB, RosMissing, own_processes
+from vinesim.bench.ros_resets import RESETS, measure_resets
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup
 from vinesim.client.processes.ros_listener import RosListener
 from vinesim.client.rate_loop import TickLog
@@ -178,6 +179,8 @@ def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Mea
         yield from _measure_topics(group, folder, window)
         announce(f"actions: {GOALS} goals, {CANCELS} cancels, {PREEMPTS} preempts; about 200 s")
         yield from _measure_actions(group)
+        announce(f"resets: {RESETS} by simulation_interfaces; about 150 s")
+        yield from measure_resets(group)
 
 
 def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) -> Iterator[Measurement]:

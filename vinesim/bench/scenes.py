@@ -140,10 +140,15 @@ def keep_awake(physics: Physics, trees: np.ndarray) -> Physics:
 
 def interleaved_medians(*works: Callable[[], object], rounds: int = 9) -> list[float]:
     """Median time [s] of each of some works, run in turns, so that changes of the machine's load meet all alike."""
-    seconds = np.zeros((rounds, len(works)))
+    return interleaved_times(*works, rounds=rounds)[0].tolist()
+
+
+def interleaved_times(*works: Callable[[], object], rounds: int = 9) -> np.ndarray:
+    """Medians [2, work] s of some works, run in turns: of the time that passes, and of this thread's processor time."""
+    seconds = np.zeros((rounds, 2, len(works)))
     for row in seconds:
         for i, work in enumerate(works):
-            start = time.perf_counter()
+            start, began = time.perf_counter(), time.thread_time()
             work()
-            row[i] = time.perf_counter() - start
-    return np.median(seconds, axis=0).tolist()
+            row[:, i] = time.perf_counter() - start, time.thread_time() - began
+    return np.median(seconds, axis=0)

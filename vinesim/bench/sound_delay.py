@@ -4,9 +4,9 @@ A robot and a person 3 m from it, of two clients, over a network in memory. Agai
 lights to alarm with their tone and plays an alarm as a waveform, too, and the person says a word.
 
 The light is seen when the copy of the robot in the person's client is lit. The tone is heard when the person's page is
-told to make it, the waveform when the page has the two frames with which it begins. The word is heard when the robot's
-microphone has recorded a block of 20 ms with it, counted from its first sample. What a headset, a browser and a sound
-card need comes on top.
+told to make it, the waveform when the page has its first frame and has waited as long as it does. The word is heard
+when the robot's microphone has recorded a block of 20 ms with it, counted from its first sample. What a headset, a
+browser and a sound card need comes on top.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ PAUSE = 0.5
 """[s] Of silence between two alarms; the voices begin anew."""
 WAVEFORM, WORD = 500.0, 700.0
 """[Hz] Of the alarm as a waveform, and of the word."""
-PAGE_STARTS = 2
-"""Frames that wait in a page before it plays (``vinesim/web/page/voice_worklet.js``)."""
+PAGE_WAITS = 0.01
+"""From the first frame of a voice until a page plays it [s] (``vinesim/web/page/voice_worklet.js``)."""
 HEARD = 0.01
 """Amplitude of a tone from which a block contains it; 3 m away alarms have 0.16."""
 BUDGET = 500.0
@@ -121,10 +121,10 @@ class _World:
             has_word = any(_level(block.samples, WORD) > HEARD for block in self.at_bot.blocks)
             for what, is_so in (
                 (LIGHT, self.is_lit()), (TONE_OF_LIGHTS, self.at_anna.has_tone), (VOICE, has_word),
-                (AS_WAVEFORM, self.at_anna.frames >= PAGE_STARTS),
+                (AS_WAVEFORM, self.at_anna.frames > 0),
             ):  # fmt: skip
                 if is_so:
-                    found.setdefault(what, after)
+                    found.setdefault(what, after + (PAGE_WAITS if what == AS_WAVEFORM else 0.0))
             self.at_bot.blocks = []
         return found
 

@@ -1,8 +1,7 @@
-"""Fits of synthetic tracks: how near they come, how honest their intervals are, and how long they take beside peers.
+"""``vinesim bench tune``: how near fits of synthetic tracks come, how honest their intervals are, what they cost.
 
-Canes of 1 m (9 to 6 mm, 900 kg/m^3), modulus 2 to 9 GPa, damping ratio 0.01 to 0.1, pulled by 10 cm; 30 pictures a
-second for 3 s with 2 mm of noise in each axis; start values up to five times off. The truth is stepped at 1 ms by
-vinesim, or at 0.5 ms by MuJoCo, whose scheme then has less damping of its own than the canes have.
+The truth is stepped at 1 ms by vinesim, or at 0.5 ms by MuJoCo, whose scheme then has less damping of its own than the
+canes have; beside peers in :mod:`vinesim.bench.tuning_peers`.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import dataclasses
 import math
 import time
 from collections.abc import Iterator
-from typing import Any
 
 import msgspec
 import mujoco
@@ -19,60 +17,23 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
+from vinesim.bench.tuning_cases import DAMPING_BAR, MODULUS_BAR, Case, draw_case
+from vinesim.bench.tuning_peers import peer_rows, stein_rows
 from vinesim.scene.builder import assemble
-from vinesim.scene.plant_parameters import Number, Specimen
+from vinesim.scene.plant_parameters import Specimen
 from vinesim.scene.values import Measurement
-from vinesim.tune import Experiment, Fit, Trajectory, measure, tune
+from vinesim.tune import Fit, Trajectory, measure, tune
 from vinesim.tune.candidates import COLUMNS, Candidates
 from vinesim.tune.experiment import pull_for
-from vinesim.tune.features import extract_features
-from vinesim.tune.priors import physical_priors
-from vinesim.tune.problem import Problem
 from vinesim.tune.specimen import build_tree
-from vinesim.tune.start import start_values
-from vinesim.tune.tuning import STEP_PHASE
 
 SEEDS = 50
-SPEED_SEEDS = 5
+SPEED_SEEDS = 3
 """Tracks on which peers are timed."""
+STEIN_SEEDS = 4
+"""Tracks of which Stein particles give the posterior."""
 MUJOCO_SEEDS = 6
 MUJOCO_SEGMENTS = 32
-MODULUS_BAR, DAMPING_BAR = 0.03, 0.15
-"""Largest relative errors."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Case:
-    """One synthetic laboratory."""
-
-    truth: Specimen
-    guess: Specimen
-    """What the user begins with."""
-    experiment: Experiment
-
-
-def bench_cane(modulus: float, damping: float, segments: int = 8) -> Specimen:
-    """The cane of this benchmark; ``damping`` [s]."""
-
-    def number(value: float, unit: str) -> Number:
-        return Number(value, unit, "GUESSED", "benchmark")
-
-    return Specimen(
-        organ="cane", length=number(1.0, "m"), base_diameter=number(0.009, "m"), tip_diameter=number(0.006, "m"),
-        modulus=number(modulus, "Pa"), density=number(900.0, "kg/m^3"), damping=number(damping, "s"),
-        segments=segments,
-    )  # fmt: skip
-
-
-def draw_case(seed: int) -> Case:
-    """Modulus, damping, start values and the moment of release of one seed."""
-    rng = np.random.default_rng(seed)
-    modulus = 1e9 * math.exp(rng.uniform(math.log(2.0), math.log(9.0)))
-    ratio = math.exp(rng.uniform(math.log(0.01), math.log(0.1)))
-    damping = ratio / (math.pi * 3.48 * math.sqrt(modulus / 5e9))
-    off = np.exp(rng.uniform(-math.log(5.0), math.log(5.0), 2))
-    experiment = Experiment(seed=seed, hold=0.2 + float(rng.uniform(0.0, 1.0 / 30.0)))
-    return Case(bench_cane(modulus, damping), bench_cane(modulus * off[0], damping * off[1]), experiment)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -153,112 +114,7 @@ def mujoco_track(case: Case, dt: float = 5e-4) -> Trajectory:
     return Trajectory(clock, seen[:, None] + noise, source=f"MuJoCo, seed {e.seed}")
 
 
-# ---------------------------------------------------------------------- peers
-
-
-class PlainProblem:
-    """The same loss and the same simulator, for optimisers that know neither derivatives nor features.
-
-    Start values of release and pull are given to them; modulus and damping begin where the user's do.
-    """
-
-    def __init__(self, case: Case, track: Trajectory) -> None:
-        features = extract_features(track)
-        dt = min(0.01, STEP_PHASE / (2.0 * math.pi * features.frequency))
-        names = ("modulus", "damping")
-        self.problem = Problem(case.guess, track, features, names, physical_priors(case.guess), dt)
-        self.noise = features.noise
-        self.good = start_values(self.problem)
-        """Our own start values."""
-        self.plain = self.good.copy()
-        self.plain[:2] = 0.0  # the user's
-        self.scales = self.problem._scales()
-
-    def losses(self, thetas: np.ndarray) -> np.ndarray:
-        """[n] of parameters [n, 8], all of one launch."""
-        problem = self.problem
-        x, _ = problem.samples(thetas, np.array([problem.row(theta) for theta in thetas]))
-        return np.array([problem.loss(theta, y, self.noise) for theta, y in zip(thetas, x, strict=True)])
-
-    def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Of one candidate, priors included, for scipy."""
-        problem = self.problem
-        x, _ = problem.samples(theta[None], problem.row(theta)[None])
-        off = (x[0] - problem.observed)[problem.seen] / self.noise
-        return np.concatenate([off, problem._extra(theta)[0]])
-
-
-def fit_by_scipy(plain: PlainProblem, starts: np.ndarray) -> np.ndarray:
-    """scipy's least squares with its own finite differences, from each start; the best."""
-    from scipy.optimize import least_squares
-
-    found = [
-        least_squares(
-            plain.residuals, start, x_scale=plain.scales, loss="soft_l1", f_scale=3.0, ftol=1e-5, xtol=1e-6,
-            diff_step=1e-4, max_nfev=30,
-        )
-        for start in starts
-    ]  # fmt: skip
-    return min(found, key=lambda one: one.cost).x
-
-
-def fit_by_cma(plain: PlainProblem, seed: int) -> np.ndarray:
-    """CMA-ES with its default population, each generation one launch, from the user's start."""
-    import cma
-
-    spread = plain.scales.copy()
-    spread[:2] = math.log(5.0)
-    options = {"verbose": -9, "seed": seed + 1, "CMA_stds": spread, "maxiter": 400, "tolfun": 1e-3, "tolx": 1e-5}
-    strategy = cma.CMAEvolutionStrategy(plain.plain, 0.5, options)
-    while not strategy.stop():
-        asked = np.array(strategy.ask())
-        asked[:, :2] = np.clip(asked[:, :2], -4.0, 4.0)
-        strategy.tell(list(asked), plain.losses(asked).tolist())
-    return np.asarray(strategy.result.xbest)
-
-
-FREQUENCY_STARTS = np.log(np.array([0.04, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5, 5.0, 10.0, 25.0]))
-"""Moduli over the guess from which scipy starts; fewer miss the right cycle more often."""
-
-
-def _peer_rows(seeds: int) -> Iterator[Measurement]:
-    cases = [draw_case(seed) for seed in range(seeds)]
-    tracks = [measure(case.truth, case.experiment) for case in cases]
-    peers: dict[str, Any] = {
-        "scipy, one start": lambda p, s: fit_by_scipy(p, p.plain[None]),
-        "scipy, 11 starts": lambda p, s: fit_by_scipy(p, _fan(p)),
-        "scipy, from our start values": lambda p, s: fit_by_scipy(p, p.good[None]),
-        "CMA-ES": fit_by_cma,
-    }
-    for case, track in zip(cases[:1], tracks[:1], strict=True):  # loads every kernel
-        tune(case.guess, track)
-    ours, seconds, good = [], {name: [] for name in peers}, dict.fromkeys(peers, 0)
-    for seed, (case, track) in enumerate(zip(cases, tracks, strict=True)):
-        begun = time.perf_counter()
-        tune(case.guess, track)
-        ours.append(time.perf_counter() - begun)
-        plain = PlainProblem(case, track)
-        plain.losses(plain.plain[None])
-        for name, peer in peers.items():
-            begun = time.perf_counter()
-            found = peer(plain, seed)
-            seconds[name].append(time.perf_counter() - begun)
-            value = case.guess.modulus.value * math.exp(found[0])
-            good[name] += abs(value / case.truth.modulus.value - 1.0) < MODULUS_BAR
-    mine = float(np.median(ours))
-    for name in peers:
-        theirs = float(np.median(seconds[name]))
-        case_name = f"fit of 3 s ({name}: {good[name]} of {seeds} right)"
-        yield Measurement("tune", case_name, mine, "s", name, theirs, theirs / mine)
-
-
-def _fan(plain: PlainProblem) -> np.ndarray:
-    starts = np.repeat(plain.plain[None], len(FREQUENCY_STARTS), 0)
-    starts[:, 0] = FREQUENCY_STARTS
-    return starts
-
-
-def _recovery_rows(name: str, found: Recovery) -> Iterator[Measurement]:
+def recovery_rows(name: str, found: Recovery) -> Iterator[Measurement]:
     yield Measurement("tune", f"{name}: modulus, largest error", 100.0 * float(np.abs(found.modulus_error).max()), "%")
     yield Measurement("tune", f"{name}: damping, largest error", 100.0 * float(np.abs(found.damping_error).max()), "%")
     for i, part in enumerate(("modulus", "damping")):
@@ -271,9 +127,11 @@ def _recovery_rows(name: str, found: Recovery) -> Iterator[Measurement]:
 
 
 def tuning(seeds: int = SEEDS) -> Iterator[Measurement]:
-    """Recovery over seeds, from vinesim's and from MuJoCo's tracks; wall time beside scipy and CMA-ES."""
+    """Recovery over seeds, from vinesim's and from MuJoCo's tracks; CPU time and calibration beside peers."""
     cases = [draw_case(seed) for seed in range(seeds)]
-    yield from _recovery_rows(f"{seeds} seeds", recover(cases))
+    tracks = [measure(case.truth, case.experiment) for case in cases]
+    yield from recovery_rows(f"{seeds} seeds", recover(cases, tracks))
     few = cases[: min(MUJOCO_SEEDS, seeds)]
-    yield from _recovery_rows(f"{len(few)} tracks of MuJoCo", recover(few, [mujoco_track(case) for case in few]))
-    yield from _peer_rows(min(SPEED_SEEDS, seeds))
+    yield from recovery_rows(f"{len(few)} tracks of MuJoCo", recover(few, [mujoco_track(case) for case in few]))
+    yield from peer_rows(cases[:SPEED_SEEDS], tracks[:SPEED_SEEDS])
+    yield from stein_rows(cases[:STEIN_SEEDS], tracks[:STEIN_SEEDS])

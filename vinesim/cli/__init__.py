@@ -24,7 +24,7 @@ import typer
 from vinesim import allocator
 from vinesim.cli.commands.client import client
 from vinesim.cli.commands.demo import demo
-from vinesim.cli.commands.images import dataset, render, scene_show
+from vinesim.cli.commands.images import dataset, render, scene_import_plant, scene_show
 from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
 from vinesim.cli.commands.tools import bench, certs_new, doctor, ros_build_interfaces, ros_play, ros_record
@@ -44,6 +44,7 @@ app.add_typer(certs_app, name="certs")
 for command in (demo, server, client, record, replay, render, dataset, tune, experiment, bench, doctor):
     app.command()(command)
 scene_app.command("show")(scene_show)
+scene_app.command("import-plant")(scene_import_plant)
 ros_app.command("build-interfaces")(ros_build_interfaces)
 ros_app.command("record")(ros_record)
 ros_app.command("play")(ros_play)

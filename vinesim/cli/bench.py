@@ -133,6 +133,12 @@ def _page() -> Iterator[Measurement]:
     return page()
 
 
+def _voice() -> Iterator[Measurement]:
+    from vinesim.bench.voice_delay import voice
+
+    return voice()
+
+
 def _ros() -> Iterator[Measurement]:
     from vinesim.bench.ros_topics import ros
 
@@ -184,6 +190,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "live": _live,
     "ros": _ros,
     "page": _page,
+    "voice": _voice,
     "sound": _sound,
     "sync": _sync,
     "link": _link,

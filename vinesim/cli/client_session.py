@@ -136,7 +136,7 @@ class ClientSession:
             server = self.enter(PageServer(world, port, sound=sound))
         print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
         client.post_step.append(lambda _: world.collect(server))
-        client.faults_elsewhere.append(lambda: {"page_messages_refused": server.refused})
+        client.faults_elsewhere.append(lambda: {"page_messages_refused": server.refused_messages})
 
     def run(
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
@@ -224,7 +224,8 @@ def status_line(values: dict[str, Any]) -> str:
     return (
         f"{values['time']:7.1f} s  {values['tick_hz']:6.2f} Hz  p99 {values['tick_p99_ms']:5.2f} ms  "
         f"awake {values['awake']:3d}  force {values['force']:6.2f} N  "
-        f"dropped {values['frames_dropped']} frames {values['messages_dropped']} messages  "
+        f"dropped {values['frames_dropped']} frames {values['messages_dropped']} messages "
+        f"{values['sound_lost'] + values['sound_dropped']} of sound  "
         f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'no others'}"
         f"{'  FAULTS: ' if faults else ''}{faults}"
     )

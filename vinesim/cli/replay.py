@@ -21,8 +21,11 @@ from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_
 from vinesim.net.transport.endpoints import check_exposure
 
 if TYPE_CHECKING:
+    from vinesim.client.recording.page_replay import PageReplay
     from vinesim.client.recording.replay import ReplayBus
     from vinesim.client.spectator import Spectator
+    from vinesim.scene.model import Model
+    from vinesim.scene.spec import Scene
 
 POLL = 0.004
 """Between two looks at what is due [s]."""
@@ -30,13 +33,14 @@ POLL = 0.004
 
 def run(
     *, file: pathlib.Path, connect: str | None, listen: str | None, insecure: bool, world: str, speed: float,
-    start: float, end: float | None, out: pathlib.Path | None, ros: bool, pose: tuple[float, float, float] | None,
-    scene: str | None, seed: int | None,
+    start: float, end: float | None, out: pathlib.Path | None, page: int | None, ros: bool,
+    pose: tuple[float, float, float] | None, scene: str | None, seed: int | None,
 ) -> int:  # fmt: skip
     """Play a file; 0 when its end is reached, or on Ctrl-C."""
-    if sum(way is not None for way in (connect, listen, out)) + ros != 1:
+    if sum(way is not None for way in (connect, listen, out, page)) + ros != 1:
         raise UsageError(
-            "give one of --connect (play to a server), --listen (be one), --out (look at it) and --ros (publish topics)"
+            "give one of --connect (play to a server), --listen (be one), --page (look at it in a browser), --out (as "
+            "pictures) and --ros (publish topics)"
         )
     if listen is not None:
         check_exposure([listen], insecure=insecure)
@@ -52,6 +56,8 @@ def run(
     print(f"{file}: {len(tape.messages)} messages, {tape.length:.1f} s, {who}", file=sys.stderr, flush=True)
     if out is not None:
         return _look(tape, stop, out, pose, scene, seed, speed, start, end)
+    if page is not None:
+        return _show(tape, stop, page, pose, scene, seed, speed, start, end)
     if ros:
         return _publish(tape, stop, scene, seed, speed, start, end)
     return _tell(tape, stop, connect, listen, world, speed, start, end)
@@ -106,6 +112,46 @@ def _look(
     return 0
 
 
+def make_page_replay(
+    tape: Recording, pose: tuple[float, float, float] | None = None, scene: str | None = None, seed: int | None = None,
+    speed: float = 1.0, start: float = 0.0, end: float | None = None,
+) -> PageReplay:  # fmt: skip
+    """A recording for pages; arguments as of :func:`run`."""
+    from vinesim.client.recording.page_replay import PageReplay
+
+    plan, model = _vineyard(tape, scene, seed)
+
+    def make(begin: float, eyes: np.ndarray | None) -> tuple[Spectator, ReplayBus]:
+        return _spectator_in(tape, plan, model, _eyes(tape, pose) if eyes is None else eyes, begin, end)
+
+    return PageReplay(make, tape.length if end is None else min(end, tape.length), start, speed)
+
+
+def _show(
+    tape: Recording, stop: threading.Event, port: int, pose: tuple[float, float, float] | None, scene: str | None,
+    seed: int | None, speed: float, start: float, end: float | None,
+) -> int:  # fmt: skip
+    """Play to a spectator in this process and show it in browsers, which pause it and go to other times."""
+    from vinesim.web import page_files
+
+    page_files.check()
+    from vinesim.client.rate_loop import RateLoop
+    from vinesim.web.page_server import PageServer
+
+    replay = make_page_replay(tape, pose, scene, seed, speed, start, end)
+    with PageServer(replay.world, port) as server:
+        print(f"the recording in a browser: {server.address}", file=sys.stderr, flush=True)
+        loop, was_playing = RateLoop(replay.dt), True
+        while not stop.is_set():
+            if not was_playing:
+                stop.wait(POLL)
+                loop = RateLoop(loop.dt)
+            loop.begin()
+            was_playing = replay.step(server)
+            loop.end()
+    return 0
+
+
 def _publish(
     tape: Recording, stop: threading.Event, scene: str | None, seed: int | None, speed: float, start: float,
     end: float | None,
@@ -139,8 +185,12 @@ def _spectator(
     end: float | None,
 ) -> tuple[Spectator, ReplayBus]:  # fmt: skip
     """A spectator of a recording that stands at a ``pose``, unless given behind the first robot; and its bus."""
-    from vinesim.client.recording.replay import ReplayBus
-    from vinesim.client.spectator import Spectator, follow_view, standing_view
+    plan, model = _vineyard(tape, scene, seed)
+    return _spectator_in(tape, plan, model, _eyes(tape, pose), start, end)
+
+
+def _vineyard(tape: Recording, scene: str | None, seed: int | None) -> tuple[Scene, Model]:
+    """The scene that a recording is of, and its model."""
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import SceneError, load_scene, with_seed
 
@@ -159,7 +209,23 @@ def _spectator(
             f"{tape.path} is of scene {tape.metadata.get('scene', '?')!r} with digest {digest}, "
             f"{plan.name!r} with seed {plan.seed} has {model.digest()}: give its --scene and --seed"
         )
-    eyes = standing_view(*pose) if pose is not None else follow_view(_first_pose(tape))
+    return plan, model
+
+
+def _eyes(tape: Recording, pose: tuple[float, float, float] | None) -> np.ndarray:
+    """Pose [7] of eyes that stand at a ``pose``, unless given behind the first robot."""
+    from vinesim.client.spectator import follow_view, standing_view
+
+    return standing_view(*pose) if pose is not None else follow_view(_first_pose(tape))
+
+
+def _spectator_in(
+    tape: Recording, plan: Scene, model: Model, eyes: np.ndarray, start: float, end: float | None
+) -> tuple[Spectator, ReplayBus]:  # fmt: skip
+    """A spectator at a time of a recording, and its bus."""
+    from vinesim.client.recording.replay import ReplayBus
+    from vinesim.client.spectator import Spectator
+
     bus = ReplayBus(tape, "spectator", start=start, end=end)
     return Spectator(plan, model, None, bus, name="spectator", pose=eyes, clock=lambda: bus.time), bus
 

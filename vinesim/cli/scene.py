@@ -3,16 +3,42 @@
 from __future__ import annotations
 
 import pathlib
+from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from vinesim import frames
 from vinesim.errors import WriteError
 from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.plant_import.imported_plant import import_plant
+from vinesim.scene.plant_import.wood import build_model
+from vinesim.scene.plant_parameters import load_plant
 from vinesim.scene.spec import load_scene, with_seed
 from vinesim.scene.summary import summary_rows as rows_of
 from vinesim.sensors.export.images import render_overview
 from vinesim.sensors.scene.primitives import rest_snapshot
+
+
+def write_imported_plant(file: pathlib.Path, out: pathlib.Path | None, **options: Any) -> int:
+    """Read another program's plant, write it as TOML, and print what it has and what was filled; the exit code."""
+    plant = import_plant(file, **options)
+    target = out or pathlib.Path(f"{file.stem}.toml")
+    plant.write(target)
+    model = build_model(plant, frames.pose(np.zeros(3)), 0, load_plant(options["plants"]), 0)
+    counts = model.counts()
+    print(f"read     {plant.source}: {len(plant.nodes)} points, {len(plant.bunches)} bunches")
+    print(
+        f"moves    {counts['tree']} trees of {counts['body']} bodies, {model.body_mass.sum():.3g} kg; "
+        f"{counts['fixed']} pieces of wood thicker than {1e3 * plant.wood.old_wood.value:.4g} mm stand still"
+    )
+    for note in plant.notes:
+        print(f"note     {note}")
+    moduli = "moduli, density, damping and drag of wood"
+    print(f"filled   {moduli}; diameters of {len(plant.filled)} points; from {options['plants']!r}, marked in the file")
+    print(f"written  {target}; a scene loads it with [[imported]] file = {target.name!r}")
+    return 0
 
 
 def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:

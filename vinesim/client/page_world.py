@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.static_primitives import row_layout
 from vinesim.sensors.scheduler import load_kernels
 from vinesim.web import array_message
-from vinesim.web.page_input import PageInput, TrackedPerson
+from vinesim.web.page_input import PageInput, ReplayCommand, TrackedPerson
 from vinesim.web.page_server import PageServer
 
 GRASS = 25.0
@@ -35,6 +35,18 @@ _TURN_STEPS = 32767
 """Steps of a component of a quaternion from 0 to 1."""
 
 
+class Replay(Protocol):
+    """A recording that is played for pages."""
+
+    def status(self) -> dict[str, float | bool]:
+        """What pages are told with every state."""
+        ...
+
+    def take(self, command: ReplayCommand) -> None:
+        """What a page asks for; called in the server's thread."""
+        ...
+
+
 class PageWorld:
     """The world of one client as its pages see it. The client's loop writes it, the server's thread reads it.
 
@@ -42,10 +54,16 @@ class PageWorld:
     tick each tree has last moved; a page is sent the trees that have moved since the last state that was sent to it.
     """
 
-    def __init__(self, client: Client, person: TrackedHuman | None = None, most: int = MAX_PRIMITIVES) -> None:
+    def __init__(
+        self, client: Client, person: TrackedHuman | None = None, most: int = MAX_PRIMITIVES,
+        replay: Replay | None = None,
+    ) -> None:  # fmt: skip
         """``person``: the source of the client's own human, whom the first page moves; ``most``: primitives of plants
-        and ground that a page loads, those nearest to where it looks from at first."""
-        self._client, self._person, self._most = client, person, most
+        and ground that a page loads, those nearest to where it looks from at first; ``replay``: the recording that the
+        client is in, if it is in one."""
+        self._client, self._person, self._most, self._replay = client, person, most, replay
+        self._ticks_before = 0
+        """Of earlier clients, so that ticks of states rise: see :meth:`show`."""
         self._at_rest = client.physics.snapshot().body_q.copy()
         self._moved_at = np.full(len(client.model.tree_first), -1)
         """[tree] tick"""
@@ -53,7 +71,7 @@ class PageWorld:
         self._primitives: Primitives | None = None
         """None until a page asks."""
         self._lock = threading.Lock()
-        self._snapshot: Snapshot | None = None
+        self._snapshot: tuple[int, Snapshot] | None = None
         self._rigid_version, self._rigid = 0, b""
         self._lamps: dict[str, np.ndarray] = {}
         """Rows of primitives that have shone, counted from those of the rigid bodies; their surfaces and materials."""
@@ -77,10 +95,28 @@ class PageWorld:
 
     # ------------------------------------------------------------------ in the client's loop
 
-    def collect(self, server: PageServer) -> None:
-        """After a step: note what has moved, take a snapshot if a page looks, and lead a spectator's eyes there."""
+    def show(self, client: Client) -> None:
+        """From now on show another client of the same vineyard, at another time of it: all trees are told anew."""
+        with self._lock:
+            self._ticks_before += self._client.physics.tick + 1
+            self._client, self._snapshot = client, None
+            self._moved_at[self._moved_at >= 0] = self._tick
+        client.after_reset.append(self._follow_reset)
+        self._visuals = None
+        if self._sway is not None:
+            self._sway = Sway(client.model)
+
+    @property
+    def _tick(self) -> int:
+        """Tick of the newest state for pages."""
+        return self._client.physics.tick + self._ticks_before
+
+    def collect(self, server: PageServer, *, again: bool = False) -> None:
+        """After a step: note what has moved, take a snapshot if a page looks, and lead a spectator's eyes there.
+        ``again``: there was no step, but something else that pages are told of."""
         physics = self._client.physics
-        self._moved_at[physics.plants.awake] = physics.tick
+        self._ticks_before += again
+        self._moved_at[physics.plants.awake] = self._tick
         if self._eyes is not None and isinstance(self._client, Spectator):
             self._client.pose = self._eyes
         if self._person is not None:
@@ -94,8 +130,8 @@ class PageWorld:
             return
         self._contacts = physics.contacts if self._overlay_pages else ()
         snapshot = physics.snapshot()
-        swayed = self._sway.apply(snapshot, np.flatnonzero(self._moved_at == physics.tick))
-        self._moved_at[swayed.moved_trees] = physics.tick
+        swayed = self._sway.apply(snapshot, np.flatnonzero(self._moved_at == self._tick))
+        self._moved_at[swayed.moved_trees] = self._tick
         if self._person is not None:
             hands = [physics.hand(self._client.name, side) for side in SIDES]
             self._hands = {
@@ -103,12 +139,12 @@ class PageWorld:
                 "hand_controller": np.array([hand.controller for hand in hands], np.float32),
             }
         with self._lock:
-            self._snapshot = swayed
+            self._snapshot = self._tick, swayed
         server.notify()
 
     def _follow_reset(self) -> None:
         """All trees are at rest again: pages are told of those that had moved."""
-        self._moved_at[self._moved_at >= 0] = self._client.physics.tick + 1
+        self._moved_at[self._moved_at >= 0] = self._tick + 1
         if self._sway is not None:
             self._sway = Sway(self._client.model)
 
@@ -133,6 +169,7 @@ class PageWorld:
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
                 "person": None if self._person is None else self._client.name,
+                "replay": None if self._replay is None else self._replay.status(),
                 "intentions": [] if self._person is None else list(INTENTIONS[1:]),
                 "gestures": {} if self._person is None else dict(self._person.gestures.poses),
                 "buttons": {} if self._person is None else dict(self._person.gestures.buttons),
@@ -152,18 +189,21 @@ class PageWorld:
     def state(self, since: int) -> tuple[int, bytes] | None:
         """Bodies of the trees that have moved after the tick ``since``, all rigid bodies, and what was picked."""
         with self._lock:
-            snapshot = self._snapshot
-        if snapshot is None or self._primitives is None or snapshot.tick <= since:
+            newest = self._snapshot
+        if newest is None or self._primitives is None or newest[0] <= since:
             return None
+        tick, snapshot = newest
         if snapshot.visuals is not self._visuals:
             self._follow_visuals(self._primitives, snapshot)
         body = self._bodies(np.flatnonzero(self._moved_at > since))
         pose, rigid = snapshot.body_q[body], np.asarray(snapshot.visual_q).reshape(-1, 7)
         haptics, self._haptics = self._haptics, {}
-        shown = {"owners": page_overlays.owners(self._client)} if self._overlay_pages else {}
+        shown: dict[str, Any] = {"owners": page_overlays.owners(self._client)} if self._overlay_pages else {}
+        if self._replay is not None:
+            shown["replay"] = self._replay.status()
         state = array_message.encode(
             {
-                **shown, "tick": snapshot.tick, "time": snapshot.time, "rigid": self._rigid_version,
+                **shown, "tick": tick, "time": snapshot.time, "rigid": self._rigid_version,
                 "haptics": {hand: [one.amplitude, one.duration] for hand, one in haptics.items()},
             },
             {
@@ -173,7 +213,7 @@ class PageWorld:
                 **self._hands, **page_overlays.contact_arrays(self._contacts),
             },
         )  # fmt: skip
-        return snapshot.tick, state
+        return tick, state
 
     def _follow_visuals(self, primitives: Primitives, snapshot: Snapshot) -> None:
         """Lay the rigid bodies out for pages, unless only lights have changed: those are part of every state."""
@@ -203,6 +243,8 @@ class PageWorld:
     def take(self, page: int, said: PageInput) -> None:
         """Take over where a page looks from and what its person does; only the first page's."""
         (self._overlay_pages.add if said.overlays else self._overlay_pages.discard)(page)
+        if said.replay is not None and self._replay is not None:
+            self._replay.take(said.replay)
         if self._driver is None:
             self._driver = page
         if page != self._driver:

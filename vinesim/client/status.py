@@ -14,8 +14,8 @@ from vinesim.client.recording.bunch_trace import touch_to_motion
 from vinesim.robot.tasks.task import Task
 
 _WITHOUT_SENSORS = {
-    "sensors_ready": True, "sensors_awaited": [], "frames_dropped": 0, "messages_dropped": 0, "sensor_restarts": 0,
-    "ros_restarts": 0, "sensor_restart_s": 0.0, "processes": {},
+    "sensors_ready": True, "sensors_awaited": [], "frames_dropped": 0, "messages_dropped": 0, "sound_lost": 0,
+    "sensor_restarts": 0, "ros_restarts": 0, "sensor_restart_s": 0.0, "processes": {},
 }  # fmt: skip
 """Status of sensors of a client that has none."""
 
@@ -77,6 +77,7 @@ class Status:
             "environment_bytes_out": traffic.environment.bytes_out,
             "faults": faults,
             "recent_faults": recent_faults,
+            "sound_dropped": client.sound.dropped,
             "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "phase": "" if self._task is None else self._task.phase,
             "others": sorted(client.remote_actors),

@@ -23,11 +23,13 @@ from vinesim.ros.publishers.clock import CLOCK, ClockPublisher
 from vinesim.ros.publishers.contacts import ContactPublisher
 from vinesim.ros.publishers.control import ControlPublisher
 from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
+from vinesim.ros.publishers.lights import LightsPublisher
 from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
 from vinesim.ros.publishers.robot import RobotPublisher
 from vinesim.ros.publishers.sound import SoundPublisher
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage
 from vinesim.scene.values import ComponentStatus, ControllerSpec, Intention, RobotSample
+from vinesim.scene.values.signals import Color
 
 FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
@@ -83,6 +85,7 @@ class RobotNode(Node):
         self._sound = SoundPublisher(self._advertise)
         self._send(self._sound.pending_info(), always=True)
         self._intentions = self._advertise(String, "human_intention", TRANSIENT_LOCAL)
+        self._lights = LightsPublisher(self._advertise, self._urdf)
         self._diagnostics = self._advertise(DiagnosticArray, "/diagnostics", RELIABLE)
         self._proprioception = ProprioceptionPublisher(self._advertise, self._imus, self._wrenches)
         self._control = ControlPublisher(self._advertise, self._controllers)
@@ -162,6 +165,10 @@ class RobotNode(Node):
     def publish_intentions(self, intentions: Sequence[Intention]) -> None:
         """Publish what people indicate, when it changes; late subscribers receive the last message, too."""
         self._send([(self._intentions, lambda: convert.intentions(intentions))], always=True)
+
+    def publish_lights(self, color: Color | None) -> None:
+        """Publish what the indicator lights show, when it changes: UNLIT between flashes, None when they are off."""
+        self._send(self._lights.pending(color), always=True)
 
     def publish_sound(self, time: float, pcm: bytes) -> None:
         """Publish what the microphone recorded from ``time`` [s] of the world on: PCM16 of 16 kHz, mono."""

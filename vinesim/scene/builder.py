@@ -454,7 +454,7 @@ def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
             parent = i - 1 if body["parent"] is None else body["parent"]
             model.body_tree[at] = number
             model.body_parent[at] = first + parent if parent >= 0 else -1
-            for key in ("organ", "offset", "rest", "mass", "com", "inertia", "length", "radius"):
+            for key in ("organ", "offset", "rest", "mass", "com", "inertia", "length", "radius", "drag"):
                 if key in body:
                     getattr(model, f"body_{key}")[at] = body[key]
             for key in ("stiffness", "damping", "settled"):

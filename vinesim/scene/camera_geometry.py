@@ -1,4 +1,4 @@
-"""Pinhole geometry of pictures: intrinsic matrix, rays of pixels, projection, depth in millimetres, coloured points."""
+"""Geometry of pictures: intrinsic matrix, rays of pixels, projection, depth in millimetres, coloured points."""
 
 from __future__ import annotations
 
@@ -6,12 +6,9 @@ import functools
 
 import numpy as np
 
+from vinesim.scene import lens_distortion
 from vinesim.scene.values import CameraFrame, CameraInfo
 
-DISTORTION_MODEL = "plumb_bob"
-"""Of sensor_msgs/CameraInfo."""
-DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
-"""Coefficients k1 k2 t1 t2 k3 of that model: pictures are not distorted."""
 MAX_MILLIMETRES = 65535.5
 """From this depth [mm] on 16 bits cannot hold it."""
 POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
@@ -23,19 +20,35 @@ def intrinsic_matrix(info: CameraInfo) -> list[float]:
     return [info.fx, 0.0, info.cx, 0.0, info.fy, info.cy, 0.0, 0.0, 1.0]
 
 
+def distortion_model(info: CameraInfo) -> tuple[str, tuple[float, ...]]:
+    """Name of the model of distortion and its coefficients D, as sensor_msgs/CameraInfo has them."""
+    coefficients = info.distortion or lens_distortion.NONE
+    return lens_distortion.MODELS[len(coefficients)], coefficients
+
+
 @functools.lru_cache(maxsize=16)
 def pixel_rays(info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
-    """x per z of every column [width] and y per z of every row [height], float32; pixel centres are whole numbers."""
-    across = (np.arange(info.width, dtype=np.float32) - np.float32(info.cx)) / np.float32(info.fx)
-    down = (np.arange(info.height, dtype=np.float32) - np.float32(info.cy)) / np.float32(info.fy)
-    return across, down
+    """x per z and y per z of pixels, float32, to be broadcast: [1, width] and [height, 1] of a pinhole.
+
+    Of a lens with distortion both are [height, width]. Pixel centres are whole numbers.
+    """
+    across = (np.arange(info.width, dtype=np.float32)[None] - np.float32(info.cx)) / np.float32(info.fx)
+    down = (np.arange(info.height, dtype=np.float32)[:, None] - np.float32(info.cy)) / np.float32(info.fy)
+    if not info.distortion:
+        return across, down
+    rays = lens_distortion.undistort(np.stack(np.broadcast_arrays(across, down), -1), info.distortion)
+    return rays[..., 0].astype(np.float32), rays[..., 1].astype(np.float32)
 
 
 def project_points(points: np.ndarray, info: CameraInfo) -> np.ndarray:
     """Pixels [..., 2] (column, row) of points [..., 3] m in the optical frame; NaN behind the camera."""
     points = np.asarray(points, float)
     z = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
-    return np.stack([points[..., 0] / z * info.fx + info.cx, points[..., 1] / z * info.fy + info.cy], -1)
+    across, down = points[..., 0] / z, points[..., 1] / z
+    if info.distortion:
+        bent = lens_distortion.distort(np.stack([across, down], -1), info.distortion)
+        across, down = bent[..., 0], bent[..., 1]
+    return np.stack([across * info.fx + info.cx, down * info.fy + info.cy], -1)
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
@@ -50,7 +63,7 @@ def write_points(frame: CameraFrame, points_out: np.ndarray) -> None:
     depth = np.where(np.isfinite(frame.depth), frame.depth, np.float32(np.nan))
     across, down = pixel_rays(frame.info)
     np.multiply(depth, across, out=points_out["x"])
-    np.multiply(depth, down[:, None], out=points_out["y"])
+    np.multiply(depth, down, out=points_out["y"])
     points_out["z"] = depth
     red, green, blue = (frame.rgb[..., i].astype(np.uint32) for i in range(3))
     points_out["rgb"] = red << 16 | green << 8 | blue

@@ -16,6 +16,7 @@ from vinesim.scene import plant_parameters
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.data_files import DataFileNotFound, find_data_file
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.plant_import.imported_plant import load_imported_plant
 from vinesim.scene.toml_loader import DataError, load_toml
 
 MAX_ROBOTS = 10
@@ -131,6 +132,18 @@ class Spawn(_Part, frozen=True, kw_only=True):
     yaw: float = 0.0
 
 
+class Imported(_Part, frozen=True, kw_only=True):
+    """A plant that another program has grown, and where it stands."""
+
+    file: str
+    """Written by ``vinesim scene import-plant``; looked for beside the scene file first."""
+    x: float
+    y: float
+    z: float = 0.0
+    """[m] Of its base above the ground."""
+    yaw: float = 0.0
+
+
 class Scene(_Part, frozen=True, kw_only=True):
     """One vineyard as its file describes it."""
 
@@ -144,6 +157,7 @@ class Scene(_Part, frozen=True, kw_only=True):
     season: Season = Season()
     fruit: Fruit
     boxes: tuple[Box, ...] = ()
+    imported: tuple[Imported, ...] = ()
     sun: Sun = Sun()
     wind: Wind = Wind()
     spawns: tuple[Spawn, ...] = ()
@@ -161,10 +175,17 @@ def load_scene(path_or_name: str | pathlib.Path, seed: int | None = None) -> Sce
     except DataFileNotFound as missing:
         raise SceneError(str(missing)) from None
     scene = load_toml(path, Scene, SceneError)
+    beside = [msgspec.structs.replace(one, file=str(_beside(path, one.file))) for one in scene.imported]
+    scene = msgspec.structs.replace(scene, imported=tuple(beside))
     trouble = _find_error(scene)
     if trouble:
         raise SceneError(f"{path}: {trouble}")
     return with_seed(scene, seed)
+
+
+def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:
+    """A file that a scene names: beside the scene, or where its path leads from here."""
+    return near if (near := scene.parent / file).is_file() else pathlib.Path(file)
 
 
 def _find_error(scene: Scene) -> str:
@@ -182,6 +203,11 @@ def _find_error(scene: Scene) -> str:
         plant_parameters.load_plant(scene.plants)
     except (DataFileNotFound, DataError) as bad:
         return f"plants is {scene.plants!r}; {bad}"
+    for i, one in enumerate(scene.imported):
+        try:
+            load_imported_plant(one.file)
+        except DataError as bad:
+            return f"imported[{i}].file: {bad}"
     names = [s.name for s in scene.spawns]
     for i, name in enumerate(names):
         if name in names[:i]:

@@ -13,8 +13,8 @@ from vinesim.scene.spec import Scene
 def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
     """Rows of (quantity, value, unit)."""
     counts, layout = model.counts(), scene.layout
-    vines = layout.rows * layout.vines
-    ground = vines * layout.row_spacing * layout.vine_spacing
+    grown = layout.rows * layout.vines
+    ground, vines = grown * layout.row_spacing * layout.vine_spacing, grown + len(scene.imported)
     bent = np.linalg.norm(frames.log(model.joint_settled.astype(float)), axis=1)
     memory = sum(getattr(model, name).nbytes for name in model.array_fields())
     fruit = model.body_mass[model.bunch_body].sum()

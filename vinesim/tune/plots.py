@@ -13,20 +13,27 @@ from vinesim.errors import writing
 from vinesim.tune.fit import Fit
 from vinesim.tune.posterior import Z90
 
+SIZE = (11.0, 4.6)
+"""[inch] Width and height of :func:`draw_fit`."""
 _ORDER = ("modulus", "damping", "mass")
 
 
 def plot_fit(fit: Fit, path: str | pathlib.Path) -> None:
     """Draw track, residuals and posterior into a file."""
-    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    figure = Figure(figsize=SIZE, layout="constrained")
+    draw_fit(fit, figure)
+    with writing(path):
+        figure.savefig(path, dpi=130)
+
+
+def draw_fit(fit: Fit, figure: Figure) -> None:
+    """Track, residuals, and posterior beside prior: all that a fit shows, in one figure of about :data:`SIZE`."""
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.3, 1.0])[0]
     above, below = left.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.0])
     draw_track(fit, above)
     draw_residuals(fit, below)
     count = max(fit.posterior.physical, 1)
     draw_posterior(fit, right.subplots(count, count, squeeze=False))
-    with writing(path):
-        figure.savefig(path, dpi=130)
 
 
 def strongest_column(fit: Fit) -> int:

@@ -34,6 +34,15 @@ class TrackedPerson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the person indicates to do; empty: nothing."""
 
 
+class ReplayCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a page wants a recording to be played."""
+
+    paused: bool
+    speed: Annotated[float, msgspec.Meta(ge=0.05, le=20.0)]
+    seek: Annotated[float, msgspec.Meta(ge=0.0, le=1e7)] | None = None
+    """[s] since its beginning; None: go on where it is."""
+
+
 class PageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One message of a page."""
 
@@ -43,6 +52,8 @@ class PageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     person: TrackedPerson | None = None
     overlays: bool = False
     """Whether it shows contact forces or owners."""
+    replay: ReplayCommand | None = None
+    """Only in pages of a recording, when the user has asked for something."""
 
     def poses(self) -> list[Pose]:
         """All poses in it."""

@@ -19,6 +19,7 @@ from aiohttp import WSMsgType, web
 
 from vinesim.errors import UsageError
 from vinesim.web import page_files
+from vinesim.web.https_site import HttpsSite
 from vinesim.web.page_files import PAGE
 from vinesim.web.page_input import PageInput, decode_input
 from vinesim.web.voice_socket import Sound, VoiceSocket
@@ -29,6 +30,8 @@ WINDOW = 2
 """States in flight to one page. Without a limit a page on a busy machine was 0.4 to 1 s behind."""
 _MAX_INPUT = 8192
 """Longest message of a page [B]."""
+_NEEDS_HTTPS = "this page needs https: open the address that the client has printed, with https:// and its token"
+"""For who opens it by plain http."""
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _POLICY = "; ".join(
     (
@@ -104,6 +107,11 @@ class PageServer:
         """Whether any page is connected."""
         return bool(self._fresh)
 
+    @property
+    def refused_messages(self) -> int:
+        """Messages of pages, and frames of their sound, that were none or too many."""
+        return self.refused + (0 if self.voice is None else self.voice.refused)
+
     def notify(self) -> None:
         """A new state is there. Called in the loop of the client; does not wait."""
         if self._fresh:
@@ -141,12 +149,17 @@ class PageServer:
         if self.voice is not None:
             app.router.add_get("/voice", self.voice.serve)
         app.router.add_static("/", PAGE)
+        site: HttpsSite | None = None
         runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
         await runner.setup()
         try:
-            site = web.TCPSite(runner, self._host, self._asked, ssl_context=self._tls)
-            await site.start()
-            self.port = runner.addresses[0][1]
+            if self._tls is None:
+                await web.TCPSite(runner, self._host, self._asked).start()
+                self.port = runner.addresses[0][1]
+            else:
+                assert runner.server is not None
+                site = HttpsSite(runner.server, self._tls, _NEEDS_HTTPS)
+                self.port = site.listen(self._host, self._asked)
             self._started.set()
             await self._stopping.wait()
         except OSError as failure:
@@ -156,6 +169,8 @@ class PageServer:
                 event.set()
             if self.voice is not None:
                 await self.voice.close()
+            if site is not None:
+                await site.close()
             await runner.cleanup()
 
     def _wake(self) -> None:

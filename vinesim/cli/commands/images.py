@@ -27,6 +27,38 @@ def scene_show(
     raise typer.Exit(show(file, seed, out))
 
 
+def scene_import_plant(
+    file: Annotated[
+        pathlib.Path, typer.Argument(help="MTG (.mtg), PLY skeleton (.ply), cylinders (.txt) or Helios XML (.xml).")
+    ],
+    out: Annotated[pathlib.Path | None, typer.Option(help="TOML file to write; NAME.toml unless given.")] = None,
+    unit: Annotated[str, typer.Option(help="Of coordinates: m, cm or mm.")] = "m",
+    diameter_unit: Annotated[str | None, typer.Option(help="Of diameters and radii; as --unit unless given.")] = None,
+    plants: Annotated[str, typer.Option(help="Plant parameters from which missing numbers are filled.")] = "vine",
+    slack: Annotated[
+        bool, typer.Option("--slack", help="The file shows the plant without its weight: it will sag.")
+    ] = False,
+    piece: Annotated[float, typer.Option(help="Length of the rigid bodies that wood is cut into [m].")] = 0.06,
+    old_wood: Annotated[
+        float | None, typer.Option(help="Wood thicker than this [m] stands still; 0.01575 with vine's parameters.")
+    ] = None,
+) -> None:
+    """Make a plant that another program has grown one that scenes load, with wood; fill what is missing, and mark it.
+
+    \b
+    Examples:
+      vinesim scene import-plant examples/plants/vine.mtg
+      vinesim scene import-plant tree.ply --unit cm --out tree.toml --slack
+    """
+    from vinesim.cli.scene import write_imported_plant
+
+    code = write_imported_plant(
+        file, out, unit=unit, diameter_unit=diameter_unit, plants=plants, shape="slack" if slack else "drawn",
+        piece=piece, old_wood=old_wood,
+    )  # fmt: skip
+    raise typer.Exit(code)
+
+
 def render(
     scene: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
     at: Annotated[str | None, typer.Option(help="Position of the camera, X,Y,Z [m].")] = None,

@@ -55,20 +55,25 @@ def replay(
     out: Annotated[
         pathlib.Path | None, typer.Option(help="Render it: folder for a picture a second, without any server.")
     ] = None,
+    page: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="Show it in a browser, with a timeline: port on this machine, 0: any."),
+    ] = None,
     ros: Annotated[bool, typer.Option("--ros", help="Publish it as ROS 2 topics, without any server.")] = False,
     pose: Annotated[
         Pose | None,
-        typer.Option(help="With --out: look from X Y [m] along YAW [rad]; unless given, follow a robot."),
+        typer.Option(help="With --out and --page: look from X Y [m] along YAW [rad]; unless given, follow a robot."),
     ] = None,
     scene: Annotated[
-        str | None, typer.Option(help="With --out and --ros: its scene file, if it is none that ships.")
+        str | None, typer.Option(help="With --out, --page and --ros: its scene file, if it is none that ships.")
     ] = None,
     seed: Seed = None,
 ) -> None:
-    """Play a recording again: to a server's clients, as pictures, or as ROS topics.
+    """Play a recording again: to a server's clients, in a browser, as pictures, or as ROS topics.
 
     \b
     Examples:
+      vinesim replay run.mcap --page 8080
       vinesim replay run.mcap --out pictures
       vinesim replay run.mcap --ros
       vinesim replay run.mcap --connect tcp/127.0.0.1:7447 --from 20 --to 40

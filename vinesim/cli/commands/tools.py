@@ -32,12 +32,13 @@ def bench(
     simulated time). Of sensors: camera and lidar (speed),
     sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
     beside budgets). Of ROS: ros (topics of every step in another process, one subscriber stopped; actions). Of
-    browsers: page (input of a person to the state that shows it), sound (how
-    late alarms are seen and heard, and voices, in simulated time). Of the
+    browsers: page (input of a person to the state that shows it), voice (from the microphone of one browser to the
+    sound of another; needs Chromium), sound (how late alarms are seen and heard, and voices, in simulated time). Of the
     network: sync (what delay does, in simulated time), link (real clients over emulated links;
     needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz
     (broken messages and well-formed lies), kill (programs killed at random moments, while all others go on).
-    Of fits: tune (recovery over 50 seeds, MuJoCo as the truth; beside scipy and CMA-ES; needs scipy and cma).
+    Of fits: tune (recovery over 50 seeds, MuJoCo as the truth; beside scipy, CMA-ES, Stein particles;
+    needs scipy and cma).
     Of a long run: soak (memory, threads and open files of robots, people and a recorder; Linux).
 
     \b

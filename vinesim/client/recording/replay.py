@@ -152,6 +152,11 @@ class ReplayBus:
         return self._playhead.time
 
     @property
+    def start(self) -> float:
+        """Network time of the beginning of the recording [s]."""
+        return self._playhead.recording.start
+
+    @property
     def ended(self) -> bool:
         """Whether the end was reached."""
         return self._playhead.ended

@@ -92,6 +92,7 @@ class RobotProcesses:
             "sensors_awaited": awaited,
             "frames_dropped": sum(report["frames_dropped"].values()),
             "messages_dropped": sum(self.dropped_messages().values()),
+            "sound_lost": 0 if self.ros is None else self.ros.sound_lost,
             "sensor_restarts": report["sensor_restarts"],
             "ros_restarts": 0 if self.ros is None else self.ros.worker.restarts,
             "sensor_restart_s": self.sensors.worker.restart_time,

@@ -32,6 +32,7 @@ from vinesim.ros.commands.types import Command, GoalResult
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import ComponentStatus, JointReference, RigidVisual
+from vinesim.scene.values.signals import Color
 
 START_TIMEOUT = 120.0
 """How long the process may take to start; a first run builds message packages [s]."""
@@ -55,6 +56,7 @@ class RosProcess:
         self._sent_before: collections.Counter[str] = collections.Counter()
         self._dropped_before: collections.Counter[str] = collections.Counter()
         """Counts of the runs of the process before this one."""
+        self._sound_lost = self._sound_lost_before = 0
         self._contacts_left_out = 0
         self._is_restarted = False
         self._leads = clock
@@ -63,6 +65,8 @@ class RosProcess:
         self._intentions = IntentionLog()
         self._told_run: Run[RosChannel] | None = None
         """The run of the process that knows :attr:`_intentions`."""
+        self._told_lights: tuple[Run[RosChannel], Color | None] | None = None
+        """The run of the process that knows what the indicator lights show, and that."""
         poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
         fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
         self._records = StepRecords(name, description, series_stiffness(description.drives))
@@ -151,6 +155,7 @@ class RosProcess:
                     now = physics.time + client.world_time.offset
                     self._contacts_left_out += self._records.write(record, now, sample)
         self._tell_intentions(client)
+        self._tell_lights()
         truth_period = float(channel.wanted["truth_period"][0])
         if truth_period and physics.tick % max(round(truth_period / physics.dt), 1) == 0:
             self._write_truth(client)
@@ -164,6 +169,13 @@ class RosProcess:
         if has_changed or run is not self._told_run:
             self._told_run = run
             run.send("intentions", self._intentions.intentions)
+
+    def _tell_lights(self) -> None:
+        """Pass what the indicator lights show to the process when it changes, and to a new run."""
+        told = self.worker.current(), self.robot.shown_lights
+        if told != self._told_lights:
+            self._told_lights = told
+            told[0].send("lights", told[1])
 
     def _write_truth(self, client: Client) -> None:
         """Pass true poses to the process: of bunches, boxes and people."""
@@ -211,13 +223,14 @@ class RosProcess:
         elif kind == "simulation" and self._simulation is not None:
             self._simulation.put(value)
         elif kind == "statistics":
-            self._sent, self._dropped = value["sent"], value["dropped"]
+            self._sent, self._dropped, self._sound_lost = value["sent"], value["dropped"], value["sound_lost"]
         elif kind == "parameters":
             self._parameters.update(value)
         elif kind == "restarted":
             self._is_restarted = True
             self._sent_before.update(self._sent)
             self._dropped_before.update(self._dropped)
+            self._sound_lost_before, self._sound_lost = self.sound_lost, 0
             self._sent, self._dropped = dict.fromkeys(self._sent, 0), {}
 
     def sent_messages(self) -> dict[str, int]:
@@ -231,6 +244,11 @@ class RosProcess:
         dropped["vine/contacts"] += self._contacts_left_out
         dropped["tf_environment"] += self._missed_truth
         return dict(dropped)
+
+    @property
+    def sound_lost(self) -> int:
+        """Frames of voices that the microphone missed: lost on the network, too late, or not decoded."""
+        return self._sound_lost_before + self._sound_lost
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
         """Publish states of parts of the client on /diagnostics at simulation time ``time`` [s]."""

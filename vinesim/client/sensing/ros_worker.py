@@ -188,6 +188,8 @@ class RosWorker:
                 self._record(value)
             elif kind == "intentions":
                 self.node.publish_intentions(value)
+            elif kind == "lights":
+                self.node.publish_lights(value)
             elif kind == "truth":
                 self._rigid.take(value)
             elif kind == "finish":
@@ -236,7 +238,9 @@ class RosWorker:
             self._send_statistics()
 
     def _send_statistics(self) -> None:
-        statistics: dict[str, Any] = {"sent": self.node.sent, "dropped": self.node.dropped}
+        statistics: dict[str, Any] = {
+            "sent": self.node.sent, "dropped": self.node.dropped, "sound_lost": self._microphone.missed,
+        }  # fmt: skip
         self.pipe.send(("statistics", statistics))
 
 

@@ -1,7 +1,7 @@
 """The Delassus matrix A = J M^-1 J^T: how impulses of contacts change the velocities along their rows.
 
-For plants M^-1 is the impulse response of the articulation solver; for rigid bodies it comes from MuJoCo's sparse factor
-L^T D L of M^ (mass with implicit servos). Where active constraints bind a rigid body, the caller fills in its response.
+For plants M^-1 J^T comes from ``row_response``; for rigid bodies from MuJoCo's sparse factor L^T D L of M^ (mass with
+implicit servos). Where active constraints bind a rigid body, the caller fills in its response.
 
 Only the plants' part is assembled, a matrix for each block of contacts that plants couple. Rigid bodies couple blocks; what
 they add, J_r H^-1 J_r^T, has the rank of their degrees of freedom and stays in its factors: ``rigid_jacobian`` and
@@ -10,8 +10,8 @@ they add, J_r H^-1 J_r^T, has the rank of their degrees of freedom and stays in 
 
 import warp as wp
 
+from vinesim.kernels.contact.row_response import SideRows
 from vinesim.kernels.contact.structs import (
-    IS_CONSTRAINED,
     Contacts,
     Geoms,
     Islands,
@@ -60,108 +60,50 @@ def solve_rigid_row(
         response_out[row, i] = value
 
 
-@wp.func_native("""
-    const float* from = body_response.data + source;
-    double* to = response.data + target;
-    for (int i = 0; i < count; ++i) {
-        const double change = factor * from[i];
-        to[i] += change;
-    }
-""")
-def add_body_response(
-    response: wp.array2d(dtype=wp.float64),
-    target: int,
-    body_response: wp.array4d(dtype=float),
-    source: int,
-    count: int,
-    factor: wp.float64,
-):
-    """Add ``factor`` times ``count`` numbers of the body response, from ``source`` on, to a response from ``target`` on.
-
-    Both contiguous. Native, as Warp's loops over arrays in structs are not vectorised.
-    """
-    ...
-
-
-@wp.func
-def respond_within_tree(
-    row: int,
-    column: int,
-    slot: int,
-    touched: TouchedBodies,
-    plant_jacobian: wp.array2d(dtype=wp.float64),
-    body_response: wp.array4d(dtype=float),
-    response_out: wp.array2d(dtype=wp.float64),
-):
-    """Add to a row's response in one tree what its six entries from ``column`` on, of the body in ``slot``, give.
-
-    The body response is symmetric: what an impulse on one body gives all is read along its row, not down its column.
-    """
-    count = 6 * (touched.tree_end[slot] - touched.tree_start[slot])
-    for j in range(6):
-        source = (6 * slot + j) * 6 * body_response.shape[2]
-        factor = plant_jacobian[row, column + j]
-        add_body_response(response_out, row * response_out.shape[1], body_response, source, count, factor)
-
-
 @wp.kernel
-def inverse_mass_times_jacobian(
+def respond_rigidly(
     # model
     geoms: Geoms,
     # in
     rigid: RigidBodies,
     factors: RigidFactors,
     contacts: Contacts,
-    touched: TouchedBodies,
-    counters: wp.array(dtype=wp.int32),
-    body_response: wp.array4d(dtype=float),
     # out
     rows_out: Rows,
 ):
-    """One thread per row j: M^-1 j of the plant bodies in contact, and of one kinematic tree if it is unconstrained.
-
-    ``body_response`` [u, 6, t, 6]: change of velocity of plant body u in contact for a unit impulse on body t of its
-    tree. The rigid response was zeroed before.
-    """
+    """One thread per row j: M^-1 j of one kinematic tree of MuJoCo. The response was zeroed before."""
     row = wp.tid()
-    c = row // 3
-    slot = contacts.body_slot[c]
-    start = touched.tree_start[slot]
-    for k in range(6 * (touched.tree_end[slot] - start)):
-        rows_out.plant_response[row, k] = wp.float64(0.0)
-    respond_within_tree(row, 0, slot, touched, rows_out.plant_jacobian, body_response, rows_out.plant_response)
-    last_dof = int(-1)
-    if contacts.other[c] < 0:
-        other = contacts.other_slot[c]
-        if touched.tree_start[other] == start:
-            respond_within_tree(row, 6, other, touched, rows_out.plant_jacobian, body_response, rows_out.plant_response)
-        else:
-            for k in range(6 * (touched.tree_end[other] - touched.tree_start[other])):
-                rows_out.other_response[row, k] = wp.float64(0.0)
-            respond_within_tree(row, 6, other, touched, rows_out.plant_jacobian, body_response, rows_out.other_response)
-    else:
-        last_dof = geoms.dof[contacts.other[c]]
-    if last_dof >= 0 and counters[IS_CONSTRAINED] == 0:
-        solve_rigid_row(row, last_dof, rigid, factors, rows_out.rigid_jacobian, rows_out.rigid_response)
+    other = contacts.other[row // 3]
+    if other >= 0 and geoms.dof[other] >= 0:
+        solve_rigid_row(row, geoms.dof[other], rigid, factors, rows_out.rigid_jacobian, rows_out.rigid_response)
 
 
 @wp.func
-def body_velocity_along(
-    value: wp.float64, row: int, column: int, slot: int, source_row: int, source: int, contacts: Contacts,
-    touched: TouchedBodies, rows: Rows,
-):  # fmt: skip
-    """Add the velocity along six entries of ``row`` that a unit impulse along ``source_row`` gives the body in a slot.
+def side_slot(side: int, contacts: Contacts):
+    """Place of a side's body in the list of bodies in contact; -1 if the side is empty."""
+    slot = contacts.body_slot[side // 2]
+    if side % 2 == 1:
+        slot = contacts.other_slot[side // 2]
+    return slot
 
-    ``source``: the contact of ``source_row``.
+
+@wp.func
+def sides_entries(value: wp.mat33, side: int, source: int, contacts: Contacts, touched: TouchedBodies, sides: SideRows):
+    """Add the velocities along the rows of ``side`` that unit impulses along those of ``source`` give.
+
+    Of two sides the one whose body comes later in the list knows the response of the other's.
     """
-    start = touched.tree_start[slot]
-    at = 6 * (slot - start)
-    if touched.tree_start[contacts.body_slot[source]] == start:
-        for k in range(6):
-            value = value + rows.plant_jacobian[row, column + k] * rows.plant_response[source_row, at + k]
-    elif contacts.other[source] < 0 and touched.tree_start[contacts.other_slot[source]] == start:
-        for k in range(6):
-            value = value + rows.plant_jacobian[row, column + k] * rows.other_response[source_row, at + k]
+    slot = side_slot(side, contacts)
+    other = side_slot(source, contacts)
+    if slot >= 0 and other >= 0:
+        start = touched.tree_start[slot]
+        if touched.tree_start[other] == start:
+            if slot < other or (slot == other and side <= source):
+                value = value + wp.transpose(sides.force[side]) * sides.linear[source, slot - start]
+                value = value + wp.transpose(sides.moment[side]) * sides.angular[source, slot - start]
+            else:
+                value = value + wp.transpose(sides.linear[side, other - start]) * sides.force[source]
+                value = value + wp.transpose(sides.angular[side, other - start]) * sides.moment[source]
     return value
 
 
@@ -171,25 +113,27 @@ def assemble_delassus(
     contacts: Contacts,
     touched: TouchedBodies,
     islands: Islands,
+    sides: SideRows,
     # out
     rows_out: Rows,
 ):
-    """One thread per row: the plants' entries of J M^-1 J^T with all rows of its block."""
-    row = wp.tid()
-    c = row // 3
+    """One thread per contact: the plants' entries of J M^-1 J^T of its three rows with all rows of its block."""
+    c = wp.tid()
     block = contacts.block[c]
     first = islands.block_start[block]
     last = islands.block_start[block + 1]
-    at = islands.matrix_start[block] + (3 * (contacts.place[c] - first) + row % 3) * 3 * (last - first)
+    size = 3 * (last - first)
+    at = islands.matrix_start[block] + 3 * (contacts.place[c] - first) * size
+    is_pair = contacts.other_slot[c] >= 0
     for m in range(first, last):
         source = islands.contact[m]
-        for k in range(3):
-            column = 3 * source + k
-            value = body_velocity_along(
-                wp.float64(0.0), row, 0, contacts.body_slot[c], column, source, contacts, touched, rows_out
-            )  # fmt: skip
-            if contacts.other[c] < 0:
-                value = body_velocity_along(
-                    value, row, 6, contacts.other_slot[c], column, source, contacts, touched, rows_out
-                )  # fmt: skip
-            rows_out.delassus[at + 3 * (m - first) + k] = value
+        entries = sides_entries(wp.mat33(), 2 * c, 2 * source, contacts, touched, sides)
+        if contacts.other_slot[source] >= 0:
+            entries = sides_entries(entries, 2 * c, 2 * source + 1, contacts, touched, sides)
+        if is_pair:
+            entries = sides_entries(entries, 2 * c + 1, 2 * source, contacts, touched, sides)
+            if contacts.other_slot[source] >= 0:
+                entries = sides_entries(entries, 2 * c + 1, 2 * source + 1, contacts, touched, sides)
+        for r in range(3):
+            for k in range(3):
+                rows_out.delassus[at + r * size + 3 * (m - first) + k] = wp.float64(entries[r, k])

@@ -1,8 +1,9 @@
 """Distances: from points and segments to MuJoCo's primitives, and between two segments.
 
 A plant's capsule is a segment with a radius (a sphere when both ends agree); a rigid geom is one of MuJoCo's primitives.
-:func:`primitive_distance` gives distance and direction from a point to a primitive. Along a segment that distance is
-convex, so a bisection of its slope finds where the two are closest, for every kind of primitive alike.
+:func:`primitive_distance` gives distance and direction from a point to a primitive. Planes, spheres and capsules are
+closest to a segment where a formula says. Along a segment the distance from any primitive is convex, so of the others a
+bisection of its slope finds where they are closest.
 """
 
 import warp as wp
@@ -111,28 +112,46 @@ def ellipsoid_distance(size: wp.vec3d, p: wp.vec3d):
 
 
 @wp.func
+def round_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
+    """:func:`primitive_distance` of planes, spheres and capsules."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    q = wp.vec3d(p[0], p[1], p[2] - wp.clamp(p[2], -size[1], size[1]))
+    length = wp.length(q)
+    n = wp.vec3d(one, zero, zero)
+    if length > wp.float64(1.0e-12):
+        n = q / length
+    distance = length - size[0]
+    if kind == PLANE:
+        n = wp.vec3d(zero, zero, one)
+        distance = p[2]
+    return wp.vec4d(n[0], n[1], n[2], distance)
+
+
+@wp.func
 def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
     """Outward normal (0 to 2) and signed distance (3) [m] of a point from a primitive, in the primitive's frame.
 
     ``size`` is MuJoCo's ``geom_size``. Inside of an ellipsoid the distance is of first order, all else is exact.
     """
-    zero = wp.float64(0.0)
-    one = wp.float64(1.0)
-    tiny = wp.float64(1.0e-12)
-    if kind == PLANE:
-        return wp.vec4d(zero, zero, one, p[2])
-    if kind == SPHERE or kind == CAPSULE:
-        q = wp.vec3d(p[0], p[1], p[2] - wp.clamp(p[2], -size[1], size[1]))
-        length = wp.length(q)
-        n = wp.vec3d(one, zero, zero)
-        if length > tiny:
-            n = q / length
-        return wp.vec4d(n[0], n[1], n[2], length - size[0])
+    if kind == PLANE or kind == SPHERE or kind == CAPSULE:
+        return round_distance(kind, size, p)
     if kind == ELLIPSOID:
         return ellipsoid_distance(size, p)
     if kind == CYLINDER:
         return cylinder_distance(size, p)
     return box_distance(size, p)
+
+
+@wp.func
+def distance_of(is_round: bool, kind: int, size: wp.vec3d, p: wp.vec3d):
+    """:func:`primitive_distance`; ``is_round``: the kind is known to be one of :func:`round_distance`."""
+    found = wp.vec4d()
+    if is_round:
+        found = round_distance(kind, size, p)
+    else:
+        found = primitive_distance(kind, size, p)
+    return found
 
 
 @wp.func
@@ -143,8 +162,32 @@ def distance_slope(kind: int, size: wp.vec3d, p: wp.vec3d, direction: wp.vec3d):
 
 
 @wp.func
-def closest_on_segment(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """Where (0 to 1) on the segment from a to b the primitive is closest; the middle of all such places if many."""
+def closest_to_plane(a: wp.vec3d, b: wp.vec3d):
+    """Where (0 to 1) on the segment from a to b the plane z = 0 is closest; the middle if it is level."""
+    rise = b[2] - a[2]
+    flat = wp.float64(1.0e-9) * wp.length(b - a)
+    t = wp.float64(0.5)
+    if rise > flat or flat == wp.float64(0.0):
+        t = wp.float64(0.0)
+    elif rise < -flat:
+        t = wp.float64(1.0)
+    return t
+
+
+@wp.func
+def closest_to_axis(a: wp.vec3d, along: wp.vec3d):
+    """Where (0 to 1) on the segment from a along a vector the z axis is closest; its start if they are parallel."""
+    zero = wp.float64(0.0)
+    t = wp.float64(0.0)
+    across = along[0] * along[0] + along[1] * along[1]
+    if across > zero:
+        t = wp.clamp(-(a[0] * along[0] + a[1] * along[1]) / across, zero, wp.float64(1.0))
+    return t
+
+
+@wp.func
+def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
+    """:func:`closest_on_segment` of any kind of primitive; of the side of a cylinder by a formula."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     half = wp.float64(0.5)
@@ -159,13 +202,17 @@ def closest_on_segment(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
     # where the slope stops being negative, where it starts being positive
     low = zero
     high = one
-    for i in range(SLOPE_BISECTIONS):
-        middle = half * (low + high)
-        if distance_slope(kind, size, a + middle * along, along) < -flat:
-            low = middle
-        else:
-            high = middle
-    first = high
+    first = zero
+    if kind == CYLINDER:
+        first = closest_to_axis(a, along)
+    if kind != CYLINDER or wp.abs(distance_slope(kind, size, a + first * along, along)) > flat:
+        for i in range(SLOPE_BISECTIONS):
+            middle = half * (low + high)
+            if distance_slope(kind, size, a + middle * along, along) < -flat:
+                low = middle
+            else:
+                high = middle
+        first = high
     low = first
     high = one
     if distance_slope(kind, size, a + wp.min(first + wp.float64(1.0e-6), one) * along, along) > flat:
@@ -180,15 +227,46 @@ def closest_on_segment(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 
 @wp.func
+def closest_to_round(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
+    """:func:`closest_on_segment` of planes, spheres and capsules."""
+    t = wp.float64(0.0)
+    if kind == PLANE:
+        t = closest_to_plane(a, b)
+    else:
+        end = wp.vec3d(wp.float64(0.0), wp.float64(0.0), size[1])
+        found = segment_segment_distance(a, b, -end, end)
+        t = found[4]
+    return t
+
+
+@wp.func
+def closest_on_segment(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
+    """Where (0 to 1) on the segment from a to b the primitive is closest; the middle of all such places if many."""
+    t = wp.float64(0.0)
+    if kind == PLANE or kind == SPHERE or kind == CAPSULE:
+        t = closest_to_round(kind, size, a, b)
+    else:
+        t = closest_by_bisection(kind, size, a, b)
+    return t
+
+
+@wp.func
 def segment_primitive_distance(
-    kind: int, size: wp.vec3d, rotation: wp.mat33d, center: wp.vec3d, a: wp.vec3d, b: wp.vec3d
+    is_round: bool, kind: int, size: wp.vec3d, rotation: wp.mat33d, center: wp.vec3d, a: wp.vec3d, b: wp.vec3d
 ):
-    """World normal (0 to 2) and distance (3) [m] from a primitive to the segment a b, and where on it (4, 0 to 1)."""
+    """World normal (0 to 2) and distance (3) [m] from a primitive to the segment a b, and where on it (4, 0 to 1).
+
+    ``is_round``: see :func:`distance_of`.
+    """
     to_local = wp.transpose(rotation)
     start = to_local * (a - center)
     along = to_local * (b - center) - start
-    t = closest_on_segment(kind, size, start, start + along)
-    n = primitive_distance(kind, size, start + t * along)
+    t = wp.float64(0.0)
+    if is_round:
+        t = closest_to_round(kind, size, start, start + along)
+    else:
+        t = closest_on_segment(kind, size, start, start + along)
+    n = distance_of(is_round, kind, size, start + t * along)
     normal = rotation * wp.vec3d(n[0], n[1], n[2])
     return vec5d(normal[0], normal[1], normal[2], n[3], t)
 
@@ -207,23 +285,33 @@ def on_same_face(closest: wp.vec4d, other: wp.vec4d, tolerance: wp.float64):
 
 
 @wp.func
-def interval_along_face(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d, t: wp.float64, tolerance: wp.float64):
+def interval_along_face(
+    is_round: bool, kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d, t: wp.float64, tolerance: wp.float64
+):
     """Both ends (0 to 1) of the part of a segment along a primitive's face about its closest point ``t``.
 
     They are the same if it crosses the face. What lies along a face needs two contacts: with one, it rocks about it from
-    step to step. All in the primitive's frame.
+    step to step. All in the primitive's frame; ``is_round``: see :func:`distance_of`.
     """
     half = wp.float64(0.5)
     along = b - a
-    closest = primitive_distance(kind, size, a + t * along)
+    closest = distance_of(is_round, kind, size, a + t * along)
+    near = tolerance / wp.length(along)
+    leaves = bool(True)  # the face or the segment so soon on both sides that what lies along it is too short
+    for side in range(2):
+        u = t + wp.where(side == 0, -near, near)
+        if u >= wp.float64(0.0) and u <= wp.float64(1.0):
+            leaves = leaves and not on_same_face(closest, distance_of(is_round, kind, size, a + u * along), tolerance)
+    if leaves:
+        return wp.vec2d(t, t)
     ends = wp.vec2d(wp.float64(0.0), wp.float64(1.0))
     for side in range(2):
-        if not on_same_face(closest, primitive_distance(kind, size, a + ends[side] * along), tolerance):
+        if not on_same_face(closest, distance_of(is_round, kind, size, a + ends[side] * along), tolerance):
             outer = ends[side]
             inner = t
             for i in range(FACE_BISECTIONS):
                 middle = half * (outer + inner)
-                if on_same_face(closest, primitive_distance(kind, size, a + middle * along), tolerance):
+                if on_same_face(closest, distance_of(is_round, kind, size, a + middle * along), tolerance):
                     inner = middle
                 else:
                     outer = middle

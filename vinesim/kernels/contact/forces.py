@@ -21,25 +21,23 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def store_contact(
     c: int,
+    slip_u: wp.float64,
+    slip_v: wp.float64,
     parameters: Parameters,
-    geoms: Geoms,
-    rigid: RigidBodies,
-    islands: Islands,
-    rows: Rows,
+    impulses: wp.array(dtype=wp.float64),
     contacts_out: Contacts,
     warm_start_out: WarmStart,
 ):
-    """Write the impulse of contact ``c`` as a force on the plant, and what the next step starts from."""
+    """Write the impulse of contact ``c`` as a force on the plant, and what the next step starts from.
+
+    slip_u, slip_v: [m/s] velocities along its tangents with all impulses.
+    """
     n = 3 * c
     axes = contacts_out.axes[c]
     t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
-    impulse = wp.vec3d(rows.impulse[n], rows.impulse[n + 1], rows.impulse[n + 2])
+    impulse = wp.vec3d(impulses[n], impulses[n + 1], impulses[n + 2])
     contacts_out.force[c] = wp.transpose(axes) * impulse / parameters.dt
-    slip_u = rows.velocity_free[n + 1]
-    slip_v = rows.velocity_free[n + 2]
-    slip_u = velocity_along(slip_u, n + 1, geoms, rigid, contacts_out, islands, rows)
-    slip_v = velocity_along(slip_v, n + 2, geoms, rigid, contacts_out, islands, rows)
     # the stretch with which spring and damper give just this friction: a contact that slides drags its anchor along
     force_u = impulse[1] / parameters.dt + contacts_out.damping[c] * slip_u
     force_v = impulse[2] / parameters.dt + contacts_out.damping[c] * slip_v
@@ -68,7 +66,12 @@ def store_warm_start(
     warm_start_out: WarmStart,
 ):
     """One thread per contact: its impulse as a force on the plant, and what the next step starts from."""
-    store_contact(wp.tid(), parameters, geoms, rigid, islands, rows, contacts_out, warm_start_out)
+    c = wp.tid()
+    u = 3 * c + 1
+    v = 3 * c + 2
+    slip_u = velocity_along(rows.velocity_free[u], u, geoms, rigid, contacts_out, islands, rows)
+    slip_v = velocity_along(rows.velocity_free[v], v, geoms, rigid, contacts_out, islands, rows)
+    store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts_out, warm_start_out)
 
 
 @wp.kernel

@@ -94,7 +94,7 @@ def insert_sorted(body: int, count: int, bodies_out: wp.array(dtype=wp.int32)):
 
 @wp.func
 def slot_of(body: int, count: int, sorted_bodies: wp.array(dtype=wp.int32)):
-    """Place of a body in a sorted list of ``count`` that contains it; 0 for none (negative)."""
+    """Place of a body in a sorted list of ``count`` that contains it."""
     low = int(0)
     high = int(count) - 1
     while low < high:
@@ -263,9 +263,10 @@ def build_islands(
     for c in range(contact_count):
         islands_out.label[c] = c
         contacts_out.body_slot[c] = slot_of(contacts_out.body[c], body_count, touched_out.body)
-        contacts_out.other_slot[c] = slot_of(contacts_out.other_body[c], body_count, touched_out.body)
+        contacts_out.other_slot[c] = -1
         link_contacts(c, touched_out.last_contact, touched_out.tree_start[contacts_out.body_slot[c]], islands_out.label)
         if contacts_out.other_body[c] >= 0:
+            contacts_out.other_slot[c] = slot_of(contacts_out.other_body[c], body_count, touched_out.body)
             place = touched_out.tree_start[contacts_out.other_slot[c]]
             link_contacts(c, touched_out.last_contact, place, islands_out.label)
     flatten_labels(contact_count, islands_out.label)

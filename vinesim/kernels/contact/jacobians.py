@@ -194,3 +194,21 @@ def write_contact_rows(
         c, contacts_out.source[c] // slots, contacts_out.source[c] % slots, parameters, pairs, capsules, geoms, bodies,
         rigid, candidates, warm_start, contacts_out, rows_out,
     )  # fmt: skip
+
+
+@wp.func
+def row_vector(row: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
+    """Three entries of a row, in single precision."""
+    return wp.vec3(
+        wp.float32(jacobian[row, column]), wp.float32(jacobian[row, column + 1]), wp.float32(jacobian[row, column + 2])
+    )
+
+
+@wp.func
+def row_columns(c: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
+    """Three entries, from ``column`` on, of each of the three rows of a contact, one row a column."""
+    return wp.matrix_from_cols(
+        row_vector(3 * c, column, jacobian),
+        row_vector(3 * c + 1, column, jacobian),
+        row_vector(3 * c + 2, column, jacobian),
+    )

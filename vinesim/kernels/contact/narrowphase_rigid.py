@@ -91,6 +91,7 @@ def list_near_geoms(
 
 @wp.func
 def segment_geom_distance(
+    is_round: bool,
     geoms: Geoms,
     hulls: Hulls,
     g: int,
@@ -102,10 +103,11 @@ def segment_geom_distance(
 ):
     """World normal (0 to 2) and distance (3) [m] from a geom to the segment a b, and where on it (4, 0 to 1).
 
-    Beyond ``reach`` [m] the distance from a hull is a lower bound.
+    Beyond ``reach`` [m] the distance from a hull is a lower bound. ``is_round``, here and below: all geoms are known to be
+    planes, spheres and capsules, for which far less is compiled.
     """
     found = vec5d()
-    if geoms.kind[g] == MESH:
+    if not is_round and geoms.kind[g] == MESH:
         to_local = wp.transpose(rotation)
         found = segment_hull_distance(hulls, geoms.hull[g], to_local * (a - center), to_local * (b - center), reach)
         normal = rotation * wp.vec3d(found[0], found[1], found[2])
@@ -113,12 +115,13 @@ def segment_geom_distance(
         found[1] = normal[1]
         found[2] = normal[2]
     else:
-        found = segment_primitive_distance(geoms.kind[g], geoms.size[g], rotation, center, a, b)
+        found = segment_primitive_distance(is_round, geoms.kind[g], geoms.size[g], rotation, center, a, b)
     return found
 
 
 @wp.func
 def follow_contact(
+    is_round: bool,
     parameters: Parameters,
     candidate: Candidate,
     pair: Pair,
@@ -155,6 +158,7 @@ def follow_contact(
         end_a = end_a + t * (end_b - end_a)
         end_b = end_a
     later = segment_geom_distance(
+        is_round,
         geoms,
         hulls,
         g,
@@ -180,6 +184,7 @@ def follow_contact(
 
 @wp.func
 def rigid_candidate(
+    is_round: bool,
     parameters: Parameters,
     pair: Pair,
     nearest: vec5d,
@@ -214,6 +219,7 @@ def rigid_candidate(
     approach = dt * wp.dot(candidate.normal, relative)
     if is_static:
         at_rest = segment_primitive_distance(
+            is_round,
             geoms.kind[g],
             geoms.size[g],
             pair.rotation,
@@ -227,7 +233,7 @@ def rigid_candidate(
         candidate.exists = candidate.gap + soonest < parameters.static_margin
     if candidate.exists:
         candidate = follow_contact(
-            parameters, candidate, pair, nearest, t, approach, relative, velocity, bodies, capsule_states, geoms,
+            is_round, parameters, candidate, pair, nearest, t, approach, relative, velocity, bodies, capsule_states, geoms,
             hulls, geom_states,
         )  # fmt: skip
     return candidate
@@ -235,6 +241,7 @@ def rigid_candidate(
 
 @wp.func
 def contact_ends(
+    is_round: bool,
     parameters: Parameters,
     geoms: Geoms,
     hulls: Hulls,
@@ -250,12 +257,14 @@ def contact_ends(
     to_local = wp.transpose(rotation)
     local_a = to_local * (a - center)
     local_b = to_local * (b - center)
-    if geoms.kind[g] == MESH:
+    if not is_round and geoms.kind[g] == MESH:
         normal = to_local * wp.vec3d(nearest[0], nearest[1], nearest[2])
         local = vec5d(normal[0], normal[1], normal[2], nearest[3], nearest[4])
         ends = interval_along_hull(hulls, geoms.hull[g], local_a, local_b, local, parameters.margin)
     elif has_flat_or_straight_side(geoms.kind[g]):
-        ends = interval_along_face(geoms.kind[g], geoms.size[g], local_a, local_b, nearest[4], parameters.margin)
+        ends = interval_along_face(
+            is_round, geoms.kind[g], geoms.size[g], local_a, local_b, nearest[4], parameters.margin
+        )
     return ends
 
 
@@ -278,6 +287,7 @@ def clear_slots(row: int, count: int, candidates_out: Candidates):
 
 @wp.func
 def add_pair(
+    is_round: bool,
     row: int,
     count: int,
     s: int,
@@ -292,13 +302,11 @@ def add_pair(
     geom_states: GeomStates,
     candidates_out: Candidates,
 ):
-    """Add the contacts of capsule ``s`` with geom ``g`` to a row that has ``count`` so far.
+    """Add the contacts of capsule ``s`` with geom ``g``, whose boxes overlap, to a row that has ``count`` so far.
 
     Returns their number, and whether one is an impact.
     """
     is_impact = bool(False)
-    if aabbs_disjoint(capsule_states.low[s], capsule_states.high[s], geom_states.low[g], geom_states.high[g]):
-        return count, is_impact
     radius = wp.float64(capsules.radius[s])
     a = to_double(capsule_states.start[s])
     b = to_double(capsule_states.end[s])
@@ -309,9 +317,9 @@ def add_pair(
     limit = bound + geoms.radius[g] + margin
     if wp.dot(between, between) < limit * limit:
         rotation = rigid.xmat[geoms.id[g]]
-        nearest = segment_geom_distance(geoms, hulls, g, rotation, center, a, b, radius + margin)
+        nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
         if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules):
-            ends = contact_ends(parameters, geoms, hulls, g, rotation, center, a, b, nearest)
+            ends = contact_ends(is_round, parameters, geoms, hulls, g, rotation, center, a, b, nearest)
             pair = Pair()
             pair.capsule = s
             pair.body = capsules.body[s]
@@ -321,9 +329,9 @@ def add_pair(
             for end in range(pair.ends):
                 if pair.ends == 2:
                     p = a + ends[end] * (b - a)
-                    nearest = segment_geom_distance(geoms, hulls, g, rotation, center, p, p, FAR)
+                    nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, p, p, FAR)
                 candidate = rigid_candidate(
-                    parameters, pair, nearest, ends[end], g >= geoms.count[0], bodies, capsules, capsule_states,
+                    is_round, parameters, pair, nearest, ends[end], g >= geoms.count[0], bodies, capsules, capsule_states,
                     geoms, hulls, geom_states,
                 )  # fmt: skip
                 if candidate.exists:
@@ -371,12 +379,16 @@ def find_rigid_contacts(
     last = capsules.tree_start[tree + wp.where(near_count > 0, 1, 0)]
     for s in range(capsules.tree_start[tree], last):
         if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):
+            low = capsule_states.low[s]
+            high = capsule_states.high[s]
             for k in range(near_count):
-                count, hits = add_pair(
-                    row, count, s, candidates_out.near_geoms[row, k], parameters, capsules, geoms, bodies, capsule_states,
-                    rigid, hulls, geom_states, candidates_out,
-                )  # fmt: skip
-                is_impact = is_impact or hits
+                g = candidates_out.near_geoms[row, k]
+                if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):  # a call copies all structs
+                    count, hits = add_pair(
+                        False, row, count, s, g, parameters, capsules, geoms, bodies, capsule_states, rigid, hulls, geom_states,
+                        candidates_out,
+                    )  # fmt: skip
+                    is_impact = is_impact or hits
     candidates_out.is_impact[row] = is_impact
     candidates_out.count[row] = count
     clear_slots(row, count, candidates_out)

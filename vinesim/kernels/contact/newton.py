@@ -1,15 +1,15 @@
 """Active-set Newton step on the contacts of one island, from the impulses that projected Gauss-Seidel has reached.
 
-Which contacts are open, stick or slide, and in which direction they slide, is taken as it is: then the conditions are a
-linear system, B x + J_r w = r with one matrix B for each block, and w = H^-1 J_r^T x of the rigid bodies. Each block is
-eliminated by itself; what is left is a system as large as the degrees of freedom of the rigid bodies (Woodbury). See
-``docs/decisions/contact-solver.md``.
+Which contacts are open, stick or slide is taken as it is, and the direction in which they slide is linearised: then the
+conditions are a linear system, B x + J_r w = r with one matrix B for each block, and w = H^-1 J_r^T x of the rigid
+bodies. Each block is eliminated by itself; what is left is a system as large as the degrees of freedom of the rigid
+bodies (Woodbury). See ``docs/decisions/contact-solver.md``.
 """
 
 import warp as wp
 
-from vinesim.kernels.contact.row_velocity import update_rigid_velocity
-from vinesim.kernels.contact.structs import Contacts, Islands, Rows, SolverScratch
+from vinesim.kernels.contact.row_velocity import row_residual, tangential_eigenvalue, update_rigid_velocity
+from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, RigidBodies, Rows, SolverScratch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,12 +17,91 @@ SLIDING_SHARE = wp.constant(wp.float64(0.999999))
 """[1] A contact slides if its friction is at least this share of the largest one."""
 
 
+@wp.func_native("""
+    const int pitch = a.strides[0] / (int)sizeof(double);
+    const int pitch_out = out.strides[0] / (int)sizeof(double);
+    for (int i = first; i < first + count; ++i) out.data[i * pitch_out] = a.data[i * pitch];
+""")
+def copy_entries(a: wp.array(dtype=wp.float64), first: int, count: int, out: wp.array(dtype=wp.float64)):
+    """Copy ``count`` numbers from ``first`` on to the same place."""
+    ...
+
+
 @wp.func
-def write_block(block: int, island: int, contacts: Contacts, islands: Islands, rows: Rows, scratch_out: SolverScratch):
+def write_sliding_rows(
+    c: int,
+    place: int,
+    at: int,
+    size: int,
+    island: int,
+    geoms: Geoms,
+    rigid: RigidBodies,
+    contacts: Contacts,
+    islands: Islands,
+    rows: Rows,
+    scratch_out: SolverScratch,
+):
+    """Write both friction rows of a sliding contact, whose matrix rows begin at ``at`` and ``at + size``.
+
+    Friction is the projection of f = x_t - r_t / e on the disk of radius mu x_n, where r_t is the residual velocity along
+    the tangents and e their eigenvalue. Linearised about the present f, with d = f / |f|, P = 1 - d d^T and
+    s = mu x_n / |f|:  x_t - s P (x_t - r_t / e) - mu d x_n = 0 (Alart and Curnier, A mixed formulation for frictional
+    contact problems prone to Newton like solution methods, 1991).
+    """
+    one = wp.float64(1.0)
+    u = 3 * c + 1
+    eigenvalue = tangential_eigenvalue(c, geoms, rigid, contacts, islands, rows)
+    fu = rows.impulse[u] - row_residual(u, geoms, rigid, contacts, islands, rows) / eigenvalue
+    fv = rows.impulse[u + 1] - row_residual(u + 1, geoms, rigid, contacts, islands, rows) / eigenvalue
+    friction = contacts.friction[c]
+    length = wp.max(wp.sqrt(fu * fu + fv * fv), wp.float64(1.0e-30))
+    share = wp.min(friction * rows.impulse[u - 1] / length, one)
+    du = fu / length
+    dv = fv / length
+    uu = share * (one - du * du)
+    uv = -share * du * dv
+    vv = share * (one - dv * dv)
+    for k in range(size):
+        along_u = rows.delassus[at + k] / eigenvalue
+        along_v = rows.delassus[at + size + k] / eigenvalue
+        scratch_out.matrix[at + k] = uu * along_u + uv * along_v
+        scratch_out.matrix[at + size + k] = uv * along_u + vv * along_v
+    softer = one - contacts.compliance[c] / eigenvalue
+    n = at + 3 * place
+    scratch_out.matrix[n] = scratch_out.matrix[n] - friction * du
+    scratch_out.matrix[n + 1] = scratch_out.matrix[n + 1] + one - softer * uu
+    scratch_out.matrix[n + 2] = scratch_out.matrix[n + 2] - softer * uv
+    n = n + size
+    scratch_out.matrix[n] = scratch_out.matrix[n] - friction * dv
+    scratch_out.matrix[n + 1] = scratch_out.matrix[n + 1] - softer * uv
+    scratch_out.matrix[n + 2] = scratch_out.matrix[n + 2] + one - softer * vv
+    along_u = -(rows.velocity_free[u] + rows.bias[u]) / eigenvalue
+    along_v = -(rows.velocity_free[u + 1] + rows.bias[u + 1]) / eigenvalue
+    scratch_out.columns[u, 0] = uu * along_u + uv * along_v
+    scratch_out.columns[u + 1, 0] = uv * along_u + vv * along_v
+    for k in range(islands.first_dof[island + 1] - islands.first_dof[island]):
+        dof = islands.dof[islands.first_dof[island] + k]
+        along_u = -rows.rigid_jacobian[u, dof] / eigenvalue
+        along_v = -rows.rigid_jacobian[u + 1, dof] / eigenvalue
+        scratch_out.columns[u, 1 + k] = uu * along_u + uv * along_v
+        scratch_out.columns[u + 1, 1 + k] = uv * along_u + vv * along_v
+
+
+@wp.func
+def write_block(
+    block: int,
+    island: int,
+    geoms: Geoms,
+    rigid: RigidBodies,
+    contacts: Contacts,
+    islands: Islands,
+    rows: Rows,
+    scratch_out: SolverScratch,
+):
     """Write the linear system of one block: its matrix, and right-hand sides for w = 0 and for each entry of w.
 
     Sticking rows: (B + compliance) x = -velocity - bias - J_r w. Rows of open contacts: x = 0. Friction of sliding
-    contacts: a fixed share of the normal impulse.
+    contacts: see :func:`write_sliding_rows`.
     """
     zero = wp.float64(0.0)
     start = islands.block_start[block]
@@ -33,82 +112,103 @@ def write_block(block: int, island: int, contacts: Contacts, islands: Islands, r
         n = 3 * c
         normal = rows.impulse[n]
         tangential = wp.sqrt(rows.impulse[n + 1] * rows.impulse[n + 1] + rows.impulse[n + 2] * rows.impulse[n + 2])
-        slides = tangential >= contacts.friction[c] * normal * SLIDING_SHARE
+        slides = normal > zero and tangential >= contacts.friction[c] * normal * SLIDING_SHARE
         for axis in range(3):
             row = n + axis
             at = islands.matrix_start[block] + (3 * p + axis) * size
-            if normal <= zero or (axis > 0 and slides):
+            if normal <= zero:
                 for k in range(size):
                     scratch_out.matrix[at + k] = zero
                 for k in range(1 + dofs):
                     scratch_out.columns[row, k] = zero
                 scratch_out.matrix[at + 3 * p + axis] = wp.float64(1.0)
-                if normal > zero:
-                    scratch_out.matrix[at + 3 * p] = -rows.impulse[row] / normal
-            else:
-                for k in range(size):
-                    scratch_out.matrix[at + k] = rows.delassus[at + k]
+            elif axis == 0 or not slides:
+                copy_entries(rows.delassus, at, size, scratch_out.matrix)
                 scratch_out.matrix[at + 3 * p + axis] = scratch_out.matrix[at + 3 * p + axis] + contacts.compliance[c]
                 scratch_out.columns[row, 0] = -rows.velocity_free[row] - rows.bias[row]
                 for k in range(dofs):
                     dof = islands.dof[islands.first_dof[island] + k]
                     scratch_out.columns[row, 1 + k] = -rows.rigid_jacobian[row, dof]
+        if slides:
+            at = islands.matrix_start[block] + (3 * p + 1) * size
+            write_sliding_rows(
+                c, p, at, size, island, geoms, rigid, contacts, islands, rows, scratch_out
+            )  # fmt: skip
 
 
 @wp.func_native("""
-    const int pitch = a.strides[0] / (int)sizeof(double);
-    const double* from = a.data + source * pitch;
-    double* to = a.data + target * pitch;
-    if (pitch == 1) {
-        for (int i = 0; i < count; ++i) {
-            const double change = factor * from[i];
-            to[i] -= change;
+    const int pitch = matrix.strides[0] / (int)sizeof(double);
+    const int column_pitch = columns.strides[1] / (int)sizeof(double);
+    const int row_pitch = columns.strides[0] / (int)sizeof(double);
+    double* const a = matrix.data + at * pitch;
+    for (int k = 0; k < size; ++k) {
+        const double* const __restrict__ pivot = a + k * size * pitch;
+        const double* const __restrict__ pivot_columns = columns.data + (3 * contact.data[start + k / 3] + k % 3) * row_pitch;
+        const double scale = 1.0 / pivot[k * pitch];
+        for (int m = k + 1; m < size; ++m) {
+            double* const __restrict__ row = a + m * size * pitch;
+            const double factor = row[k * pitch] * scale;
+            if (factor == 0.0) continue;
+            if (pitch == 1) {
+                for (int i = k + 1; i < size; ++i) row[i] -= factor * pivot[i];
+            } else {
+                for (int i = k + 1; i < size; ++i) row[i * pitch] -= factor * pivot[i * pitch];
+            }
+            double* const __restrict__ right = columns.data + (3 * contact.data[start + m / 3] + m % 3) * row_pitch;
+            for (int c = 0; c < count; ++c) right[c * column_pitch] -= factor * pivot_columns[c * column_pitch];
         }
-    } else {
-        for (int i = 0; i < count; ++i) to[i * pitch] -= factor * from[i * pitch];
+    }
+    for (int k = size - 1; k >= 0; --k) {
+        const double* const row = a + k * size * pitch;
+        double* const right = columns.data + (3 * contact.data[start + k / 3] + k % 3) * row_pitch;
+        for (int m = k + 1; m < size; ++m) {
+            const double entry = row[m * pitch];
+            const double* const below = columns.data + (3 * contact.data[start + m / 3] + m % 3) * row_pitch;
+            for (int c = 0; c < count; ++c) right[c * column_pitch] -= entry * below[c * column_pitch];
+        }
+        const double scale = 1.0 / row[k * pitch];
+        for (int c = 0; c < count; ++c) right[c * column_pitch] *= scale;
     }
 """)
-def subtract_row(a: wp.array(dtype=wp.float64), target: int, source: int, count: int, factor: wp.float64):
-    """Subtract from ``count`` numbers of an array, from ``target`` on, ``factor`` times those from ``source`` on.
+def eliminate(
+    matrix: wp.array(dtype=wp.float64),
+    at: int,
+    size: int,
+    contact: wp.array(dtype=wp.int32),
+    start: int,
+    columns: wp.array2d(dtype=wp.float64),
+    count: int,
+):
+    """Gaussian elimination without pivoting of the matrix that begins at ``at``; its solutions replace ``columns``.
 
-    Native, as Warp's loops over arrays in structs are not vectorised.
+    Row k of the matrix is row 3 * contact[start + k / 3] + k % 3 of the columns. Native, as Warp's loops over arrays in
+    structs are not vectorised, and a call copies its structs.
     """
     ...
 
 
 @wp.func
 def solve_block(block: int, columns: int, islands: Islands, scratch_out: SolverScratch):
-    """Gaussian elimination without pivoting: B is positive definite, and sliding rows change that little."""
+    """Solve the system of one block. No pivoting: B is positive definite, and sliding rows change that little."""
     start = islands.block_start[block]
     size = 3 * (islands.block_start[block + 1] - start)
-    matrix = islands.matrix_start[block]
-    for k in range(size):
-        pivot_row = 3 * islands.contact[start + k // 3] + k % 3
-        pivot_at = matrix + k * size
-        scale = wp.float64(1.0) / scratch_out.matrix[pivot_at + k]
-        for m in range(k + 1, size):
-            at = matrix + m * size
-            factor = scratch_out.matrix[at + k] * scale
-            if factor != wp.float64(0.0):
-                row = 3 * islands.contact[start + m // 3] + m % 3
-                subtract_row(scratch_out.matrix, at + k + 1, pivot_at + k + 1, size - k - 1, factor)
-                for c in range(columns):
-                    scratch_out.columns[row, c] = (
-                        scratch_out.columns[row, c] - factor * scratch_out.columns[pivot_row, c]
-                    )
-    for back in range(size):
-        k = size - 1 - back
-        row = 3 * islands.contact[start + k // 3] + k % 3
-        at = matrix + k * size
-        for m in range(k + 1, size):
-            entry = scratch_out.matrix[at + m]
-            if entry != wp.float64(0.0):
-                below = 3 * islands.contact[start + m // 3] + m % 3
-                for c in range(columns):
-                    scratch_out.columns[row, c] = scratch_out.columns[row, c] - entry * scratch_out.columns[below, c]
-        scale = wp.float64(1.0) / scratch_out.matrix[at + k]
-        for c in range(columns):
-            scratch_out.columns[row, c] = scratch_out.columns[row, c] * scale
+    eliminate(
+        scratch_out.matrix, islands.matrix_start[block], size, islands.contact, start, scratch_out.columns, columns
+    )
+
+
+@wp.func_native("""
+    double* to = a.data + target * (a.strides[0] / (int)sizeof(double));
+    const int pitch = columns.strides[1] / (int)sizeof(double);
+    const double* from = columns.data + source * (columns.strides[0] / (int)sizeof(double));
+    for (int i = 1; i <= count; ++i) to[i] -= factor * from[i * pitch];
+""")
+def subtract_columns(
+    a: wp.array2d(dtype=wp.float64), target: int, columns: wp.array2d(dtype=wp.float64), source: int, count: int,
+    factor: wp.float64,
+):  # fmt: skip
+    """Subtract from a row, its first number left out, ``factor`` times ``count`` numbers of a row of ``columns``."""
+    ...
 
 
 @wp.func
@@ -133,10 +233,7 @@ def solve_rigid(island: int, contacts: Contacts, islands: Islands, rows: Rows, s
                     if response != zero:
                         value = scratch_out.rigid_system[first + i, 0] + response * scratch_out.columns[row, 0]
                         scratch_out.rigid_system[first + i, 0] = value
-                        for k in range(1, 1 + dofs):
-                            scratch_out.rigid_system[first + i, k] = (
-                                scratch_out.rigid_system[first + i, k] - response * scratch_out.columns[row, k]
-                            )
+                        subtract_columns(scratch_out.rigid_system, first + i, scratch_out.columns, row, dofs, response)
     for k in range(dofs):
         best = int(k)
         for i in range(k + 1, dofs):
@@ -187,6 +284,8 @@ def project_into_cones(island: int, contacts: Contacts, islands: Islands, rows_o
 @wp.func
 def newton_step(
     island: int,
+    geoms: Geoms,
+    rigid: RigidBodies,
     contacts: Contacts,
     islands: Islands,
     scratch_out: SolverScratch,
@@ -196,7 +295,7 @@ def newton_step(
     first = islands.first_dof[island]
     dofs = islands.first_dof[island + 1] - first
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
-        write_block(block, island, contacts, islands, rows_out, scratch_out)
+        write_block(block, island, geoms, rigid, contacts, islands, rows_out, scratch_out)
         solve_block(block, 1 + dofs, islands, scratch_out)
     solve_rigid(island, contacts, islands, rows_out, scratch_out)
     for m in range(islands.start[island], islands.start[island + 1]):

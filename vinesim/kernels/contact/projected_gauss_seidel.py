@@ -6,22 +6,25 @@ x_n v_n = 0; friction |x_t| <= mu x_n against the sliding. In double precision.
 
 import warp as wp
 
+from vinesim.kernels.compiler_flags import INLINE_ALL
 from vinesim.kernels.contact.conjugate_gradient import follow_conjugate_direction
 from vinesim.kernels.contact.newton import newton_step
-from vinesim.kernels.contact.row_velocity import add_impulse, delassus_entry, update_rigid_velocity, velocity_along
+from vinesim.kernels.contact.row_velocity import (
+    add_impulse,
+    delassus_entry,
+    row_residual,
+    tangential_eigenvalue,
+    update_rigid_velocity,
+)
 from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, RigidBodies, Rows, SolverScratch
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
 MIN_IMPULSE_SCALE = wp.constant(wp.float64(1.0e-5))
 """[N s] The largest impulse counts as at least this when convergence is judged. TUNED: 1 mN over 10 ms."""
 
-
-@wp.func
-def row_residual(row: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows):
-    """Velocity [m/s] along a row, bias and compliance included, with the impulses of its island."""
-    r = rows.velocity_free[row] + rows.bias[row] + contacts.compliance[row // 3] * rows.impulse[row]
-    return velocity_along(r, row, geoms, rigid, contacts, islands, rows)
+NEWTON_PERIOD = wp.constant(10)
+"""Sweeps between two further Newton steps of an island that the first ones did not settle. TUNED"""
 
 
 @wp.func
@@ -30,7 +33,6 @@ def relax_contact(
 ):
     """One Gauss-Seidel step of a contact, normal and then friction; returns the largest change of an impulse [N s]."""
     zero = wp.float64(0.0)
-    half = wp.float64(0.5)
     compliance = contacts.compliance[c]
     n = 3 * c
     r = row_residual(n, geoms, rigid, contacts, islands, rows_out)
@@ -44,13 +46,7 @@ def relax_contact(
     v = n + 2
     ru = row_residual(u, geoms, rigid, contacts, islands, rows_out)
     rv = row_residual(v, geoms, rigid, contacts, islands, rows_out)
-    # the larger eigenvalue of the tangential block: the step stays inside the cone's convergence
-    uu = delassus_entry(u, 1, geoms, rigid, contacts, islands, rows_out)
-    vv = delassus_entry(v, 2, geoms, rigid, contacts, islands, rows_out)
-    uv = delassus_entry(u, 2, geoms, rigid, contacts, islands, rows_out)
-    mean = half * (uu + vv) + compliance
-    spread = half * (uu - vv)
-    eigenvalue = mean + wp.sqrt(spread * spread + uv * uv)
+    eigenvalue = tangential_eigenvalue(c, geoms, rigid, contacts, islands, rows_out)
     fu = rows_out.impulse[u] - ru / eigenvalue
     fv = rows_out.impulse[v] - rv / eigenvalue
     tangential = wp.sqrt(fu * fu + fv * fv)
@@ -103,12 +99,12 @@ def solve_island(
 
     Contacts that depend on each other (two fingers about a bunch) slow Gauss-Seidel down: within a few sweeps it finds
     which contacts stick, slide or open, and takes a hundred for the rest. So islands of small blocks take a Newton step
-    after every other sweep, at first. If these do not settle, sweeps go on from where they began, with conjugate
+    after every sweep, at first. If these do not settle, sweeps go on from where they began, with conjugate
     gradients, as they do from the first one on in islands with a large block.
     """
     first = islands_out.start[island]
     last = islands_out.start[island + 1]
-    newton_end = 2 * max_newton_steps
+    newton_end = max_newton_steps
     if largest_block(island, islands_out) > max_newton_contacts:
         newton_end = 0
     update_rigid_velocity(island, contacts, islands_out, rows_out)
@@ -130,12 +126,13 @@ def solve_island(
             if sweeps == newton_end + 1 and newton_end > 0:
                 copy_impulses(island, islands_out, scratch_out.impulse_first, rows_out.impulse)
                 update_rigid_velocity(island, contacts, islands_out, rows_out)
-            elif sweeps > newton_end:
+            elif sweeps > newton_end and (newton_end == 0 or sweeps % NEWTON_PERIOD != 0):
                 gradient = follow_conjugate_direction(island, gradient, contacts, islands_out, scratch_out, rows_out)
-            elif sweeps % 2 == 0:
-                if sweeps == 2:
+            else:
+                if sweeps == 1:
                     copy_impulses(island, islands_out, rows_out.impulse, scratch_out.impulse_first)
-                newton_step(island, contacts, islands_out, scratch_out, rows_out)
+                gradient = wp.float64(0.0)
+                newton_step(island, geoms, rigid, contacts, islands_out, scratch_out, rows_out)
     islands_out.sweeps[island] = sweeps
 
 

@@ -11,6 +11,35 @@ from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, RigidBodie
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.func_native("""
+    const int pitch = delassus.strides[0] / (int)sizeof(double);
+    const int impulse_pitch = impulse.strides[0] / (int)sizeof(double);
+    const double* entry = delassus.data + at * pitch;
+    double n = 0.0, u = 0.0, v = 0.0;
+    for (int m = first; m < last; ++m) {
+        const double* x = impulse.data + 3 * contact.data[m] * impulse_pitch;
+        n += entry[0] * x[0];
+        u += entry[pitch] * x[impulse_pitch];
+        v += entry[2 * pitch] * x[2 * impulse_pitch];
+        entry += 3 * pitch;
+    }
+    return n + u + v;
+""")
+def block_velocity(
+    delassus: wp.array(dtype=wp.float64),
+    at: int,
+    contact: wp.array(dtype=wp.int32),
+    first: int,
+    last: int,
+    impulse: wp.array(dtype=wp.float64),
+) -> wp.float64:
+    """Velocity [m/s] along a row, whose matrix entries begin at ``at``, by the impulses of the contacts of its block.
+
+    Native, with a sum for each axis: one sum would wait for itself, and Warp's loops count slowly.
+    """
+    ...
+
+
 @wp.func
 def velocity_along(
     value: wp.float64, row: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows
@@ -21,17 +50,7 @@ def velocity_along(
     first = islands.block_start[block]
     last = islands.block_start[block + 1]
     at = islands.matrix_start[block] + (3 * (contacts.place[c] - first) + row % 3) * 3 * (last - first)
-    m = int(first)
-    while m < last:
-        i = 3 * islands.contact[m]
-        value = (
-            value
-            + rows.delassus[at] * rows.impulse[i]
-            + rows.delassus[at + 1] * rows.impulse[i + 1]
-            + rows.delassus[at + 2] * rows.impulse[i + 2]
-        )
-        at = at + 3
-        m = m + 1
+    value = value + block_velocity(rows.delassus, at, islands.contact, first, last, rows.impulse)
     if contacts.other[c] >= 0:
         dof = geoms.dof[contacts.other[c]]
         while dof >= 0:
@@ -57,6 +76,26 @@ def delassus_entry(
             value = value + rows.rigid_jacobian[row, dof] * rows.rigid_response[3 * c + k, dof]
             dof = rigid.dof_parent[dof]
     return value
+
+
+@wp.func
+def row_residual(row: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows):
+    """Velocity [m/s] along a row, bias and compliance included, with the impulses of its island."""
+    r = rows.velocity_free[row] + rows.bias[row] + contacts.compliance[row // 3] * rows.impulse[row]
+    return velocity_along(r, row, geoms, rigid, contacts, islands, rows)
+
+
+@wp.func
+def tangential_eigenvalue(c: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows: Rows):
+    """The larger eigenvalue [1/kg] of the tangential block of a contact, compliance included: a step of friction by the
+    residual over it stays inside the cone's convergence."""
+    u = 3 * c + 1
+    uu = delassus_entry(u, 1, geoms, rigid, contacts, islands, rows)
+    vv = delassus_entry(u + 1, 2, geoms, rigid, contacts, islands, rows)
+    uv = delassus_entry(u, 2, geoms, rigid, contacts, islands, rows)
+    mean = wp.float64(0.5) * (uu + vv) + contacts.compliance[c]
+    spread = wp.float64(0.5) * (uu - vv)
+    return mean + wp.sqrt(spread * spread + uv * uv)
 
 
 @wp.func

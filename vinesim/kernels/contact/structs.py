@@ -18,17 +18,15 @@ IMPACTED_TREES = wp.constant(3)
 """Trees with a contact that closes faster than the impact speed."""
 BODIES = wp.constant(4)
 """Plant bodies in contact."""
-IS_CONSTRAINED = wp.constant(5)
-"""1 if a rigid body in contact is bound by active constraints of MuJoCo."""
+SORT_AXIS = wp.constant(5)
+"""World axis (0, 1, 2) along which the boxes of trees are sorted."""
 ISLANDS = wp.constant(6)
 BLOCKS = wp.constant(8)
 MATRIX_ENTRIES = wp.constant(9)
 """Entries of the matrices of all blocks."""
-SORT_AXIS = wp.constant(7)
-"""World axis (0, 1, 2) along which the boxes of trees are sorted."""
-SKIPPED_GEOMS = wp.constant(10)
+SKIPPED_GEOMS = wp.constant(7)
 """Static geoms beyond what one tree can be near to."""
-COUNTERS = 11
+COUNTERS = 10
 
 AABB_BLOCK = wp.constant(32)
 """So many static boxes share one box around them, and are skipped by one comparison."""
@@ -336,6 +334,7 @@ class Contacts:
     other_body: wp.array(dtype=wp.int32)
     """the other plant body, -1 for a geom."""
     other_slot: wp.array(dtype=wp.int32)
+    """the same of the other plant body, -1 for a geom."""
     gap: wp.array(dtype=wp.float64)
     friction: wp.array(dtype=wp.float64)
     stiffness: wp.array(dtype=wp.float64)
@@ -407,13 +406,8 @@ class Rows:
     """[row, 12] of the body and of the other plant body, each linear and angular."""
     rigid_jacobian: wp.array2d(dtype=wp.float64)
     """[row, dof]"""
-    plant_response: wp.array2d(dtype=wp.float64)
-    """[row, 6 * touched body of the tree] M^-1 J^T: change of velocity of the touched bodies of the tree of ``body``
-    for a unit impulse along the row."""
-    other_response: wp.array2d(dtype=wp.float64)
-    """The same for the tree of ``other_body``, if that is another tree."""
     rigid_response: wp.array2d(dtype=wp.float64)
-    """[row, dof] the same for the rigid world."""
+    """[row, dof] M^-1 J^T: change of velocity of the rigid world for a unit impulse along the row."""
     delassus: wp.array(dtype=wp.float64)
     """J M^-1 J^T of the plants [entry], a matrix of rows for each block."""
     velocity_free: wp.array(dtype=wp.float64)

@@ -5,12 +5,12 @@ Entry ``i`` of a tree lies at ``i * trees + tree``: see :mod:`vinesim.kernels.co
 
 import warp as wp
 
-from vinesim.kernels.contact.structs import Candidates, Contacts, Islands, Rows, SolverScratch, WarmStart
+from vinesim.kernels.contact.structs import Contacts, Rows, WarmStart
+from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem
 
 wp.set_module_options({"enable_backward": False})
 
 VIEW = "a.data += tree; a.strides[0] = trees * (int)sizeof(*a.data); return a;"
-VIEW_COLUMNS = "a.data += first * (a.strides[1] / (int)sizeof(*a.data)); a.shape.dims[1] = count; return a;"
 VIEW_2D = """
 a.data += tree;
 a.strides[1] = trees * (int)sizeof(*a.data);
@@ -41,38 +41,25 @@ def view_table(a: wp.array2d(dtype=wp.float64), tree: int, trees: int, columns: 
 ): ...
 
 
-@wp.func_native(VIEW_COLUMNS)
-def columns_int(a: wp.array2d(dtype=wp.int32), first: int, count: int) -> wp.array2d(dtype=wp.int32): ...
+@wp.func_native(VIEW_2D)
+def view_matrix(a: wp.array2d(dtype=float), tree: int, trees: int, columns: int) -> wp.array2d(dtype=float): ...
 
 
-@wp.func_native(VIEW_COLUMNS)
-def columns_double(a: wp.array2d(dtype=wp.float64), first: int, count: int) -> wp.array2d(dtype=wp.float64): ...
+@wp.func_native("a.data += first; return a;")
+def part_double(a: wp.array(dtype=wp.float64), first: int) -> wp.array(dtype=wp.float64): ...
 
 
-@wp.func_native(VIEW_COLUMNS)
-def columns_vec3d(a: wp.array2d(dtype=wp.vec3d), first: int, count: int) -> wp.array2d(dtype=wp.vec3d): ...
+@wp.func_native("a.data += first * a.shape.dims[1]; return a;")
+def part_matrix(a: wp.array2d(dtype=float), first: int) -> wp.array2d(dtype=float): ...
 
 
-@wp.func
-def view_candidates(s: Candidates, first: int, count: int):
-    """Candidates with the slots from ``first`` on."""
-    return Candidates(
-        s.count,
-        s.is_impact,
-        s.near_geoms,
-        s.skipped_geoms,
-        columns_int(s.feature, first, count),
-        columns_int(s.other, first, count),
-        columns_double(s.gap, first, count),
-        columns_double(s.end_gap, first, count),
-        columns_vec3d(s.normal, first, count),
-        columns_vec3d(s.point, first, count),
-    )
+@wp.func_native("a.data += first * a.shape.dims[1]; return a;")
+def part_table(a: wp.array2d(dtype=wp.float64), first: int) -> wp.array2d(dtype=wp.float64): ...
 
 
 @wp.func
 def view_contacts(s: Contacts, tree: int, trees: int):
-    """The contacts of one tree. Islands, blocks and places are the same for all: one island, one block, in order."""
+    """The contacts of one tree. All are in one island and one block."""
     return Contacts(
         view_int(s.source, tree, trees),
         view_int(s.feature, tree, trees),
@@ -97,31 +84,16 @@ def view_contacts(s: Contacts, tree: int, trees: int):
 
 @wp.func
 def view_rows(s: Rows, tree: int, trees: int):
-    """The rows of one tree's contacts, and its Delassus matrix."""
+    """The rows of one tree's contacts."""
     return Rows(
         view_table(s.plant_jacobian, tree, trees, 12),
         s.rigid_jacobian,
-        s.plant_response,
-        s.other_response,
         s.rigid_response,
-        view_double(s.delassus, tree, trees),
+        s.delassus,
         view_double(s.velocity_free, tree, trees),
         view_double(s.bias, tree, trees),
         view_double(s.impulse, tree, trees),
         s.rigid_velocity,
-    )
-
-
-@wp.func
-def view_scratch(s: SolverScratch, tree: int, trees: int):
-    """What the solve of one tree works with."""
-    return SolverScratch(
-        view_double(s.matrix, tree, trees),
-        view_table(s.columns, tree, trees, 1),
-        s.rigid_system,
-        view_double(s.impulse_first, tree, trees),
-        view_double(s.impulse_before, tree, trees),
-        view_double(s.direction, tree, trees),
     )
 
 
@@ -139,18 +111,48 @@ def view_warm_start(s: WarmStart, tree: int, trees: int):
 
 
 @wp.func
-def view_islands(s: Islands, tree: int, trees: int):
-    """One island of one block: its first contact is 0, its end the number of the tree's contacts."""
-    return Islands(
-        view_int(s.start, tree, trees),
-        s.first_block,
-        view_int(s.start, tree, trees),
-        s.matrix_start,
-        s.contact,
-        s.label,
-        s.block_label,
-        s.first_dof,
-        s.dof,
-        s.rigid_last_contact,
-        view_int(s.sweeps, tree, trees),
+def view_system(s: TreeSystem, tree: int, trees: int, width: int):
+    """What the contacts of one tree must fulfil, with so many rows at most."""
+    return TreeSystem(
+        view_matrix(s.matrix, tree, trees, width),
+        view_double(s.free, tree, trees),
+        view_double(s.friction, tree, trees),
+        view_double(s.compliance, tree, trees),
+        view_double(s.impulse, tree, trees),
+        view_double(s.velocity, tree, trees),
+    )
+
+
+@wp.func
+def view_search(s: TreeSearch, tree: int, trees: int, columns: int):
+    """What the search of one tree works with; its matrix has so many columns."""
+    return TreeSearch(
+        view_table(s.factor, tree, trees, columns),
+        view_double(s.first, tree, trees),
+        view_double(s.before, tree, trees),
+        view_double(s.direction, tree, trees),
+    )
+
+
+@wp.func
+def part_of_system(s: TreeSystem, first: int):
+    """The same of arrays in which each tree has a stretch of its own, from row ``first`` on."""
+    return TreeSystem(
+        part_matrix(s.matrix, first),
+        part_double(s.free, first),
+        part_double(s.friction, first),
+        part_double(s.compliance, first),
+        part_double(s.impulse, first),
+        part_double(s.velocity, first),
+    )
+
+
+@wp.func
+def part_of_search(s: TreeSearch, first: int):
+    """What the search of one such tree works with."""
+    return TreeSearch(
+        part_table(s.factor, first),
+        part_double(s.first, first),
+        part_double(s.before, first),
+        part_double(s.direction, first),
     )

@@ -45,6 +45,10 @@ class ServerAdmission:
         self._servers: frozenset[str] | None = None
         """The session that admitted this actor, if any did; None: it has not joined."""
         self._declared: list[object] = []
+        self._querier: zenoh.Querier | None = None
+        """Knows whether a server is announced; None before the first hello."""
+        self._hello = b""
+        self._is_join_submitted = False
 
     def is_server(self, replier: zenoh.EntityGlobalId | None) -> bool:
         """Whether answers for all actors (clock, retained records) count from here: from the server that admitted this
@@ -68,27 +72,43 @@ class ServerAdmission:
                         len(welcomes), self._world)  # fmt: skip
         self.count += bool(welcomes)
         querier = self._session.declare_querier(self._key)
+        self._querier, self._hello = querier, hello
 
         def on_matching(status: zenoh.MatchingStatus) -> None:
             self.is_served = status.matching
-            if status.matching:
-                self._submit(lambda: self._join_again(querier, hello))
+            self._submit_join()
 
-        self._declared += [querier, querier.declare_matching_listener(on_matching)]
-        if not welcomes and has_match(querier):
-            self._submit(lambda: self._join_again(querier, hello))
+        self._declared.append(querier.declare_matching_listener(on_matching))
+        if not welcomes:
+            self._submit_join()
 
-    def _join_again(self, querier: zenoh.Querier, hello: bytes) -> None:
+    def watch(self) -> None:
+        """Called from time to time: ask a server that is there although the last thing heard is that one went.
+
+        Zenoh may report that a server came before it reports that its predecessor went.
+        """
+        if self._querier is not None and not self.is_served:
+            self._submit_join()
+
+    def _submit_join(self) -> None:
+        """Have the hello sent again by the bus's own thread, unless that is submitted already."""
+        if not self._is_join_submitted:
+            self._is_join_submitted = True
+            self._submit(self._join_again)
+
+    def _join_again(self) -> None:
         """Send the hello to a server that has appeared, and note whether it rejects this actor.
 
         Between linked routers a server is announced before queries are routed to it: without a reply this is submitted
         again, behind what else the thread has to do, as long as the server is announced.
         """
-        welcomes = self._query(hello)
+        self._is_join_submitted = False
+        if self._querier is None or not has_match(self._querier):
+            return
+        welcomes = self._query(self._hello)
         if not welcomes:
-            if has_match(querier):
-                time.sleep(RETRY_PERIOD)
-                self._submit(lambda: self._join_again(querier, hello))
+            time.sleep(RETRY_PERIOD)
+            self._submit_join()
             return
         self.is_served = True  # whatever order Zenoh's threads report in that one server went and another came
         self.rejection = welcomes[0].refused

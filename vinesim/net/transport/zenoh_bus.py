@@ -1,7 +1,8 @@
 """The bus over Zenoh (eclipse-zenoh 1.10): client sessions to one router, without scouting and without listening.
 
-Publishers have exact keys, so that without a subscriber not one byte is sent. Callbacks only store. Poses are best
-effort and may be dropped; events are reliable and are sent by a thread of the bus, because sending them may block.
+Publishers have exact keys, so that without a subscriber not one byte is sent. Callbacks only store, and the threads
+that read the network call them: else Zenoh keeps a Python thread for every subscription, a hundred in a client. Poses
+are best effort and may be dropped; events are reliable and are sent by a thread of the bus, as sending them may block.
 
 Poses and states have a session of their own, over datagrams, wherever the server is on another machine, so that neither
 a lost packet nor a large snapshot delays them. Where no datagrams pass they share the stream with everything else.
@@ -17,7 +18,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import zenoh
 
@@ -33,12 +34,11 @@ from vinesim.net.transport.zenoh_entities import BusPublisher, BusSubscription
 from vinesim.net.transport.zenoh_session import (
     CONNECT_TIMEOUT,
     ServerUnreachable,
+    called_directly,
     close_session,
     open_client,
+    watch_certificates,
 )
-
-if TYPE_CHECKING:
-    from vinesim.net.transport.certificate_watch import CertificateWatch
 
 log = logging.getLogger(__name__)
 
@@ -94,7 +94,7 @@ class ZenohBus:
                 raise UsageError(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
         links = client_links(connect, secured=certificates is not None)
         self._credentials = {} if certificates is None else tls_config(certificates, name)
-        self._certificate_watch = None if certificates is None else _watch(certificates, name)
+        self._certificate_watch = None if certificates is None else watch_certificates(certificates, name)
         self.name, self.world, self.endpoint = name, world, str(links.bulk)
         self.bytes_in = self.bytes_out = self._oversized = self.failures = self.foreign = 0
         self._put_count = self._put_bytes = self._sent_count = self._sent_bytes = 0
@@ -129,7 +129,9 @@ class ZenohBus:
             tokens = liveliness.get(f"{self._prefix}live/*/*", timeout=CONNECT_TIMEOUT)
             self._names.start([_token(reply.ok.key_expr) for reply in tokens if reply.ok is not None])
             self._declared.append(
-                liveliness.declare_subscriber(f"{self._prefix}live/*/*", self._on_liveliness, history=True)
+                liveliness.declare_subscriber(
+                    f"{self._prefix}live/*/*", called_directly(self._on_liveliness), history=True
+                )
             )
             if links.live is not None:
                 self._pose_session = self._open_datagrams(links.live)
@@ -165,6 +167,7 @@ class ZenohBus:
     def _watch_links(self) -> None:
         """What the bus's own thread does once a :data:`WATCH_PERIOD`."""
         self._watch_datagrams()
+        self._admission.watch()
         if (watch := self._certificate_watch) is not None:
             if watch.has_changed():  # Zenoh reads the files whenever it connects
                 log.warning("%s: its certificates changed: they are used from the next connection on", self.name)
@@ -331,7 +334,9 @@ class ZenohBus:
                 self._store.put(depth, key, sample.payload.to_bytes())
 
         def declare(session: zenoh.Session) -> zenoh.Subscriber:
-            return session.declare_subscriber(self._prefix + pattern, store, allowed_origin=zenoh.Locality.REMOTE)
+            return session.declare_subscriber(
+                self._prefix + pattern, called_directly(store), allowed_origin=zenoh.Locality.REMOTE
+            )
 
         return BusSubscription(self, declare, depth >= KEEP_ALL)
 
@@ -358,7 +363,11 @@ class ZenohBus:
         no_consolidation = zenoh.ConsolidationMode.NONE
         self.submit(
             lambda: self._session.get(
-                self._prefix + key, on_reply, payload=payload, timeout=CONNECT_TIMEOUT, consolidation=no_consolidation
+                self._prefix + key,
+                called_directly(on_reply),
+                payload=payload,
+                timeout=CONNECT_TIMEOUT,
+                consolidation=no_consolidation,
             )
         )
 
@@ -473,21 +482,6 @@ class ZenohBus:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _watch(folder: pathlib.Path, name: str) -> CertificateWatch | None:
-    """Check the certificate of ``name``, and watch it from now on; None without the library that reads certificates."""
-    from vinesim.net.transport import certificates
-    from vinesim.net.transport.certificate_watch import CertificateWatch
-
-    try:
-        certificates.check(folder, name)
-    except certificates.CryptographyMissing:
-        log.info(
-            "%s: whether the certificates in %s are valid is not checked here without 'vinesim[tls]'", name, folder
-        )
-        return None
-    return CertificateWatch(folder)
 
 
 def _token(key: zenoh.KeyExpr) -> tuple[str, str]:

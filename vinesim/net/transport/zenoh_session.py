@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
+import pathlib
 import threading
-from collections.abc import Iterator
-from typing import Any
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
 
 import zenoh
 
 from vinesim.net.codec import messages
 from vinesim.net.transport.bus import BusError
 from vinesim.net.transport.endpoints import Endpoint
+
+if TYPE_CHECKING:
+    from vinesim.net.transport.certificate_watch import CertificateWatch
+
+log = logging.getLogger(__name__)
 
 LEASE = 2000
 """A peer that is silent for this long is taken to have left [ms]."""
@@ -62,6 +70,9 @@ _open_sessions: set[zenoh.Session] = set()
 
 _closer: list[threading.Thread] = []
 
+_direct: set[object] = set()
+"""One for each callback that a thread of Zenoh may still call."""
+
 
 def open_session(settings: zenoh.Config) -> zenoh.Session:
     """Open a session and close it when the main thread ends, unless it was closed before.
@@ -87,6 +98,9 @@ def _close_all() -> None:
     threading.main_thread().join()
     for session in list(_open_sessions):
         close_session(session)
+    deadline = time.monotonic() + CONNECT_TIMEOUT
+    while _direct and time.monotonic() < deadline:  # a thread that enters Python while that ends aborts the program
+        time.sleep(0.005)
 
 
 @contextlib.contextmanager
@@ -111,6 +125,28 @@ def open_client(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Sessio
                 **credentials,
             )
         )
+
+
+def watch_certificates(folder: pathlib.Path, name: str) -> CertificateWatch | None:
+    """Check the certificate of ``name``, and watch it from now on; None without the library that reads certificates."""
+    from vinesim.net.transport import certificates
+    from vinesim.net.transport.certificate_watch import CertificateWatch
+
+    try:
+        certificates.check(folder, name)
+    except certificates.CryptographyMissing:
+        log.info(
+            "%s: whether the certificates in %s are valid is not checked here without 'vinesim[tls]'", name, folder
+        )
+        return None
+    return CertificateWatch(folder)
+
+
+def called_directly(callback: Callable[[Any], object]) -> zenoh.handlers.Callback:
+    """A callback that the threads of Zenoh call which read the network. It must not wait for anything."""
+    mark = object()
+    _direct.add(mark)
+    return zenoh.handlers.Callback(callback, lambda: _direct.discard(mark), indirect=False)
 
 
 def has_match(entity: zenoh.Publisher | zenoh.Querier) -> bool:

@@ -1,7 +1,7 @@
 """Solve of all contacts of a step at once: islands, Jacobians, Delassus matrix, projected Gauss-Seidel, warm start.
 
-The stages of :meth:`ImpulseSolver.solve` follow the kernels: ``islands``, ``jacobians``, ``delassus``,
-``projected_gauss_seidel`` (with the steps of ``newton``), ``forces``.
+The stages of :meth:`ImpulseSolver.solve` follow the kernels: ``islands``, ``jacobians``, ``row_response``,
+``delassus``, ``projected_gauss_seidel`` (with the steps of ``newton``), ``forces``.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from vinesim.kernels.contact import delassus, forces, islands, jacobians, projec
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
 from vinesim.physics.contact.detection import ContactDetection
+from vinesim.physics.contact.row_response import RowResponse
 from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
@@ -41,10 +42,12 @@ class ImpulseSolver:
         self._kernel_parameters = kernel_parameters
         self._pairs = material_pairs(parameters)
         n = self.capacity = parameters.contact_capacity
-        self.contacts = SharedArrays.zeros(structs.Contacts, n)
+        self.response = response = RowResponse(plants, n)
+        slots = {"body_slot": response.body_slot, "other_slot": response.other_slot}
+        self.contacts = SharedArrays.zeros(structs.Contacts, n, **slots)
         self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
-        self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1)
-        tree_size = plants.buffers.max_tree_size
+        listed = {"body": response.body, "tree_start": response.tree_start}
+        self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1, **listed)
         self._island_arrays = {
             name: np.zeros(n + 1, np.int32)
             for name in ("start", "first_block", "block_start", "matrix_start", "contact", "label", "block_label",
@@ -52,9 +55,7 @@ class ImpulseSolver:
         }  # fmt: skip
         self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
         self._row_arrays = {
-            "plant_jacobian": np.zeros((3 * n, 12)),
-            "plant_response": np.zeros((3 * n, 6 * tree_size)),
-            "other_response": np.zeros((3 * n, 6 * tree_size)),
+            "plant_jacobian": response.jacobian,
             "velocity_free": np.zeros(3 * n),
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
@@ -62,7 +63,6 @@ class ImpulseSolver:
         self._memory: dict[str, np.ndarray] = {}
         """See :meth:`_kept`."""
         self._wrench = np.zeros((2 * n, 6))
-        self._body_response = np.zeros((2 * n, 6, tree_size, 6), np.float32)
         self.bodies = np.zeros(0, np.int32)
         """Plant bodies in contact [n], sorted."""
         self.wrenches = np.zeros((0, 6))
@@ -149,14 +149,12 @@ class ImpulseSolver:
         rigid_response[:] = 0.0
         self._write_contact_rows(n)
 
-        widest = int((self.touched.tree_end[:touched] - self.touched.tree_start[:touched]).max())
-        self._body_response[:touched, :, :widest] = self.plants.impulse_response_by_tree(bodies)[:, :, :widest]
-        geom_bodies = self.rigid_arrays.geoms.body[self.contacts.other[:n].clip(0)]
-        is_constrained = counters[structs.IS_CONSTRAINED] = self.rigid.is_constrained(geom_bodies)
-        self._inverse_mass_times_jacobian(row_count)
-        if is_constrained:
+        self.response.compute(n, bodies)
+        if self.rigid.is_constrained(self.rigid_arrays.geoms.body[self.contacts.other[:n].clip(0)]):
             rigid_response[:] = self.rigid.impulse_response(rigid_jacobian).T
-        self._assemble_delassus(row_count)
+        else:
+            self._respond_rigidly(row_count)
+        self._assemble_delassus(n)
         self._solve_islands(island_count)
         self.sweeps, self.island_count = int(self.islands.sweeps[:island_count].max()), island_count
 
@@ -175,7 +173,6 @@ class ImpulseSolver:
         candidates, contacts = detection.candidates.struct, self.contacts.struct
         groups, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
         counters, touched = share(detection.counters, wp.int32), self.touched.struct
-        body_response, factors = share(self._body_response, wp.float32), rigid.factors.struct
         self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
         self._build_islands = bind_launch(
             islands.build_islands,
@@ -187,12 +184,12 @@ class ImpulseSolver:
             [parameters, self._pairs.struct, capsules, geoms, bodies, rigid_bodies, candidates, warm_start],
             [contacts, rows],
         )
-        self._inverse_mass_times_jacobian = bind_launch(
-            delassus.inverse_mass_times_jacobian,
-            [geoms, rigid_bodies, factors, contacts, touched, counters, body_response],
-            [rows],
+        self._respond_rigidly = bind_launch(
+            delassus.respond_rigidly, [geoms, rigid_bodies, rigid.factors.struct, contacts], [rows]
         )
-        self._assemble_delassus = bind_launch(delassus.assemble_delassus, [contacts, touched, groups], [rows])
+        self._assemble_delassus = bind_launch(
+            delassus.assemble_delassus, [contacts, touched, groups, self.response.sides], [rows]
+        )
         self._solve_islands = bind_launch(
             projected_gauss_seidel.solve_islands,
             [p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms,

@@ -14,7 +14,9 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.articulation import structs as plant_structs
-from vinesim.kernels.contact import broadphase, structs, tree_islands
+from vinesim.kernels.contact import broadphase, structs, tree_delassus, tree_islands, tree_narrowphase
+from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
+from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem
 from vinesim.kernels.launch import THREADS_PER_BLOCK, bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters, material_pairs
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
@@ -22,15 +24,20 @@ from vinesim.physics.contact.plant_capsules import plant_capsules
 from vinesim.physics.contact.warp_arrays import SharedArrays
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.device_buffers import WARP_SIZE
 from vinesim.physics.rigid.rigid_world import RigidWorld
 
 FULL_BLOCK = 128
 """CUDA threads a block of kernels with several threads for each tree."""
 AABB_BLOCK = int(structs.AABB_BLOCK)
-CAPSULE_SLOTS = 4
-"""Contacts that one capsule can have at once: with two geoms along whose faces it lies."""
 DEFAULT_SLOTS = 8
-"""Contacts that one tree can have at once: 17 kB a contact and tree of 17 bodies."""
+"""Contacts that one tree can have at once: 6 kB a tree."""
+PAIRS_PER_SLOT = 4
+"""Pairs of capsules and geoms whose boxes may overlap, for each contact that a tree can have."""
+FIRST_LANES = 4
+"""Threads of a GPU that share a tree in its first sweeps."""
+WARPS = 132 * 32
+"""Warps of a GPU that solve at once: as many as one with 132 multiprocessors keeps."""
 
 
 class ResidentContacts:
@@ -104,7 +111,6 @@ class ResidentContacts:
 
     def _take_over_plants(self, arrays: PlantArrays) -> None:
         rows, zeros = self.plants.buffers.arrays, self._zeros
-        self._tree_states = self._on_device(structs.Trees, arrays.trees.struct)
         self._bodies = structs.PlantBodies()
         self._bodies.parent, self._bodies.tree = rows["body_parent"], rows["body_tree"]
         self._bodies.is_cut = zeros(wp.bool, self._places)
@@ -115,11 +121,13 @@ class ResidentContacts:
         )
 
     def _interleaved(self, capsules: SharedArrays) -> Any:
-        """The capsules on the device, capsule i of a tree at ``i * trees + tree``; -1 as the body of what is none."""
+        """The capsules on the device, capsule i of a tree at ``i * trees + tree``; -1 as the body of what does not
+        collide."""
         start = capsules.tree_start
         number = np.arange(start[-1]) - np.repeat(start[:-1], np.diff(start))
         self._capsule_count = (int(number.max(initial=-1)) + 1) * self._trees
-        at = number * self._trees + np.repeat(np.arange(self._trees), np.diff(start))
+        tree = np.repeat(np.arange(self._trees), np.diff(start))
+        at = number * self._trees + tree
         given: dict[str, np.ndarray] = {}
         for name in structs.Capsules.vars:
             source = getattr(capsules, name)
@@ -127,7 +135,11 @@ class ResidentContacts:
                 given[name] = np.zeros((self._capsule_count, *source.shape[1:]), source.dtype)
                 given[name][at] = source
         given["body"][:] = -1
-        given["body"][at] = self.plants.buffers.slots[capsules.body]
+        state = self.plants.state
+        collides = (capsules.level == 0) | (capsules.level == 1 + state.tree_fine[tree])
+        if len(state.bunch_attached):
+            collides &= (capsules.bunch < 0) | state.bunch_attached[capsules.bunch]
+        given["body"][at[collides]] = self.plants.buffers.slots[capsules.body[collides]]
         return self._on_device(structs.Capsules, capsules.struct, **given)
 
     @property
@@ -168,31 +180,31 @@ class ResidentContacts:
 
     def _allocate(self) -> None:
         trees, slots = self._trees, self.slots
+        self._groups = 1 if self._device.is_cpu else min(trees, WARPS)
         rows = 3 * slots
-        capsules = self._capsule_count // trees
         self.candidates = self._allocated(structs.Candidates, {}, {})
         for name in ("feature", "other", "gap", "end_gap", "normal", "point"):
-            dtype = structs.Candidates.vars[name].type.dtype
-            setattr(self.candidates, name, self._by_slot(dtype, capsules * CAPSULE_SLOTS))
-        of_all = dict.fromkeys(structs.Contacts.vars, trees * slots) | {"island": 1}
-        self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("block", "place"), slots), {})
-        self.contacts.place.assign(np.arange(slots, dtype=np.int32))
-        of_rows = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
-        self.rows = self._allocated(structs.Rows, of_rows | {"delassus": trees * rows * rows}, {"plant_jacobian": 12})
-        of_rows = dict.fromkeys(("columns", "impulse_first", "impulse_before", "direction"), trees * rows)
-        self._scratch = self._allocated(structs.SolverScratch, of_rows | {"matrix": trees * rows * rows}, {})
+            setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, slots))
+        of_all: dict[str, int] = dict.fromkeys(structs.Contacts.vars, trees * slots)
+        self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("island", "block", "place"), 1), {})
+        of_rows: dict[str, int] = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
+        self.rows = self._allocated(structs.Rows, of_rows, {"plant_jacobian": 12})
+        self._system = self._allocated(TreeSystem, {"free": trees * rows, "velocity": trees * rows}, {})
+        self._system.matrix = self._zeros(float, trees * rows, rows)
+        self._system.friction, self._system.compliance = self.contacts.friction, self.contacts.compliance
+        self._system.impulse = self.rows.impulse
+        self._search = self._allocated(TreeSearch, dict.fromkeys(TreeSearch.vars, trees * rows), {"factor": rows + 1})
+        busy_rows = self._groups * rows
+        self._dense = self._allocated(TreeSystem, dict.fromkeys(TreeSystem.vars, busy_rows), {"matrix": rows})
+        self._dense_search = self._allocated(
+            TreeSearch, dict.fromkeys(TreeSearch.vars, busy_rows), {"factor": rows + 1}
+        )
         of_all = dict.fromkeys(structs.WarmStart.vars, trees * slots) | {"count": trees}
         self._warm_start = self._allocated(structs.WarmStart, of_all, {})
-        lists = {"contact": slots, "first_block": 2, "first_dof": 2, "start": 2 * trees, "sweeps": trees}
-        self.islands = self._allocated(structs.Islands, lists, {})
-        self.islands.contact.assign(np.arange(slots, dtype=np.int32))
-        self.islands.first_block.assign(np.array([0, 1], np.int32))
-        of_trees = dict.fromkeys(("count", "is_impact", "dropped", "loaded_count"), trees)
-        of_trees |= {"loaded": trees * slots, "found": self._capsule_count, "hits": self._capsule_count}
-        self._tree_contacts = self._allocated(tree_islands.TreeContacts, of_trees, {})
-        self._response = self._allocated(
-            tree_islands.ResponseRows, dict.fromkeys(("a", "alpha"), slots * self._places), {}
-        )
+        of_trees = dict.fromkeys(("count", "is_impact", "dropped", "sweeps", "loaded_count", "busy"), trees)
+        of_trees |= {"loaded": trees * slots, "near": trees * slots * PAIRS_PER_SLOT}
+        self._tree_contacts = self._allocated(tree_narrowphase.TreeContacts, of_trees, {})
+        self._response = self._allocated(tree_delassus.ResponseRows, dict.fromkeys(("a", "alpha"), trees * slots), {})
         self._was_in_contact = self._zeros(wp.bool, trees)
 
     # ------------------------------------------------------------------ kernels
@@ -200,37 +212,45 @@ class ResidentContacts:
     def _bind(self) -> list[tuple[Any, int]]:
         """Every kernel of a step, bound to its arrays, with its number of threads."""
         p, plants, trees = self.parameters, self.plants.launches, self._trees
-        fill, s, arrays = plants.fill, plant_structs, self.plants.buffers.arrays
+        fill, s, arrays = plants.fill_resident, plant_structs, plants.resident_arrays
         device = str(self._device)
         parameters, capsules, geoms = self._numbers, self._capsules, self._geoms
         model, forces, joints = fill(s.ArticulationModel), fill(s.AppliedForces), fill(s.JointState)
         bodies, factors = fill(s.BodyState), fill(s.Factors)
         scratch, prediction, work = fill(s.Scratch), fill(s.Prediction), fill(s.WrenchScratch)
         onset, contacts = self.plants.onset_steps, self._tree_contacts
+        width = 3 * self.slots
+        few, lanes = (1, 1) if self._device.is_cpu else (FIRST_LANES, WARP_SIZE)
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
             block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
             return bind_launch(kernel, list(given), [], device=device, block=block), count
 
+        is_round = np.isin(self._geoms.kind.numpy(), (PLANE, SPHERE, CAPSULE)).all()
+        find = tree_narrowphase.find_round_tree_contacts if is_round else tree_narrowphase.find_tree_contacts
+        compliances = fill(tree_delassus.BodyCompliances, P="M", Q="H", R="J")  # free since the prediction
         return [
-            bound(tree_islands.find_capsule_contacts, self._capsule_count, parameters, capsules, geoms, trees,
-                  CAPSULE_SLOTS, self._tree_states, self._bodies, self._rigid_bodies, self._hulls, self._geom_states,
-                  self._static_blocks, self._capsule_states, contacts, self.candidates),
-            bound(tree_islands.list_tree_contacts, trees, trees, CAPSULE_SLOTS, self.slots, contacts, self.contacts,
-                  self.islands),
+            bound(find, trees, parameters, capsules, geoms, trees, self.slots,
+                  self._bodies, self._rigid_bodies, self._hulls, self._geom_states, self._static_blocks,
+                  self._capsule_states, contacts, self.candidates),
             bound(tree_islands.predict_impacted_trees, trees, plants.parameters, model, onset, contacts.is_impact,
                   forces, joints, arrays["phi_used"], arrays["tree_euler_steps"], bodies, factors, scratch, prediction),
             bound(tree_islands.write_tree_rows, trees * self.slots, parameters, self._pairs, capsules, geoms, trees,
                   self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts, self.contacts,
                   self.rows),
-            bound(tree_islands.respond_to_rows, trees * self.slots, model, arrays["body_branches"], trees, self._places,
-                  factors, contacts, self.contacts, self._response, self.rows),
-            bound(tree_islands.solve_trees, trees, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts,
-                  p.solver_tolerance, parameters, geoms, trees, self._rigid_bodies, contacts, self.contacts,
-                  self.islands, self._scratch, self.rows, self._warm_start, arrays["body_wrench"]),
-            bound(tree_islands.apply_contact_wrenches, trees, self.plants.dt, model, onset, contacts,
-                  arrays["body_wrench"], factors, self._was_in_contact, arrays["tree_euler_steps"], work, scratch,
-                  prediction),
+            bound(tree_delassus.respond_at_contacts, trees, model, arrays["body_branches"], trees, factors,
+                  self.contacts, self.rows, contacts, compliances, self._response),
+            bound(tree_delassus.write_delassus, trees * self.slots, model, trees, width, factors, contacts,
+                  self.contacts, self.rows, compliances, self._response, self._system),
+            bound(tree_islands.solve_trees, trees * few, p.solver_sweeps, p.solver_newton_steps,
+                  p.solver_newton_contacts, p.solver_tolerance, trees, width, few, contacts, self._system,
+                  self._search),
+            bound(tree_islands.solve_busy_trees, self._groups * lanes, p.solver_sweeps, p.solver_newton_steps,
+                  p.solver_newton_contacts, p.solver_tolerance, trees, width, lanes, self._groups, contacts,
+                  self._system, self._dense, self._dense_search),
+            bound(tree_islands.apply_tree_impulses, trees, parameters, model, arrays["body_branches"], onset, trees,
+                  width, self.rows, self._system, factors, self._was_in_contact, arrays["tree_euler_steps"], contacts,
+                  self.contacts, self._warm_start, arrays["body_wrench"], work, scratch, prediction),
         ]  # fmt: skip
 
     def solve(self) -> None:
@@ -253,7 +273,7 @@ class ResidentContacts:
     @property
     def sweeps(self) -> np.ndarray:
         """[tree] sweeps of the last solve of trees in contact."""
-        return np.where(self.count > 0, self.islands.sweeps.numpy(), 0)
+        return np.where(self.count > 0, self._tree_contacts.sweeps.numpy(), 0)
 
     @property
     def force(self) -> np.ndarray:

@@ -330,14 +330,8 @@ class ArticulationSolver:
         ``impulse_response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of
         body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees.
         """
-        self._require_stepped(bodies)
+        self.require_stepped(bodies)
         return self.launches.dense_impulse_response(bodies)
-
-    def impulse_response_by_tree(self, bodies: np.ndarray) -> np.ndarray:
-        """:meth:`impulse_response` without its zeros, [n, 6, m, 6]: entry [u, :, t] for the t-th listed body of the
-        tree of body u. Bodies of one tree must be neighbours in ``bodies``. A view, good until the next call."""
-        self._require_stepped(bodies)
-        return self.launches.impulse_response(bodies)
 
     def integrate(self, bodies: np.ndarray | None = None, wrenches: np.ndarray | None = None) -> None:
         """End the step: wrenches (N, N m, world, at the bodies' origins) act over it, joints move.
@@ -348,7 +342,7 @@ class ArticulationSolver:
         count = len(self._runner.stepped)
         self._wrench[loaded], self._loaded_bodies = 0.0, _NO_TREES
         if bodies is not None and len(bodies):
-            self._require_stepped(bodies)
+            self.require_stepped(bodies)
             np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
             self._loaded_bodies = np.array(bodies, np.int32)
             touched = np.array(sorted(set(self.model.body_tree[bodies].tolist())), np.int32)
@@ -423,7 +417,8 @@ class ArticulationSolver:
         """List trees [k] for the kernels that do not work on all awake ones."""
         self._subset[: len(trees)] = trees
 
-    def _require_stepped(self, bodies: np.ndarray) -> None:
+    def require_stepped(self, bodies: np.ndarray) -> None:
+        """:class:`ValueError` unless the trees of ``bodies`` [k] were in the last prediction."""
         if bodies is self._checked or len(bodies) == 0:
             return
         bodies = self._checked = np.asarray(bodies)

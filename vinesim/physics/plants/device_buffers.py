@@ -12,6 +12,7 @@ far as the largest of them goes. Its 32 threads in step then read one stretch of
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -127,14 +128,24 @@ class DeviceBuffers:
 
     def add_shared(self, name: str, data: np.ndarray, dtype: type) -> None:
         """An array that kernels read and write where it is; with a GPU it must come from :meth:`pinned`."""
+        self.arrays[name], self.host[name] = self.reach(data, dtype, name), data
+
+    def reach(self, data: np.ndarray, dtype: Any, name: str) -> wp.array:
+        """The same memory for kernels; with a GPU it must come from :meth:`pinned`. ``name``: for messages."""
         if self.device.is_cpu:
             shared = wp.array(data, dtype=dtype, device="cpu", copy=False)
             if data.size and shared.ptr != data.ctypes.data:
                 raise ValueError(f"{name} cannot be shared with Warp; give a C-contiguous array of its own")
-        else:
-            shape = data.shape if dtype in (float, wp.int32, wp.bool) else data.shape[:1]
-            shared = wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
-        self.arrays[name], self.host[name] = shared, data
+            return shared
+        shape = data.shape[: data.ndim - len(getattr(dtype, "_shape_", ()))]
+        return wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
+
+    def host_array(self, name: str) -> wp.array:
+        """A shared array as one of the host, to be copied from or to."""
+        shared, data = self.arrays[name], self.host[name]
+        if self.device.is_cpu or data.size == 0:
+            return shared
+        return wp.array(ptr=data.ctypes.data, shape=shared.shape, dtype=shared.dtype, device="cpu", pinned=True)
 
     def add_body_rows(self, name: str, data: np.ndarray, dtype: type, *, body_indices: bool = False) -> None:
         """An array with a row of four-byte numbers for each body, written by both sides.

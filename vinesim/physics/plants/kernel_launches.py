@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -42,6 +43,13 @@ DEVICE_RESULTS = (
     "body_q", "body_qd", "joint_xd_free", "joint_qd_free", "body_acceleration", "body_qd_free", "body_impulse",
 )  # fmt: skip
 """Rows that kernels write, or that are carried over when they are needed."""
+TREE_INPUTS = (
+    "stepping", "tree_moving", "tree_phi", "tree_euler_steps", "tree_steps", "tree_awake", "tree_budget",
+    "tree_air", "root_turn", "root_turn_rate", "tie_stiffness", "tie_damping", "tie_anchor", "tie_anchor_velocity",
+)  # fmt: skip
+"""Lists and numbers of trees and ties that kernels of a step read."""
+TREE_RESULTS = ("tree_euler_steps", "phi_used", "tree_rate")
+"""Numbers of trees that they write."""
 SCRATCH = {
     wp.vec3: ("lever", "tension", "Du"),
     wp.quat: ("axes",),
@@ -72,12 +80,25 @@ MIN_CAPACITY = 16
 """Bodies that a list holds at least."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """The launches of a step on the same arrays."""
+
+    predict_groups: Launch
+    """Over groups of trees; on a GPU each tree is a group."""
+    predict: Launch
+    integrate: Launch
+    correct_floating_momentum: Launch
+
+
 class KernelLaunches:
     """Launches of the articulation kernels on the arrays of one solver.
 
     Arrays of the model are constants. What has a row for each body a GPU keeps a copy of, see
     :mod:`vinesim.physics.plants.device_buffers`: :data:`STEP_INPUTS`, :data:`DEVICE_RESULTS`, and all others, which
-    :meth:`upload_changed` carries over when :attr:`changed` says so. Everything else a GPU reads where it is.
+    :meth:`upload_changed` carries over when :attr:`changed` says so. Everything else a GPU reads where it is, which in
+    many steps on end would cost more than the steps: those have copies of :data:`TREE_INPUTS` as well, and launches of
+    their own (:attr:`resident`), with :meth:`upload_trees` before and :meth:`download_trees` after.
     """
 
     def __init__(
@@ -95,8 +116,19 @@ class KernelLaunches:
         self._seldom: list[str] = []
         self._register_arrays(solver)
         self._record_transfers()
+        self._arrays = self.buffers.arrays
         self.parameters = self.fill(structs.SolverParameters, **parameters)
         self._record_step(self.parameters)
+        self.shared = Step(
+            self.predict_groups or self.predict, self.predict, self.integrate, self.correct_floating_momentum
+        )
+        """The launches of a step on what NumPy sees."""
+        self.resident = self.shared
+        """Those of steps between which nothing comes back to the host."""
+        self.resident_arrays = self.buffers.arrays
+        """The arrays that these work on."""
+        if self.buffers.has_copies:
+            self._record_resident(self.parameters)
         self._record_impact(
             self.fill(structs.SolverParameters, **(parameters | {"fast_rate": math.inf, "geometric_stiffness": 0.0}))
         )
@@ -148,7 +180,14 @@ class KernelLaunches:
     def fill(self, struct: Any, **values: Any) -> Any:
         """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named
         so."""
-        filled, arrays = struct(), self.buffers.arrays
+        return self._filled(struct, self._arrays, values)
+
+    def fill_resident(self, struct: Any, **values: Any) -> Any:
+        """The same with the arrays of :attr:`resident`."""
+        return self._filled(struct, self.resident_arrays, values)
+
+    def _filled(self, struct: Any, arrays: dict[str, wp.array], values: dict[str, Any]) -> Any:
+        filled = struct()
         values = {"pitch": self.buffers.pitch} | values
         for field in structs.fields(struct):
             value = values.get(field, field)
@@ -157,7 +196,7 @@ class KernelLaunches:
 
     def record(self, kernel: Any, *arguments: object, **options: Any) -> Launch:
         """Bind a kernel; a string among the arguments names an array."""
-        given = [self.buffers.arrays[value] if isinstance(value, str) else value for value in arguments]
+        given = [self._arrays[value] if isinstance(value, str) else value for value in arguments]
         return bind_launch(kernel, given, [], device=str(self.buffers.device), **options)
 
     # ------------------------------------------------------------------ transfers of the listed trees' rows
@@ -187,52 +226,84 @@ class KernelLaunches:
         self._model, self._forces = fill(s.ArticulationModel), fill(s.AppliedForces)
         joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
-        partitioned = {"index_list": "trees", "partitions": self._threads}
-        kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
-        self.predict, self.predict_subset = (
-            record(
-                kernel[0], parameters, self._model, *kernel[1], trees, "tree_phi", "tree_euler_steps", "tree_steps",
-                self._forces, joints, "phi_used",
-                self._bodies, self._factors, scratch, prediction, **options,
-            )
-            for trees, options in (("stepping", partitioned), ("subset", {"index_list": "trees"}))
-        )  # fmt: skip
+        self.predict = self._record_predict(parameters, "stepping", self._threads)
+        self.predict_subset = self._record_predict(parameters, "subset", 1)
         self.predict_groups = (
             None if self.buffers.has_copies else self._record_groups(parameters, joints, scratch, prediction)
         )
         """Predicts groups of trees, on a CPU."""
-        apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
-        begin = record(
-            begin_budget, parameters, self._model, "stepping", "tree_budget", "tree_phi", self._forces, joints,
-            self.budget, apart, **partitioned,
-        )  # fmt: skip
-        move = record(
-            integrate, parameters, self._model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
-            "tree_rate", "tree_euler_steps", joints, **partitioned,
-        )  # fmt: skip
-        keep = record(
-            keep_budget, parameters, self._model, "stepping", "tree_budget", "tree_phi", "tree_steps", "tree_rate",
-            self._forces, self.budget,
-            "tree_euler_steps", joints, apart, self._factors, scratch,
-            fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"), **partitioned,
-        )  # fmt: skip
-        self.integrate = self._keeping_budgets(begin, move, keep)
+        self.integrate = self._record_integrate(parameters)
         self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
         self.apply_wrenches = record(
             apply_wrenches, parameters.dt, self._model, "subset", "body_wrench", self._factors, fill(s.WrenchScratch),
             scratch, prediction,
         )  # fmt: skip
-        self.correct_floating_momentum = record(
-            correct_floating_momentum, parameters, self._model, "floating", "phi_used", "tree_rate", "tree_steps",
-            self._forces, self._bodies, "body_acceleration", "lever", fill(s.FloatingScratch), joints,
-            index_list="roots",
-        )  # fmt: skip
-
+        self.correct_floating_momentum = self._record_momentum(parameters)
         self.choose_budget = record(choose_budget, parameters, self._model, "stepping", scratch, "tree_budget")
         self.count_substeps = record(
             first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
             scratch, fill(s.WrenchScratch), "tree_substeps",
         )  # fmt: skip
+
+    def _record_predict(self, parameters: Any, trees: str, partitions: int) -> Launch:
+        fill, s = self.fill, structs
+        kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
+        return self.record(
+            kernel[0], parameters, fill(s.ArticulationModel), *kernel[1], trees, "tree_phi", "tree_euler_steps",
+            "tree_steps", fill(s.AppliedForces), fill(s.JointState), "phi_used", fill(s.BodyState), fill(s.Factors),
+            fill(s.Scratch), fill(s.Prediction), index_list="trees", partitions=partitions,
+        )  # fmt: skip
+
+    def _record_integrate(self, parameters: Any) -> Launch:
+        """An integration, with the energy budgets around it."""
+        fill, record, s = self.fill, self.record, structs
+        model, forces, joints, prediction = (
+            fill(struct) for struct in (s.ArticulationModel, s.AppliedForces, s.JointState, s.Prediction)
+        )
+        partitioned = {"index_list": "trees", "partitions": self._threads}
+        apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
+        begin = record(
+            begin_budget, parameters, model, "stepping", "tree_budget", "tree_phi", forces, joints,
+            self.budget, apart, **partitioned,
+        )  # fmt: skip
+        move = record(
+            integrate, parameters, model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
+            "tree_rate", "tree_euler_steps", joints, **partitioned,
+        )  # fmt: skip
+        keep = record(
+            keep_budget, parameters, model, "stepping", "tree_budget", "tree_phi", "tree_steps", "tree_rate",
+            forces, self.budget, "tree_euler_steps", joints, apart, fill(s.Factors), fill(s.Scratch),
+            fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"), **partitioned,
+        )  # fmt: skip
+        return self._keeping_budgets(begin, move, keep)
+
+    def _record_momentum(self, parameters: Any) -> Launch:
+        fill, s = self.fill, structs
+        return self.record(
+            correct_floating_momentum, parameters, fill(s.ArticulationModel), "floating", "phi_used", "tree_rate",
+            "tree_steps", fill(s.AppliedForces), fill(s.BodyState), "body_acceleration", "lever",
+            fill(s.FloatingScratch), fill(s.JointState), index_list="roots",
+        )  # fmt: skip
+
+    def _record_resident(self, parameters: Any) -> None:
+        """The launches of a step once more, on copies of what there is of each tree."""
+        device, shared = self.buffers.device, self.buffers.arrays
+        names = dict.fromkeys(TREE_INPUTS + TREE_RESULTS)
+        copies = {name: wp.empty_like(shared[name], device=device) for name in names}
+        self.resident_arrays = self._arrays = shared | copies
+        predict = self._record_predict(parameters, "stepping", 1)
+        self.resident = Step(predict, predict, self._record_integrate(parameters), self._record_momentum(parameters))
+        self._arrays = shared
+
+    def upload_trees(self) -> None:
+        """Bring the arrays of :attr:`resident` up to those that NumPy sees."""
+        for name in TREE_INPUTS if self.buffers.has_copies else ():
+            wp.copy(self.resident_arrays[name], self.buffers.host_array(name))
+
+    def download_trees(self) -> None:
+        """The other way round, what kernels write."""
+        for name in TREE_RESULTS if self.buffers.has_copies else ():
+            wp.copy(self.buffers.host_array(name), self.resident_arrays[name])
 
     def list_budgets(self, trees: np.ndarray) -> None:
         """These trees [k] have energy budgets (:mod:`vinesim.kernels.articulation.energy_budget`), no others."""

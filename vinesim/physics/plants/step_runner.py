@@ -18,7 +18,7 @@ from vinesim.kernels.articulation.energy_budget import NO_BUDGET
 from vinesim.kernels.articulation.lane_records import LANES
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.plants.kernel_launches import KernelLaunches
+from vinesim.physics.plants.kernel_launches import KernelLaunches, Step
 from vinesim.physics.plants.topology import Topologies, group_starts
 
 MIN_GROUPS_PER_THREAD = 4
@@ -91,8 +91,6 @@ class StepRunner:
         """Place in the list at which each group begins, and the end of the list."""
         self._whole_groups = 0
         """Groups of the trees of whole steps: the first ones."""
-        self._predict = launches.predict_groups or launches.predict
-        """Predicts groups."""
         self._group_ends, self._whole_group_ends, self._whole_ends = ([0] * (self._threads + 1) for _ in range(3))
         """Thread i works on groups ``_group_ends[i]`` to ``_group_ends[i + 1]``; the same of the groups of whole steps,
         and of their trees."""
@@ -102,7 +100,10 @@ class StepRunner:
 
         self._parts = {
             launch: [part(launch, ends, i) for i in range(self._threads)]
-            for launch, ends in ((self._predict, self._group_ends), (launches.integrate, self._whole_ends))
+            for launch, ends in (
+                (launches.shared.predict_groups, self._group_ends),
+                (launches.integrate, self._whole_ends),
+            )
         }
 
     # ------------------------------------------------------------------ which trees, in which order
@@ -171,7 +172,7 @@ class StepRunner:
         """Predict the listed trees over the whole step."""
         if len(self.fast):
             self._steps_of[self.fast] = 1
-        self._launch(self._predict, len(self._starts) - 1, MIN_GROUPS_PER_THREAD)
+        self._launch(self._launches.shared.predict_groups, len(self._starts) - 1, MIN_GROUPS_PER_THREAD)
 
     def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
         """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
@@ -183,7 +184,7 @@ class StepRunner:
         self._launches.look_for_budgets()
         self._launch(self._launches.integrate, self._whole, MIN_INTEGRATED_TREES_PER_THREAD)
         self._launches.correct_floating_momentum(self._roots)
-        self._take_substeps(self._levels, self._whole, 0, self._root_levels)
+        self._take_substeps(self._launches.shared, self._levels, self._whole, 0, self._root_levels)
 
     def _launch(self, launch: Callable[..., None], count: int, least: int) -> None:
         """Launch over the first trees or groups of the list, on all threads if there are ``least`` for each."""
@@ -192,12 +193,12 @@ class StepRunner:
         else:
             self._pool.run(self._parts[launch])
 
-    def _take_substeps(self, levels: Levels, first: int, partition: int, roots: Levels = ()) -> None:
+    def _take_substeps(self, step: Step, levels: Levels, first: int, partition: int, roots: Levels = ()) -> None:
         for level, count in enumerate(levels):
-            self._launches.predict(count, first, partition)
-            self._launches.integrate(count, first, partition)
+            step.predict(count, first, partition)
+            step.integrate(count, first, partition)
             if level < len(roots):
-                self._launches.correct_floating_momentum(roots[level], self._roots)
+                step.correct_floating_momentum(roots[level], self._roots)
 
     # ------------------------------------------------------------------ many steps
 
@@ -211,6 +212,7 @@ class StepRunner:
         if count == 0:
             return
         self._launches.look_for_budgets(steps)
+        self._launches.upload_trees()
         if not self._buffers.device.is_cpu:
             what = (self._whole, self._levels, self._roots, self._root_levels, between)
             if self._graph is None or self._graph_of != what:
@@ -219,12 +221,13 @@ class StepRunner:
                 self._graph, self._graph_of = capture.graph, what
             for _ in range(steps):
                 wp.capture_launch(self._graph)  # pyright: ignore[reportArgumentType]  (captured above)
-            self._buffers.synchronize()
         elif self._pool is None or count < self._threads or len(roots) or between is not None:
             self._steps(steps, between)
         else:
             shares = enumerate(self._shares_of_substeps())
             self._pool.run([functools.partial(self._steps_of_part, steps, i, levels, at) for i, (at, levels) in shares])
+        self._launches.download_trees()
+        self._buffers.synchronize()
 
     def _shares_of_substeps(self) -> list[tuple[int, Levels]]:
         """For each thread where its fast trees begin in the list, and how many take each substep."""
@@ -233,20 +236,22 @@ class StepRunner:
         return [(self._whole + int(a), _levels(self._steps_of[fast[a:b]])) for a, b in itertools.pairwise(ends)]
 
     def _steps(self, steps: int, between: Callable[[], None] | None) -> None:
+        step = self._launches.resident
         for _ in range(steps):
-            self._predict(self._whole_groups)
+            step.predict_groups(self._whole_groups)
             if between is not None:
                 between()
-            self._launches.integrate(self._whole)
-            self._launches.correct_floating_momentum(self._roots)
-            self._take_substeps(self._levels, self._whole, 0, self._root_levels)
+            step.integrate(self._whole)
+            step.correct_floating_momentum(self._roots)
+            self._take_substeps(step, self._levels, self._whole, 0, self._root_levels)
 
     def _steps_of_part(self, steps: int, partition: int, levels: Levels, fast: int) -> None:
         groups, ends = self._whole_group_ends[partition : partition + 2], self._whole_ends[partition : partition + 2]
+        step = self._launches.resident
         for _ in range(steps):
-            self._predict(groups[1] - groups[0], groups[0], partition)
-            self._launches.integrate(ends[1] - ends[0], ends[0], partition)
-            self._take_substeps(levels, fast, partition)
+            step.predict_groups(groups[1] - groups[0], groups[0], partition)
+            step.integrate(ends[1] - ends[0], ends[0], partition)
+            self._take_substeps(step, levels, fast, partition)
 
 
 def _levels(steps: np.ndarray) -> Levels:

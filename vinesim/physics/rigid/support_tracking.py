@@ -5,7 +5,8 @@ object that has been still in its support's frame for ``support_rest_duration`` 
 bunch in a box, a box on a robot. It stays at rest until it has moved by more than a band. Then its support is
 determined
 anew among what it touches, the ground before all others: a box that is pushed along the ground is not supported by what
-pushes it. Hands of people are no supports: their copies on other clients are not exact enough.
+pushes it. Hands of people are no supports, as their copies on other clients are not exact enough: what they hold is
+never at rest.
 """
 
 from __future__ import annotations
@@ -69,6 +70,7 @@ class SupportTracker:
         self._update_tables()
         d, move_speed = self.rigid.mj_data, self.rigid.parameters.support_move_speed
         self._still_steps += 1
+        self._still_steps[self._held_rows()] = 0
         speed = d.qvel[self._v[:, None] + np.arange(3)]
         self._slow_steps = np.where((speed * speed).sum(1) > move_speed * move_speed, 0, self._slow_steps + 1)
         self._touching_pairs, self._touched = self._find_touching_pairs(), None
@@ -96,6 +98,12 @@ class SupportTracker:
             self.rigid.update_kinematics()
             self._anchor_pose[restarted] = self._relative(self._poses(restarted), self._support[restarted])
             self._still_steps[restarted] = 0
+
+    def _held_rows(self) -> list[int]:
+        """Rows of what hands hold: at rest it would stay where it is when the hand opens."""
+        held = (hand.held for name in self.rigid.humans for hand in self.rigid.human(name).hands)
+        numbers = (parse_object_name(one[0]) for one in held if one is not None)
+        return [self._row_of_object[number] for number in numbers if number in self._row_of_object]
 
     @property
     def moving(self) -> list[int]:

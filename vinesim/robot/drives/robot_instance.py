@@ -11,6 +11,7 @@ from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.odometry import TrackOdometry
 from vinesim.scene.values import Contact, JointSample, Lights, RobotSample
+from vinesim.scene.values.signals import Color
 
 
 class RobotInstance:
@@ -40,7 +41,7 @@ class RobotInstance:
             rigid.add_robot(spec)
         self.lights = Lights()
         """Indicator lights."""
-        self._shown_color: tuple[int, int, int] | None = None
+        self._shown_color: Color | None = None
         back = frames.conjugate(spec.pose[3:])
         self._start = spec.pose[:3].copy()
         self._start_turn = frames.to_matrix(back)
@@ -48,6 +49,11 @@ class RobotInstance:
         """[4, 4]: quaternion product with the inverse of the start's, as a matrix"""
         self._tracks_slip = any(description.base_limits.slip)
         self._track_odometry = TrackOdometry(*description.base_limits.slip, spec.pose)
+
+    @property
+    def shown_lights(self) -> Color | None:
+        """What the indicator lights show now, :data:`UNLIT` between flashes; None: off."""
+        return self._shown_color
 
     def show_lights(self, time: float) -> None:
         """Let the indicator lights flash as they are at a ``time`` of the world [s]; cheap while nothing changes."""

@@ -29,10 +29,9 @@ from trajectory_msgs.msg import JointTrajectoryPoint
 
 from vinesim.ros.messages.transforms import split_time
 from vinesim.scene.camera_geometry import (
-    DISTORTION,
-    DISTORTION_MODEL,
     POINT_DTYPE,
     depth_millimetres,
+    distortion_model,
     intrinsic_matrix,
     write_points,
 )
@@ -261,10 +260,10 @@ def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
 
 
 def camera_info(info: CameraInfo, time: float) -> CameraInfoMessage:
-    """Intrinsics: plumb_bob without distortion, rectification is the identity."""
+    """Intrinsics and distortion; rectification is the identity, and a rectified picture has the same matrix."""
     message = CameraInfoMessage(header=header(time, info.frame_id), width=info.width, height=info.height)
-    message.distortion_model = DISTORTION_MODEL
-    message.d = array.array("d", DISTORTION)
+    message.distortion_model, coefficients = distortion_model(info)
+    message.d = array.array("d", coefficients)
     message.k = intrinsic_matrix(info)
     message.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
     message.p = [info.fx, 0.0, info.cx, 0.0, 0.0, info.fy, info.cy, 0.0, 0.0, 0.0, 1.0, 0.0]

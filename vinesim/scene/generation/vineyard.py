@@ -25,6 +25,8 @@ from vinesim.scene.generation.ties import find_ties
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.plant_import.imported_plant import load_imported_plant
+from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Scene, Sun, Wind
 
@@ -43,9 +45,10 @@ def generate(scene: Scene) -> Model:
 
     # what no plant depends on does not name another model
     plants = msgspec.structs.replace(
-        scene, name="", sun=Sun(), wind=Wind(), spawns=(), physics=PhysicsParameters(), plants=""
+        scene, name="", sun=Sun(), wind=Wind(), spawns=(), physics=PhysicsParameters(), plants="", imported=()
     )
-    digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters)))
+    imported = [(load_imported_plant(one.file), msgspec.structs.replace(one, file="")) for one in scene.imported]
+    digest = disk_cache.source_digest(_code_digest(), msgspec.json.encode((plants, parameters, imported)))
     return Model(**disk_cache.load_or_make("vineyard", digest, make)).check()
 
 
@@ -69,7 +72,13 @@ def _generate(scene: Scene, parameters: VineParameters) -> Model:
     leaf = place_leaves(scene, parameters, shoots, bodies)
     ties = find_ties(scene, parameters, structure, shoots, bodies)
     model = _assemble_model(scene, parameters, structure, shoots, bodies, leaf, ties)
-    return builder.solve_rest_pose(model).check()
+    model = builder.solve_rest_pose(model).check()
+    variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
+    for number, one in enumerate(scene.imported, len(structure.foot)):
+        pose = frames.pose(np.array([one.x, one.y, one.z]), frames.from_yaw(one.yaw))
+        plant = build_model(load_imported_plant(one.file), pose, number, parameters, variety)
+        model = join_models(model, plant)
+    return model
 
 
 def _assemble_model(

@@ -18,7 +18,7 @@ Box = tuple[int, int, int, int]
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """Pinhole intrinsics (sensor_msgs/CameraInfo; plumb_bob with zero distortion)."""
+    """Intrinsics (sensor_msgs/CameraInfo)."""
 
     width: int
     height: int
@@ -28,6 +28,8 @@ class CameraInfo:
     cy: float
     frame_id: str
     """Optical frame: z forward, x right, y down."""
+    distortion: tuple[float, ...] = ()
+    """Coefficients of the lens (:mod:`vinesim.scene.lens_distortion`), 5 or 8; none: a pinhole."""
 
 
 class CameraOutput(enum.Flag):

@@ -31,6 +31,7 @@ from vinesim.sensors.camera.live_light import shadow_maps as shadow_maps_of
 from vinesim.sensors.camera.stereo import Stereo, StereoSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN, Sunlight, SunPath
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole, supersampled
+from vinesim.sensors.raster.lens_map import LensError, LensMap, lens_map
 from vinesim.sensors.scene.primitives import Primitives
 
 
@@ -49,6 +50,9 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     rate: Annotated[Number, "Hz", (0.01, 1000.0)]
     stereo: StereoSpec | None = None
     """How depth is measured; exactly unless given."""
+    distortion: Annotated[spec_file.Numbers | None, "1", (-1000.0, 1000.0)] = None
+    """Coefficients of the lens, in the order of sensor_msgs/CameraInfo: 5 (plumb_bob) or 8 (rational_polynomial). A
+    pinhole unless given. Colour, depth and labels show the same at the same pixel."""
 
     @classmethod
     def load(cls, name: str) -> CameraSpec:
@@ -59,6 +63,10 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
                 f"camera {name!r} measures from {spec.nearest.value} to {spec.farthest.value} m, which is no range; "
                 "give 0 <= nearest < farthest"
             )
+        try:
+            lens_map(spec.info(""))
+        except LensError as error:
+            raise spec_file.SensorError(f"camera {name!r}: {error}") from error
         return spec
 
     def ideal(self) -> CameraSpec:
@@ -84,6 +92,7 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             0.5 * (width - 1),
             0.5 * (height - 1),
             frame_id,
+            self.distortion.value if self.distortion is not None and any(self.distortion.value) else (),
         )
 
 
@@ -155,7 +164,9 @@ class Camera:
         if self.quality not in QUALITIES:
             raise ValueError(f"camera {self.name!r} has the quality {self.quality!r}; give {', '.join(QUALITIES)}")
         self._quality = quality = QUALITIES[self.quality]
-        width, height, samples = self.info.width, self.info.height, quality.samples
+        self._lens: LensMap = lens_map(self.info)
+        drawn = self._drawn = self._lens.pinhole
+        width, height, samples = drawn.width, drawn.height, quality.samples
         period = self.shadow_period
         if period is None:
             period = 0.0 if self.quality == "still" else 0.2
@@ -179,7 +190,7 @@ class Camera:
         reach = self.spec.nearest.value, self.spec.farthest.value
         self._stereo = self.spec.stereo and Stereo(
             self.spec.stereo,
-            self.info,
+            drawn,
             reach,
             self.device,
             second_from_first=quality.is_live,
@@ -199,12 +210,12 @@ class Camera:
         Only ``outputs`` are made; the other arrays of the frame have the size 0.
         """
         pose = np.array(pose, float)
-        shape = (self.info.height, self.info.width)
+        shape = (self._drawn.height, self._drawn.width)
         # a stereo camera matches by the texture of the picture
         is_lit = CameraOutput.RGB in outputs or (CameraOutput.DEPTH in outputs and self._stereo is not None)
         measures = self._stereo is not None and CameraOutput.DEPTH in outputs
         picture = self.render_on_device(primitives, pose, time, is_lit=is_lit, measures=measures)
-        lens, measured = pinhole(self.info, pose), None
+        lens, measured = pinhole(self._drawn, pose), None
         if measures and self._stereo and self.device != "cpu":
             assert picture is not None
             measured = self._stereo.measure_on_device(primitives, lens, self.rasterizer.depth, picture)
@@ -231,10 +242,12 @@ class Camera:
             name=self.name,
             info=self.info,
             pose=pose,
-            rgb=rgb if CameraOutput.RGB in outputs else np.zeros((0, 0, 3), np.uint8),
-            depth=depth,
-            labels=labels.reshape(-1, shape[1]),
-            exact_depth=exact if CameraOutput.EXACT_DEPTH in outputs else np.zeros((0, 0), np.float32),
+            rgb=self._lens.smooth(rgb) if CameraOutput.RGB in outputs else np.zeros((0, 0, 3), np.uint8),
+            depth=self._lens.nearest(depth) if depth.size else depth,
+            labels=self._lens.nearest(labels.reshape(shape)) if labels.size else labels.reshape(0, 0),
+            exact_depth=(
+                self._lens.nearest(exact) if CameraOutput.EXACT_DEPTH in outputs else np.zeros((0, 0), np.float32)
+            ),
         )
 
     def _download(self, *arrays: wp.array | None) -> list[np.ndarray]:
@@ -262,7 +275,7 @@ class Camera:
         is_lit: bool = True,
         measures: bool = False,
     ) -> wp.array | None:
-        """The colours [pixel, 3] of the frame, where they were made: on a GPU, nothing is waited for.
+        """The colours [pixel, 3] without distortion, where they were made: on a GPU, nothing is waited for.
 
         None, and depth and labels alone, unless ``is_lit``. ``measures``: the noise of a stereo measurement is drawn
         meanwhile.
@@ -270,7 +283,7 @@ class Camera:
         if self.device == "cpu":
             load_camera_kernels()
         pose = np.array(pose, float)
-        lens = pinhole(self.info, pose)
+        lens = pinhole(self._drawn, pose)
         beside = []
         if measures and self._stereo:
             rng = spec_file.noise_rng(self.seed, self.name, self.image_index)
@@ -281,7 +294,7 @@ class Camera:
             return None
         seen, quality = self._supersampled, self._quality
         if quality.samples > 1:
-            lens = pinhole(supersampled(self.info, quality.samples), pose)
+            lens = pinhole(supersampled(self._drawn, quality.samples), pose)
             seen.draw(primitives, lens)
         near, far = self.update_shadows(primitives, pose, time)
         if self._live_light is not None:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from vinesim.scene.berries import VARIETIES
-from vinesim.scene.camera_geometry import DISTORTION, DISTORTION_MODEL, intrinsic_matrix
+from vinesim.scene.camera_geometry import distortion_model, intrinsic_matrix
 from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
 from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
 from vinesim.sensors.truth.ground_truth import PixelBuffers
@@ -34,12 +34,13 @@ def encode_mask(mask: np.ndarray) -> dict[str, Any]:
 
 def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
     """Intrinsics as sensor_msgs/CameraInfo names them [px], and the pose of the optical frame in the world."""
+    distortion, coefficients = distortion_model(info)
     return {
         "model": model,
         "width": info.width,
         "height": info.height,
-        "distortion_model": DISTORTION_MODEL,
-        "d": list(DISTORTION),
+        "distortion_model": distortion,
+        "d": list(coefficients),
         "k": intrinsic_matrix(info),
         "frame": "optical (REP-103): x right, y down, z forward",
         "position": pose[:3].tolist(),

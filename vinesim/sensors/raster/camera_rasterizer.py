@@ -52,6 +52,8 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
         raise ValueError(
             f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; give positive ones"
         )
+    if info.distortion:
+        raise ValueError(f"camera {info.frame_id!r} has distortion; draw lens_map(info).pinhole")
     pose = np.asarray(pose, float)
     if not np.isfinite(pose).all():
         raise ValueError(f"camera {info.frame_id!r} has the pose {pose.tolist()}; give finite numbers")

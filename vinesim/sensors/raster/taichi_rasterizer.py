@@ -8,8 +8,10 @@ real ones.
 """
 
 import contextlib
+import ctypes
 import functools
 import io
+from collections.abc import Iterator
 
 import numpy as np
 import taichi as ti
@@ -167,12 +169,27 @@ class TaichiRasterizer:
 @functools.cache
 def _start(gpu: bool) -> None:
     """Taichi, once a process; its greeting is kept from standard output, which belongs to the command."""
-    with contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.redirect_stdout(io.StringIO()), _floating_point_kept():
         if gpu:
             ti.init(arch=[ti.metal, ti.vulkan], enable_fallback=False, log_level=ti.ERROR)
         else:
             ti.init(arch=ti.cpu, log_level=ti.ERROR)
         ti.sync()
+
+
+@contextlib.contextmanager
+def _floating_point_kept() -> Iterator[None]:
+    """Leave the floating-point environment of this thread as it was.
+
+    Taichi switches denormal numbers off for whatever this thread computes from then on: physics in the same process
+    would have other bits than without a camera.
+    """
+    libm, environment = ctypes.CDLL(None), ctypes.create_string_buffer(64)  # fenv_t: 32 bytes on x86-64, 8 on AArch64
+    libm.fegetenv(environment)
+    try:
+        yield
+    finally:
+        libm.fesetenv(environment)
 
 
 def _pinhole_values(lens: pinhole.Pinhole) -> np.ndarray:

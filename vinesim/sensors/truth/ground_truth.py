@@ -15,11 +15,12 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.kernels.raster.primitives import FAR
-from vinesim.scene.camera_geometry import project_points
+from vinesim.scene.camera_geometry import pixel_rays, project_points
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraFrame, CameraInfo, Snapshot
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
+from vinesim.sensors.raster.lens_map import lens_map
 from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.ray_caster import RayCaster
@@ -64,7 +65,7 @@ def detect_bunches(frame: CameraFrame) -> tuple[Detection, ...]:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PixelBuffers:
-    """What every pixel of an ideal pinhole camera sees at one instant."""
+    """What every pixel of an ideal camera sees at one instant."""
 
     info: CameraInfo
     pose: np.ndarray
@@ -84,11 +85,13 @@ class PixelBuffers:
 
 
 def render_buffers(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -> PixelBuffers:
-    """Look from ``pose`` [7] (optical frame) through a pinhole."""
-    seen = CameraRasterizer(info.width, info.height, primitives.device)
-    seen.draw(primitives, pinhole(info, pose))
+    """Look from ``pose`` [7] (optical frame) through the lens, without noise."""
+    view = lens_map(info)
+    shape = view.pinhole.height, view.pinhole.width
+    seen = CameraRasterizer(shape[1], shape[0], primitives.device)
+    seen.draw(primitives, pinhole(view.pinhole, pose))
     primitive, depth, labels = (
-        a.numpy().reshape(info.height, info.width).copy() for a in (seen.primitive, seen.depth, seen.labels)
+        view.nearest(a.numpy().reshape(shape).copy()) for a in (seen.primitive, seen.depth, seen.labels)
     )
     depth[primitive == -1] = np.inf
     numbers = np.append(_berry_numbers(primitives), [-1, -1])  # so that -1 and -2 find no berry
@@ -121,8 +124,8 @@ def bunch_truths(
 
     ``primitives`` as posed by ``snapshot`` when ``seen`` was taken; ``caster`` saves building one.
     """
-    info, lens = seen.info, pinhole(seen.info, seen.pose)
-    alone = CameraRasterizer(info.width, info.height, primitives.device)
+    info, drawn = seen.info, lens_map(seen.info).pinhole
+    alone, lens = CameraRasterizer(drawn.width, drawn.height, primitives.device), pinhole(drawn, seen.pose)
     near = primitives.label[primitives.cluster_first][alone.cluster_distances(primitives, lens) < float(FAR)]
     bunches = np.unique(near[near // LABEL_STRIDE == int(Organ.BUNCH)]) % LABEL_STRIDE
     cuts = _cut_points(primitives.model, snapshot, bunches)
@@ -139,7 +142,9 @@ def visible_bunches(
     ``drawn`` holds what was seen from ``pose`` [7] of ``primitives`` as posed by ``snapshot``; its keys are drawn anew.
     A cut point counts as seen if the pixel that it is in shows its own peduncle, which takes no rays.
     """
-    primitive, labels = (a.numpy().reshape(info.height, info.width) for a in (drawn.primitive, drawn.labels))
+    view = lens_map(info)
+    shape = view.pinhole.height, view.pinhole.width
+    primitive, labels = (view.nearest(a.numpy().reshape(shape)) for a in (drawn.primitive, drawn.labels))
     shown = np.unique(labels)
     bunches = shown[shown // LABEL_STRIDE == int(Organ.BUNCH)] % LABEL_STRIDE
     cuts = _cut_points(primitives.model, snapshot, bunches)
@@ -179,7 +184,8 @@ class _Look:
         ``cuts``: points [3] m by bunch; ``clear``: bunches whose cut point nothing hides.
         """
         p, snapshot, model = self.primitives, self.snapshot, self.primitives.model
-        lens = pinhole(self.info, self.pose)
+        view = lens_map(self.info)
+        lens = pinhole(view.pinhole, self.pose)
         named = p.label[p.cluster_first]
         fruit = np.flatnonzero((named // LABEL_STRIDE == int(Organ.BUNCH)) & p.clusters_shown())
         fruit = fruit[np.isin(named[fruit] % LABEL_STRIDE, bunches)]
@@ -188,7 +194,7 @@ class _Look:
         loose = {one.index: k for k, one in enumerate(snapshot.visuals) if one.organ == Organ.BUNCH}
         for bunch in np.unique(named[fruit] % LABEL_STRIDE).tolist():
             mine = fruit[named[fruit] % LABEL_STRIDE == bunch]
-            whole = self.rasterizer.coverage(p, lens, mine)
+            whole = view.nearest(self.rasterizer.coverage(p, lens, mine))
             box = _box_of(whole, (0, 0, 0, 0))
             if box is None:
                 continue
@@ -254,7 +260,12 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
     info, other = first.info, second.info
     v, u = np.nonzero(np.isfinite(first.depth))
     primitive, z = first.primitive[v, u], first.depth[v, u].astype(float)
-    local = np.stack([(u - info.cx) / info.fx * z, (v - info.cy) / info.fy * z, z], 1)
+    across, down = (
+        ((u - info.cx) / info.fx, (v - info.cy) / info.fy)
+        if not info.distortion
+        else (rays[v, u].astype(float) for rays in pixel_rays(info))
+    )
+    local = np.stack([across * z, down * z, z], 1)
     point = first.pose[:3] + frames.rotate(first.pose[3:], local)
     solid = primitive >= 0  # the ground stays
     before, after = (one.carrier_poses[primitive[solid]] for one in (first, second))

@@ -7,14 +7,19 @@ import { Headset } from "./headset.js";
 import { Absence, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { LateHands } from "./late.js";
-import { DeskHand, WalkingEyes } from "./person.js";
+import { DeskHand, Pace, WalkingEyes } from "./person.js";
+import { Timeline } from "./timeline.js";
 import { Voice } from "./voice.js";
 import { World } from "./world.js";
 
 const RETRY = 1000; // ms
 const SILENCE = 3; // s
 const SHADOW_PERIOD = 250; // ms
+const LONGEST = 0.1; // s: what moves by keys moves no further in one picture
 const element = (id) => document.getElementById(id);
+
+/** A number in the address, null if it has none: triangles, pictures a second (rate), shadows. */
+const asked = (name) => { const given = new URLSearchParams(location.search).get(name); return given === null ? null : Number(given); };
 
 /** What the page has done, for those who look at it from outside. */
 const page = (window.vinesim = { states: 0, drawn: 0, tick: -1, frames: 0, calls: 0, triangles: 0, haptics: {}, failure: null });
@@ -42,11 +47,15 @@ class Viewer {
     this.help.hidden = false;
     this.intention = "";
     this.offerIntentions(world.header.intentions);
+    const { replay } = world.header;
+    this.timeline = replay === null ? null : new Timeline(replay, (wish) => this.ask(wish));
     this.newest = null;
     this.heardAt = performance.now();
+    this.pace = new Pace(LONGEST);
     this.followed = -1;
-    this.shadowAt = -1e9;
+    this.shadowAt = asked("shadows") === 0 ? Infinity : -1e9;
     this.lastFrame = performance.now();
+    this.shortest = 0; // time between two pictures of a desktop at least [s]
     this.frame = 1 / 60; // time of a frame, smoothed [s]
     this.labels = new Map();
     addEventListener("resize", () => this.resize());
@@ -108,8 +117,10 @@ class Viewer {
     // poses of trees come once: those of a state that is overtaken before it is drawn count, too
     this.world.apply(state);
     this.newest = state;
+    if (this.timeline?.show(state.replay)) this.absence.expect();
     this.lateHands.take(state);
     this.overlays.take(state);
+    this.pace.earn(state.time);
     this.heardAt = performance.now();
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
     this.headset.pulse(state.haptics);
@@ -119,6 +130,12 @@ class Viewer {
       this.loading = false;
       if (header !== null) this.world.setRigid(header);
     }
+  }
+
+  /** What the user wants of the recording, at once: none of its states may follow while it pauses. */
+  ask(replay) {
+    if (this.socket.readyState === WebSocket.OPEN)
+      this.socket.send(JSON.stringify({ ...this.message(this.eyes.pose), replay }));
   }
 
   press(code) {
@@ -142,7 +159,9 @@ class Viewer {
   }
 
   draw(frame) {
-    const now = performance.now(), passed = (now - this.lastFrame) / 1000, seconds = Math.min(passed, 0.1);
+    const now = performance.now(), passed = (now - this.lastFrame) / 1000;
+    if (passed < this.shortest && !this.headset.isWorn) return;
+    const seconds = this.isPerson ? this.pace.spend(passed) : Math.min(passed, LONGEST);
     this.lastFrame = now;
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
     const actors = this.actors();
@@ -159,7 +178,7 @@ class Viewer {
     this.world.list(eye);
     this.overlays.draw(actors, this.camera);
     if (this.isPerson) {
-      this.person = this.track(pose);
+      this.person = this.track(pose, seconds);
       this.lateHands.draw(this.person);
     }
     this.renderer.info.reset();
@@ -173,7 +192,7 @@ class Viewer {
       triangles: this.renderer.info.render.triangles });
     this.label(actors);
     const silence = (now - this.heardAt) / 1000;
-    if (this.socket.readyState === WebSocket.OPEN && silence > SILENCE)
+    if (this.socket.readyState === WebSocket.OPEN && silence > SILENCE && !this.timeline?.status.paused)
       element("state").textContent = `no news for ${silence.toFixed(0)} s: the client pauses, or does not answer`;
     if (this.newest !== null) {
       page.drawn += 1;
@@ -194,12 +213,10 @@ class Viewer {
     return { ...message, person: { ...this.person, intention: this.intention } };
   }
 
-  /** The person's tracked head and hands in this frame. */
-  track(pose) {
+  /** The person's tracked head and hands in this frame, a time [s] after the last one. */
+  track(pose, seconds) {
     if (this.headset.isWorn) return { head: pose, ...this.headset.hands() };
     const ray = new THREE.Vector3(...this.hand.cursor, 0.5).unproject(this.camera).sub(this.camera.position).normalize();
-    const now = performance.now(), seconds = Math.min((now - (this.toldAt ?? now)) / 1000, 0.1);
-    this.toldAt = now;
     const right = this.hand.tracked(pose.slice(0, 3), [ray.x, -ray.z, ray.y], this.eyes.yaw, seconds);
     return { head: pose, left: null, right };
   }
@@ -255,7 +272,7 @@ if (window.pageMisses) throw new Error(window.pageMisses);
 page.voice = new Voice();
 const header = await load("scene");
 const world = new World(header);
-const budget = Number(new URLSearchParams(location.search).get("triangles"));
-if (budget > 0) world.budget = budget;
+if (asked("triangles") > 0) world.budget = asked("triangles");
 page.viewer = new Viewer(world, [...header.arrays.start]);
+if (asked("rate") > 0) page.viewer.shortest = 1 / asked("rate") - 0.002; // displays tick a little early
 window.pageStarted();

@@ -1,6 +1,8 @@
 // Sentences for the user: what happened while nothing was drawn, and what this address cannot offer.
 
 const SHOWN_FOR = 12_000; // ms
+const FIRST = 5; // pictures in which a browser compiles shaders, however long that takes
+const TIMES = 5; // an absence is so many times the usual time between two pictures, for slow machines
 /** Show a sentence for a while, or until it is clicked. */
 export function say(text, { stays = false } = {}) {
   const notice = document.createElement("div");
@@ -17,7 +19,9 @@ export class Absence {
     this.known = null; // before the newest picture: time, picked bunches, actors
     this.before = null; // before a gap that was not told of yet
     this.told = []; // sentences so far
-    this.long = 3; // a longer time of the world between two pictures is told of [s]
+    this.long = 3; // a longer time of the world between two pictures is told of, if that is not usual here [s]
+    this.usual = 0; // time of the world between two pictures, smoothed [s]
+    this.pictures = 0;
   }
 
   /** The next jump of time was asked for. */
@@ -25,8 +29,10 @@ export class Absence {
 
   /** A picture was drawn at a time of the world [s]; `picked` bunches and names of `actors`, null: not known yet. */
   drawn(time, picked, actors) {
-    const { known } = this;
-    if (known !== null && this.before === null && (time < known.time || time > known.time + this.long)) this.before = known;
+    const { known } = this, passed = known === null ? 0 : time - known.time;
+    const isAbsence = passed < 0 || (++this.pictures > FIRST && passed > Math.max(this.long, TIMES * this.usual));
+    if (isAbsence && this.before === null) this.before = { ...known };
+    if (!isAbsence) this.usual += 0.2 * (passed - this.usual);
     if (actors === null) {
       if (known !== null) known.time = time;
       return;

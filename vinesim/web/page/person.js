@@ -7,6 +7,32 @@ const WALK = 1.4, CROUCH = 0.55, ARM = 0.75, REACH = 0.9; // m/s, m, m, m/s
 const HANGING = [0.3, -0.2, -0.7];
 const FIST = [1, 1, 1, 1, 1], OPEN = [0, 0, 0, 0, 0];
 
+/**
+ * A person walks and reaches in the world's time: where the client is slower than real time, or pauses, so is the person,
+ * and hands stay as fast in the world as an arm is.
+ */
+export class Pace {
+  /** `most` [s]: of the world's time that may be made up for. */
+  constructor(most) {
+    this.most = this.left = most;
+    this.time = null;
+  }
+
+  /** A state of a time of the world [s] has come. */
+  earn(time) {
+    const passed = this.time === null ? 0 : time - this.time;
+    this.time = time;
+    this.left = passed < 0 ? this.most : Math.min(this.left + passed, this.most);
+  }
+
+  /** Of the time [s] since the last picture, that in which the person moves. */
+  spend(passed) {
+    const seconds = Math.min(passed, this.left);
+    this.left -= seconds;
+    return seconds;
+  }
+}
+
 /** Eyes at the height of a person who walks. */
 export class WalkingEyes extends FlyingEyes {
   constructor(element, pose) {

@@ -97,9 +97,9 @@ export const VERTEX = {
   p = a.xyz + turn(b, clamp(position, -1.0, 1.0) * half3);
   n = turn(b, face);
 ` + FINISH,
-  // position: x the corner
+  // not instanced: three vertices after each other are the corners
   triangle: COMMON + START + /* glsl */ `
-  vec4 corner = shape(int(position.x));
+  vec4 corner = shape(gl_VertexID % 3);
   p = corner.xyz;
   n = unpackNormal(corner.w);
 ` + FINISH,

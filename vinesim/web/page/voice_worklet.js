@@ -1,7 +1,8 @@
 // In the thread of sound: cuts the microphone into frames, and plays the frames of one speaker at an even pace.
 
 const FRAME = 960; // samples of 20 ms at 48 kHz
-const START = 2 * FRAME, LARGEST = 12 * FRAME; // samples that wait before a voice begins, at first and at most
+/** Delay of a voice behind the beginning of its first frame, at first and at most: a frame, and a reserve. */
+const START = 1.5 * FRAME, LARGEST = 12 * FRAME; // samples
 const SPARE = 4 * FRAME; // samples that may wait beyond these
 const SILENT = 0.01; // amplitude below which a frame may be the last one of a while: nothing is sent for silence
 const RAMP = 96; // samples of a fade, 2 ms
@@ -33,8 +34,8 @@ class Capture extends AudioWorkletProcessor {
 }
 
 /**
- * Waits for a few frames, then plays. A queue that is empty amid a voice makes it wait for more of them from then on; one
- * that was never shorter than a frame for a second is cut by one, so that a voice is no later than its network makes it.
+ * Plays a voice half a frame after its first frame has come. A queue that is empty amid a voice makes it wait for
+ * longer from then on; one that was never shorter than a frame for a second is cut by one, so that a voice is no later than its network makes it.
  */
 class Player extends AudioWorkletProcessor {
   constructor() {
@@ -44,6 +45,7 @@ class Player extends AudioWorkletProcessor {
     this.at = 0; // in the first frame
     this.target = START;
     this.plays = false;
+    this.waited = 0; // samples since the first frame of those that wait has come
     this.level = 0; // of the fade, 0 to 1
     this.last = 0;
     this.counts = { stalls: 0, cut: 0 };
@@ -80,7 +82,10 @@ class Player extends AudioWorkletProcessor {
 
   process(_, outputs) {
     const out = outputs[0][0];
-    if (!this.plays && this.waiting >= this.target) this.plays = true;
+    if (!this.plays) {
+      this.waited = this.frames.length ? this.waited + out.length : 0;
+      this.plays = this.frames.length > 0 && Math.max(this.waiting, FRAME + this.waited) >= this.target;
+    }
     for (let i = 0; i < out.length; ++i) {
       if (this.plays && this.frames.length) {
         this.last = this.frames[0][this.at++];

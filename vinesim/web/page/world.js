@@ -7,6 +7,9 @@ import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGME
 const SHAPE_SHIFT = 10, SURFACE_SHIFT = 9, POSE_SHIFT = 9;
 /** Distances [m] from which the next coarser level is drawn, in units of a cluster's thickness. */
 const LEVEL_DISTANCE = [60, 190];
+const COARSEST = 1000;
+/** Rigid bodies are drawn by these coarser levels once plants are coarser than asked for by so much. */
+const RIGID_COARSER = [3, 8];
 /** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
 const VANISHING = 2600;
 const LEAF = 2, SPHEROID = 1;
@@ -101,16 +104,20 @@ export class World {
       const seen = make(fragment(name)), cast = make(depthOnly(name));
       cast.side = THREE.DoubleSide;
       return levels.map((level) => {
-        const geometry = new THREE.InstancedBufferGeometry();
-        geometry.setAttribute("position", new THREE.Float32BufferAttribute(level.points, 3));
-        geometry.setIndex(level.faces);
-        geometry.instanceCount = 0;
+        const geometry = level.isSingle ? new THREE.BufferGeometry() : new THREE.InstancedBufferGeometry();
+        geometry.setDrawRange(0, level.isSingle ? 0 : Infinity);
+        if (!level.isSingle) {
+          geometry.setAttribute("position", new THREE.Float32BufferAttribute(level.points, 3));
+          geometry.setIndex(level.faces);
+          geometry.instanceCount = 0;
+        }
         for (const [group, material] of [[this.group, seen], [this.shadowGroup, cast]]) {
           const mesh = new THREE.Mesh(geometry, material);
           mesh.frustumCulled = false;
           group.add(mesh);
         }
-        return { geometry, kind, faces: level.faces.length / 3, list: new Uint32Array(1024), count: 0 };
+        return { geometry, kind, isSingle: level.isSingle, faces: level.isSingle ? 1 : level.faces.length / 3,
+          list: new Uint32Array(1024), count: 0 };
       });
     });
     this.group.add(this.makeGround(arrays, common), makeSky(common));
@@ -201,11 +208,12 @@ export class World {
       this.choose(this.plantClusters, 0, true);
       this.choose(this.rigidClusters, this.plants, false);
       this.triangles = this.draws.flat().reduce((sum, level) => sum + level.count * level.faces, 0);
-      if (this.triangles <= this.budget || this.coarser > 100) break;
-      this.coarser *= 1.2;
+      if (this.triangles <= this.budget || this.coarser > COARSEST) break;
+      this.coarser *= 1.3;
     }
-    if (this.triangles < 0.6 * this.budget) this.coarser = Math.max(1, this.coarser / 1.2);
+    if (this.triangles < 0.6 * this.budget) this.coarser = Math.max(1, this.coarser / 1.3);
     for (const level of this.draws.flat()) {
+      if (level.isSingle) { drawSingle(level); continue; }
       let rows = level.geometry.getAttribute("row");
       if (!rows || rows.array !== level.list) {
         rows = new THREE.InstancedBufferAttribute(level.list, 1);
@@ -223,7 +231,7 @@ export class World {
       if (set.bunch[k] >= 0 && this.picked.has(set.bunch[k])) continue;
       if (this.hidden.has(set.carrier[k])) continue;
       const kind = set.kind[k], levels = this.draws[kind];
-      let level = 0;
+      let level = fades ? 0 : Math.min(RIGID_COARSER.filter((most) => this.coarser > most).length, levels.length - 1);
       if (fades) {
         const away = Math.hypot(set.ball[4 * k] - x, set.ball[4 * k + 1] - y, set.ball[4 * k + 2] - z);
         const ratio = Math.max(away - set.ball[4 * k + 3], 0.05) * this.coarser / set.thickness[k];
@@ -262,6 +270,19 @@ export class World {
     this.common.sunMatrix.value.copy(camera.projectionMatrix).multiply(camera.matrixWorldInverse)
       .multiply(this.shadowGroup.matrixWorld);
   }
+}
+
+/** Triangles as one mesh: the row of each comes three times, for an instance with one triangle costs as one with many. */
+function drawSingle({ geometry, list, count }) {
+  let rows = geometry.getAttribute("row");
+  if (!rows || rows.array.length < 3 * count) {
+    rows = new THREE.BufferAttribute(new Uint32Array(3 * list.length), 1);
+    rows.gpuType = THREE.IntType;
+    geometry.setAttribute("row", rows);
+  }
+  for (let i = 0; i < 3 * count; ++i) rows.array[i] = list[Math.floor(i / 3)];
+  rows.needsUpdate = true;
+  geometry.setDrawRange(0, 3 * count);
 }
 
 /** Parts of the page's own person that would be before its eyes. */

@@ -1,4 +1,4 @@
-"""A headless browser for tests, driven by the DevTools protocol: scripts in the page, keys, and pictures of it."""
+"""A headless browser, driven by the DevTools protocol: scripts in its page, keys, and pictures of it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import asyncio
 import base64
 import contextlib
 import json
+import pathlib
 import shutil
 import subprocess
 import tempfile
 import threading
+import wave
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,8 +19,10 @@ import aiohttp
 import cv2
 import numpy as np
 
-from tests.support.waiting import TIMEOUT
+from vinesim.audio.frame import to_pcm
 
+TIMEOUT = 120.0
+"""Longest time in which the browser answers [s]."""
 PROGRAMS = ("chromium", "google-chrome")
 OPTIONS = (
     "--headless", "--no-sandbox", "--no-first-run", "--disable-quic", "--disable-background-networking",
@@ -26,10 +30,46 @@ OPTIONS = (
     "--disable-dev-shm-usage", "--remote-debugging-port=0", "--window-size=640,480",
 )  # fmt: skip
 
+AS_RECORDED = """
+  const media = navigator.mediaDevices, open = media.getUserMedia.bind(media);
+  const raw = { echoCancellation: false, noiseSuppression: false, autoGainControl: false };
+  media.getUserMedia = () => open({ audio: raw });
+"""
+"""Runs before the page. A tone is noise to the filters of a browser, which remove it: tests need it as it is."""
+
+
+def microphone(path: pathlib.Path) -> tuple[str, ...]:
+    """Options of a browser whose microphone hears a file, again and again."""
+    return (
+        "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
+        f"--use-file-for-fake-audio-capture={path}", "--autoplay-policy=no-user-gesture-required",
+    )  # fmt: skip
+
+
+def write_tone(path: pathlib.Path, frequency: float, level: float) -> pathlib.Path:
+    """Write a second of a tone at 48 kHz that may be repeated without a gap; returns the ``path``."""
+    return write_sound(path, level * np.sin(2.0 * np.pi * frequency * np.arange(48_000) / 48_000))
+
+
+def write_sound(path: pathlib.Path, samples: np.ndarray) -> pathlib.Path:
+    """Write samples [n] of 48 kHz; returns the ``path``."""
+    with wave.open(str(path), "wb") as file:
+        file.setnchannels(1)
+        file.setsampwidth(2)
+        file.setframerate(48_000)
+        file.writeframes(to_pcm(samples))
+    return path
+
 
 def program() -> str | None:
     """The browser of this machine, or None."""
     return next((path for name in PROGRAMS if (path := shutil.which(name))), None)
+
+
+class BrowserMissing(RuntimeError):
+    """There is no browser on this machine."""
+
+    exit_code = 3
 
 
 class Page:
@@ -37,6 +77,8 @@ class Page:
 
     def __init__(self, loop: asyncio.AbstractEventLoop, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._loop, self._socket, self._count = loop, socket, 0
+        self._before: str | None = None
+        """Of the script that runs before the page."""
         self.errors: list[str] = []
         """What the page has thrown."""
 
@@ -56,13 +98,20 @@ class Page:
                 assert "error" not in answer, f"{method}: {answer['error']}"
                 return answer["result"]
 
+    def resize(self, width: int, height: int) -> None:
+        """Set the size of the page [px]."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
     def open(self, address: str, *, before: str = "") -> None:
-        """Go to an address; the script ``before`` runs before those of the page."""
+        """Go to an address; the script ``before`` runs before those of the page. Errors are counted from here on."""
         self.call("Runtime.enable")
-        if before:
-            self.call("Page.enable")
-            self.call("Page.addScriptToEvaluateOnNewDocument", source=before)
+        self.call("Page.enable")
+        if self._before is not None:
+            self.call("Page.removeScriptToEvaluateOnNewDocument", identifier=self._before)
+        added = self.call("Page.addScriptToEvaluateOnNewDocument", source=before) if before else {}
+        self._before = added.get("identifier")
         self.call("Page.navigate", url=address)
+        self.errors.clear()
 
     def run(self, script: str) -> Any:
         """Value of an expression in the page."""
@@ -77,14 +126,17 @@ class Page:
     def picture(self) -> np.ndarray:
         """What the page shows [row, column, 3] RGB."""
         png = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        return cv2.cvtColor(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 @contextlib.contextmanager
 def browser_page(*options: str) -> Iterator[Page]:
     """A page of a browser, started with these further options, that ends with the block."""
     path = program()
-    assert path is not None, "a browser is needed: install chromium"
+    if path is None:
+        raise BrowserMissing(f"a browser is needed, one of {', '.join(PROGRAMS)}: install chromium")
     profile = tempfile.mkdtemp()
     child = subprocess.Popen(
         [path, *OPTIONS, *options, f"--user-data-dir={profile}", "about:blank"], stderr=subprocess.PIPE, text=True

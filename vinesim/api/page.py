@@ -1,0 +1,52 @@
+"""The vineyard of a client in a browser, or in a cell of a notebook."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable
+
+from vinesim.client.client import Client
+from vinesim.client.page_world import PageWorld
+from vinesim.web import page_files
+from vinesim.web.page_server import PageServer
+
+
+class Page:
+    """The live vineyard as a client has it: a notebook shows it in the cell whose last expression it is.
+
+    Pages need the extra ``web``, and a browser on the same machine. They show what the client steps.
+    """
+
+    height = 480
+    """Of the cell [px]."""
+
+    def __init__(self, client: Client, port: int = 0) -> None:
+        """Serve from now on; ``port`` 0: any that is free. :class:`UsageError` if the port is taken or there are no
+        files for pages."""
+        page_files.check()
+        world = PageWorld(client)
+        self._server = PageServer(world, port)
+        self._server.__enter__()
+        self._posts = client.post_step
+        self._collect: Callable[[Client], None] = lambda _: world.collect(self._server)
+        self._posts.append(self._collect)
+
+    @property
+    def address(self) -> str:
+        """To be opened in a browser of this machine."""
+        return self._server.address
+
+    def close(self) -> None:
+        """Serve no longer; further calls do nothing."""
+        if self._collect in self._posts:
+            self._posts.remove(self._collect)
+            self._server.__exit__()
+
+    def __repr__(self) -> str:
+        return f"Page({self.address})"
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe src="{html.escape(self.address)}?rate=30" width="100%" height="{self.height}" '
+            'style="border: 0" allow="fullscreen; xr-spatial-tracking; microphone"></iframe>'
+        )

@@ -1,0 +1,52 @@
+"""Synthetic laboratories of ``vinesim bench tune``: canes, start values, and when they are let go.
+
+Canes of 1 m (9 to 6 mm, 900 kg/m^3), modulus 2 to 9 GPa, damping ratio 0.01 to 0.1, pulled by 10 cm; 30 pictures a
+second for 3 s with 2 mm of noise in each axis; start values up to five times off.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from vinesim.scene.plant_parameters import Number, Specimen
+from vinesim.tune import Experiment
+
+MODULUS_BAR, DAMPING_BAR = 0.03, 0.15
+"""Largest relative errors."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Case:
+    """One synthetic laboratory."""
+
+    truth: Specimen
+    guess: Specimen
+    """What the user begins with."""
+    experiment: Experiment
+
+
+def bench_cane(modulus: float, damping: float, segments: int = 8) -> Specimen:
+    """The cane of this benchmark; ``damping`` [s]."""
+
+    def number(value: float, unit: str) -> Number:
+        return Number(value, unit, "GUESSED", "benchmark")
+
+    return Specimen(
+        organ="cane", length=number(1.0, "m"), base_diameter=number(0.009, "m"), tip_diameter=number(0.006, "m"),
+        modulus=number(modulus, "Pa"), density=number(900.0, "kg/m^3"), damping=number(damping, "s"),
+        segments=segments,
+    )  # fmt: skip
+
+
+def draw_case(seed: int) -> Case:
+    """Modulus, damping, start values and the moment of release of one seed."""
+    rng = np.random.default_rng(seed)
+    modulus = 1e9 * math.exp(rng.uniform(math.log(2.0), math.log(9.0)))
+    ratio = math.exp(rng.uniform(math.log(0.01), math.log(0.1)))
+    damping = ratio / (math.pi * 3.48 * math.sqrt(modulus / 5e9))
+    off = np.exp(rng.uniform(-math.log(5.0), math.log(5.0), 2))
+    experiment = Experiment(seed=seed, hold=0.2 + float(rng.uniform(0.0, 1.0 / 30.0)))
+    return Case(bench_cane(modulus, damping), bench_cane(modulus * off[0], damping * off[1]), experiment)

@@ -1,0 +1,204 @@
+"""The Delassus matrices of trees that touch what does not move: how the impulses of a tree's contacts move its contacts.
+
+From what the joints were factored into, in one pass outward for the tree and one inward for each contact: see
+:func:`respond_at_contacts` and :func:`write_delassus`.
+"""
+
+import warp as wp
+
+from vinesim.kernels.articulation.spatial import cross_rows, symmetric
+from vinesim.kernels.articulation.structs import ArticulationModel, Factors
+from vinesim.kernels.contact.jacobians import row_columns
+from vinesim.kernels.contact.structs import Contacts, Rows
+from vinesim.kernels.contact.tree_narrowphase import TreeContacts
+from vinesim.kernels.contact.tree_solver import TreeSystem
+from vinesim.kernels.contact.tree_views import view_contacts, view_rows, view_system
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class BodyCompliances:
+    """The velocity of a body by an impulse on it (a, alpha) = [[P, Q], [Q^T, R]] (force, moment) [body], where a tree
+    branches."""
+
+    P: wp.array(dtype=wp.mat33)
+    """[1/kg]"""
+    Q: wp.array(dtype=wp.mat33)
+    """[1/(kg m)]"""
+    R: wp.array(dtype=wp.mat33)
+    """[1/(kg m^2)]"""
+
+
+@wp.struct
+class ResponseRows:
+    """Velocity of a contact's body by unit impulses along its three rows, one a column [slot * trees + tree]."""
+
+    a: wp.array(dtype=wp.mat33)
+    """[1/kg] linear."""
+    alpha: wp.array(dtype=wp.mat33)
+    """[1/(kg m)] angular."""
+
+
+@wp.kernel
+def respond_at_contacts(
+    # model
+    model: ArticulationModel,
+    is_branching: wp.array(dtype=wp.bool),
+    # in
+    trees: int,
+    factors: Factors,
+    contacts_all: Contacts,
+    rows_all: Rows,
+    # out
+    tree_contacts_out: TreeContacts,
+    compliances_out: BodyCompliances,
+    response_out: ResponseRows,
+):
+    """One thread per tree: from the root to the last contact, how a body answers to impulses on itself.
+
+    The inverse of its articulated inertia, seen from the root: the operational-space recursion (Featherstone 2008,
+    section 9.6; Kreutz-Delgado, Jain and Rodriguez 1992), of trees that stand. With a = a' - l x alpha' carried from the
+    parent along the lever l, alpha = (1 - DJ) alpha' - DH a, and D moment on the joint itself. Contacts are in the order
+    of their bodies. is_branching: [body] whether a body is the parent of another than the next one.
+    """
+    tree = wp.tid()
+    if tree == 0:
+        tree_contacts_out.busy_count[0] = 0
+    count = tree_contacts_out.count[tree]
+    if count == 0:
+        return
+    contacts = view_contacts(contacts_all, tree, trees)
+    rows = view_rows(rows_all, tree, trees)
+    P = wp.mat33()
+    Q = wp.mat33()
+    R = wp.mat33()
+    at = int(0)
+    for k in range(model.tree_first[tree], contacts.body[count - 1] + 1, model.pitch):
+        parent = model.body_parent[k]
+        if parent < 0:
+            P = wp.mat33()
+            Q = wp.mat33()
+            R = wp.mat33()
+        elif parent != k - model.pitch:
+            P = compliances_out.P[parent]
+            Q = compliances_out.Q[parent]
+            R = compliances_out.R[parent]
+        lever = factors.lever[k]
+        DH = factors.DH[k]
+        stay = wp.identity(n=3, dtype=float) - factors.DJ[k]
+        arm = -wp.transpose(cross_rows(R, lever))  # [l]x R
+        across = wp.transpose(cross_rows(Q, lever))  # -[l]x Q^T
+        P = symmetric(P + across + wp.transpose(across) - cross_rows(arm, lever))
+        Q = Q - arm
+        turn = stay * wp.transpose(Q) - DH * P
+        R = symmetric(factors.D[k] + (stay * R - DH * Q) * wp.transpose(stay) - turn * wp.transpose(DH))
+        Q = wp.transpose(turn)
+        if is_branching[k]:
+            compliances_out.P[k] = P
+            compliances_out.Q[k] = Q
+            compliances_out.R[k] = R
+        while at < count and contacts.body[wp.min(at, count - 1)] == k:
+            force = row_columns(at, 0, rows.plant_jacobian)
+            moment = row_columns(at, 3, rows.plant_jacobian)
+            response_out.a[at * trees + tree] = P * force + Q * moment
+            response_out.alpha[at * trees + tree] = turn * force + R * moment
+            at = at + 1
+
+
+@wp.func
+def carry_to_parent(k: int, factors: Factors, force: wp.mat33, moment: wp.mat33):
+    """Impulses on body k, a column each, as those that its parent feels: the joint takes its share."""
+    passed = force - wp.transpose(factors.DH[k]) * moment
+    # [l]x of a matrix is minus the transpose of its transpose's rows crossed with l
+    arm = -wp.transpose(cross_rows(wp.transpose(passed), factors.lever[k]))
+    return passed, moment - wp.transpose(factors.DJ[k]) * moment + arm
+
+
+@wp.func
+def common_body_response(
+    c: int,
+    other: int,
+    at: int,
+    body: int,
+    model: ArticulationModel,
+    factors: Factors,
+    compliances: BodyCompliances,
+    jacobian: wp.array2d(dtype=wp.float64),
+    force: wp.mat33,
+    moment: wp.mat33,
+):
+    """Velocities along the rows of contact ``other``, on ``body``, by impulses on body ``at``, on another branch."""
+    force_other = row_columns(other, 0, jacobian)
+    moment_other = row_columns(other, 3, jacobian)
+    here = int(at)
+    there = int(body)
+    while here != there and here >= 0 and there >= 0:
+        if here > there:
+            force, moment = carry_to_parent(here, factors, force, moment)
+            here = model.body_parent[here]
+        else:
+            force_other, moment_other = carry_to_parent(there, factors, force_other, moment_other)
+            there = model.body_parent[there]
+    block = wp.mat33()
+    if here >= 0 and there >= 0:
+        a = compliances.P[here] * force + compliances.Q[here] * moment
+        alpha = wp.transpose(compliances.Q[here]) * force + compliances.R[here] * moment
+        block = wp.transpose(force_other) * a + wp.transpose(moment_other) * alpha
+    return block
+
+
+@wp.kernel
+def write_delassus(
+    # model
+    model: ArticulationModel,
+    # in
+    trees: int,
+    width: int,
+    factors: Factors,
+    tree_contacts: TreeContacts,
+    contacts_all: Contacts,
+    rows_all: Rows,
+    compliances: BodyCompliances,
+    response: ResponseRows,
+    # out
+    system_out: TreeSystem,
+):
+    """One thread per slot of a tree: its part of what is to be solved, with the velocities along the rows of all contacts
+    up to its own by impulses along it.
+
+    Its impulses go inward; what they do at a body with another contact, that one's response says, both being one
+    symmetric matrix.
+    """
+    tree = wp.tid() % trees
+    c = wp.tid() // trees
+    if c >= tree_contacts.count[tree]:
+        return
+    contacts = view_contacts(contacts_all, tree, trees)
+    rows = view_rows(rows_all, tree, trees)
+    system = view_system(system_out, tree, trees, width)
+    for row in range(3 * c, 3 * c + 3):
+        system.free[row] = rows.velocity_free[row] + rows.bias[row]
+    force = row_columns(c, 0, rows.plant_jacobian)
+    moment = row_columns(c, 3, rows.plant_jacobian)
+    k = int(contacts.body[c])
+    for back in range(c + 1):
+        other = c - back
+        body = contacts.body[other]
+        while k > body:
+            force, moment = carry_to_parent(k, factors, force, moment)
+            k = model.body_parent[k]
+        block = wp.mat33()
+        if k == body:
+            slot = other * trees + tree
+            block = wp.transpose(response.a[slot]) * force + wp.transpose(response.alpha[slot]) * moment
+        elif k >= 0:
+            block = common_body_response(
+                c, other, k, body, model, factors, compliances, rows.plant_jacobian, force, moment
+            )
+        if other == c:
+            block = symmetric(block)
+        for r in range(3):
+            for j in range(3):
+                system.matrix[3 * other + r, 3 * c + j] = block[r, j]
+                system.matrix[3 * c + j, 3 * other + r] = block[r, j]

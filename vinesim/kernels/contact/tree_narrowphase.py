@@ -1,0 +1,180 @@
+"""Narrowphase of trees that are worlds of their own with geoms that do not move: a thread finds the contacts of a tree.
+
+In a kernel for geoms of any kind, and in a far shorter one for planes, spheres and capsules alone: a GPU whose threads are
+at many places of a long kernel waits for instructions more than for anything else.
+"""
+
+import warp as wp
+
+from vinesim.kernels.contact.broadphase import aabbs_disjoint, sweep_capsule
+from vinesim.kernels.contact.narrowphase_rigid import add_pair
+from vinesim.kernels.contact.structs import (
+    AABB_BLOCK,
+    Aabbs,
+    Candidates,
+    Capsules,
+    CapsuleStates,
+    Geoms,
+    GeomStates,
+    Hulls,
+    Parameters,
+    PlantBodies,
+    RigidBodies,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class TreeContacts:
+    """What is kept of each tree's contacts [tree] from step to step."""
+
+    count: wp.array(dtype=wp.int32)
+    """of this step."""
+    near: wp.array(dtype=wp.vec2i)
+    """[i * trees + tree] scratch: capsules and geoms whose boxes overlap."""
+    busy_count: wp.array(dtype=wp.int32)
+    """[1] number of trees that need more sweeps than one thread takes."""
+    busy: wp.array(dtype=wp.int32)
+    """[i] these trees, in any order."""
+    is_impact: wp.array(dtype=wp.bool)
+    """[tree]"""
+    dropped: wp.array(dtype=wp.int32)
+    """left out since the start, for want of room."""
+    sweeps: wp.array(dtype=wp.int32)
+    """of the last solve."""
+    loaded_count: wp.array(dtype=wp.int32)
+    """bodies that the wrenches of the last contacts act on."""
+    loaded: wp.array(dtype=wp.int32)
+    """[i * trees + tree] these bodies."""
+
+
+@wp.func
+def list_near_geoms(
+    s: int,
+    tree: int,
+    trees: int,
+    near_count: int,
+    low: wp.vec3,
+    high: wp.vec3,
+    geoms: Geoms,
+    geom_states: GeomStates,
+    static_blocks: Aabbs,
+    near_out: wp.array(dtype=wp.vec2i),
+):
+    """List the geoms whose boxes overlap that of capsule ``s``; returns how many pairs the tree has then. More than there
+    is room for are only counted."""
+    for block in range(static_blocks.low.shape[0]):
+        if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
+            for g in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, geoms.count[1])):
+                if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
+                    if near_count * trees + tree < near_out.shape[0]:
+                        near_out[near_count * trees + tree] = wp.vec2i(s, g)
+                    near_count = near_count + 1
+    return near_count
+
+
+@wp.func
+def find_contacts_of_tree(
+    tree: int,
+    is_round: bool,
+    parameters: Parameters,
+    capsules: Capsules,
+    geoms: Geoms,
+    trees: int,
+    slots: int,
+    bodies: PlantBodies,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    static_blocks: Aabbs,
+    capsule_states_out: CapsuleStates,
+    tree_contacts_out: TreeContacts,
+    candidates_out: Candidates,
+):
+    """Contacts of a tree with static geoms, in the order of (capsule, geom, end).
+
+    Capsule i of a tree is ``i * trees + tree``; one without a body is none. What exceeds the slots is only counted. First
+    boxes are compared, then threads in step go through what each of them found near: pairs beyond their room count as dropped.
+    """
+    near_count = int(0)
+    for s in range(tree, capsules.body.shape[0], trees):
+        if capsules.body[s] >= 0:
+            start, end, speed, low, high = sweep_capsule(s, wp.float32(parameters.dt), capsules, bodies)
+            before = near_count
+            near_count = list_near_geoms(
+                s, tree, trees, before, low, high, geoms, geom_states, static_blocks, tree_contacts_out.near
+            )
+            if near_count > before:
+                capsule_states_out.start[s] = start
+                capsule_states_out.end[s] = end
+                capsule_states_out.speed[s] = speed
+                capsule_states_out.low[s] = low
+                capsule_states_out.high[s] = high
+    room = tree_contacts_out.near.shape[0] / trees
+    count = int(0)
+    is_impact = bool(False)
+    for i in range(wp.min(near_count, room)):
+        pair = tree_contacts_out.near[i * trees + tree]
+        count, hits = add_pair(
+            is_round, tree, count, pair[0], pair[1], parameters, capsules, geoms, bodies, capsule_states_out, rigid,
+            hulls, geom_states, candidates_out,
+        )  # fmt: skip
+        is_impact = is_impact or hits
+    tree_contacts_out.is_impact[tree] = is_impact
+    tree_contacts_out.count[tree] = wp.min(count, slots)
+    dropped = wp.max(count - slots, 0) + wp.max(near_count - room, 0)
+    if dropped > 0:
+        tree_contacts_out.dropped[tree] += dropped
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def find_tree_contacts(
+    # model
+    parameters: Parameters,
+    capsules: Capsules,
+    geoms: Geoms,
+    # in
+    trees: int,
+    slots: int,
+    bodies: PlantBodies,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    static_blocks: Aabbs,
+    # out
+    capsule_states_out: CapsuleStates,
+    tree_contacts_out: TreeContacts,
+    candidates_out: Candidates,
+):
+    """One thread per tree: :func:`find_contacts_of_tree` with geoms of any kind."""
+    find_contacts_of_tree(
+        wp.tid(), False, parameters, capsules, geoms, trees, slots, bodies, rigid, hulls, geom_states, static_blocks,
+        capsule_states_out, tree_contacts_out, candidates_out,
+    )  # fmt: skip
+
+
+@wp.kernel(module="unique", enable_backward=False, cuda_max_registers=128)
+def find_round_tree_contacts(
+    # model
+    parameters: Parameters,
+    capsules: Capsules,
+    geoms: Geoms,
+    # in
+    trees: int,
+    slots: int,
+    bodies: PlantBodies,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    static_blocks: Aabbs,
+    # out
+    capsule_states_out: CapsuleStates,
+    tree_contacts_out: TreeContacts,
+    candidates_out: Candidates,
+):
+    """One thread per tree: :func:`find_contacts_of_tree` where all geoms are planes, spheres and capsules."""
+    find_contacts_of_tree(
+        wp.tid(), True, parameters, capsules, geoms, trees, slots, bodies, rigid, hulls, geom_states, static_blocks,
+        capsule_states_out, tree_contacts_out, candidates_out,
+    )  # fmt: skip

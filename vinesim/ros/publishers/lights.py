@@ -1,0 +1,92 @@
+"""A robot's indicator lights as markers, which RViz and Foxglove show over the robot's model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from xml.etree import ElementTree
+
+import numpy as np
+from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from vinesim import frames
+from vinesim.ros.topic import TRANSIENT_LOCAL, Advertise, PendingMessage
+from vinesim.scene.values.signals import UNLIT, Color
+
+GROWTH = 1.05
+"""A marker covers the lamp of the robot's model, as many times as large."""
+UNLIT_GREY = 0.15
+"""Of lamps between two flashes."""
+
+
+class LightsPublisher:
+    """``indicator_lights/markers``, latched, when what the lamps show changes; none while they are off."""
+
+    def __init__(self, advertise: Advertise, urdf: str) -> None:
+        self._topic = advertise(MarkerArray, "indicator_lights/markers", TRANSIENT_LOCAL)
+        self._lamps = lamp_markers(urdf)
+
+    def pending(self, color: Color | None) -> Iterator[PendingMessage]:
+        """The message of a colour, :data:`UNLIT` between flashes; None: off, as the robot's model shows them."""
+        yield self._topic, partial(self._markers, color)
+
+    def _markers(self, color: Color | None) -> MarkerArray:
+        if color is None:
+            return MarkerArray(markers=[Marker(ns="indicator_lights", action=Marker.DELETEALL)])
+        red, green, blue = (UNLIT_GREY,) * 3 if color == UNLIT else (part / 255.0 for part in color)
+        for lamp in self._lamps:
+            lamp.color = ColorRGBA(r=red, g=green, b=blue, a=1.0)
+        return MarkerArray(markers=self._lamps)
+
+
+def lamp_markers(urdf: str) -> list[Marker]:
+    """A marker for each visual of a URDF whose material has the word ``indicator``; meshes are left out.
+
+    Each is locked to the frame of its link, with the stamp 0: where the link is now.
+    """
+    markers = []
+    for link in ElementTree.fromstring(urdf).iterfind("link"):
+        for visual in link.iterfind("visual"):
+            material, geometry = visual.find("material"), visual.find("geometry")
+            words = "" if material is None else material.get("name", "")
+            form = None if geometry is None else next(iter(geometry), None)
+            if "indicator" not in words.lower().split("_") or form is None or form.tag not in _FORMS:
+                continue
+            kind, size = _FORMS[form.tag], _size(form)
+            markers.append(
+                Marker(
+                    ns="indicator_lights", id=len(markers), type=kind, action=Marker.ADD, frame_locked=True,
+                    pose=_pose(visual.find("origin")), scale=Vector3(**dict(zip("xyz", GROWTH * size, strict=True))),
+                )
+            )  # fmt: skip
+            markers[-1].header.frame_id = link.get("name", "")
+    return markers
+
+
+_FORMS = {"box": Marker.CUBE, "cylinder": Marker.CYLINDER, "sphere": Marker.SPHERE}
+
+
+def _size(form: ElementTree.Element) -> np.ndarray:
+    """Edges of the box around a form [3] m."""
+    if form.tag == "box":
+        return _numbers(form.get("size", "0 0 0"))
+    across = 2.0 * float(form.get("radius", "0"))
+    return np.array([across, across, float(form.get("length", "0")) if form.tag == "cylinder" else across])
+
+
+def _pose(origin: ElementTree.Element | None) -> Pose:
+    """The pose of a visual in its link."""
+    place, turns = (
+        _numbers("0 0 0" if origin is None else origin.get(name, "0 0 0")).tolist() for name in ("xyz", "rpy")
+    )
+    turn = frames.IDENTITY
+    for angle, axis in zip(reversed(turns), np.eye(3)[::-1], strict=True):  # about z, then y, then x
+        turn = frames.multiply(turn, frames.exp(angle * axis))
+    x, y, z, w = (float(part) for part in turn)
+    return Pose(position=Point(x=place[0], y=place[1], z=place[2]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+
+
+def _numbers(text: str) -> np.ndarray:
+    return np.array([float(word) for word in text.split()])

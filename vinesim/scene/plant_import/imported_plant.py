@@ -1,0 +1,210 @@
+"""An imported plant: skeleton and wood as one TOML file that scenes name; what was missing is filled and marked.
+
+plant = import_plant("vine.mtg", unit="cm")
+plant.write("vine.toml")  # in a scene: [[imported]] file = "vine.toml"
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import pathlib
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+
+from vinesim.errors import UsageError, writing
+from vinesim.scene import plant_parameters
+from vinesim.scene.plant_import.helios import read_cylinders, read_helios_xml
+from vinesim.scene.plant_import.mtg import read_mtg
+from vinesim.scene.plant_import.ply import read_ply
+from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, check_skeleton
+from vinesim.scene.plant_parameters import Number
+from vinesim.scene.toml_loader import load_toml
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Units of length that a plant file may have [m]."""
+SUFFIXES = (".mtg", ".ply", ".txt", ".xml")
+
+
+class Wood(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What the wood is made of; the files of other programs do not tell."""
+
+    woody_modulus: Annotated[Number, "Pa"]
+    """Young's modulus of bending at the base of a shoot."""
+    green_modulus: Annotated[Number, "Pa"]
+    """At its tip, and of side shoots."""
+    woody_share: Annotated[Number, "1"]
+    density: Annotated[Number, "kg/m^3"]
+    damping: Annotated[Number, "s"]
+    drag: Annotated[Number, "1"]
+    old_wood: Annotated[Number, "m"]
+    """Wood thicker than this stands still."""
+
+
+class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One plant, its base at the origin and z up."""
+
+    source: str
+    """Name and format of the file that it was read from."""
+    shape: Literal["drawn", "slack"] = "drawn"
+    """What the points show: the plant as it hangs under its weight (``drawn``), or without it (``slack``)."""
+    piece: Annotated[float, msgspec.Meta(gt=0.0)] = 0.06
+    """[m] Length of the rigid bodies that wood is cut into, about."""
+    notes: tuple[str, ...] = ()
+    """What of the file was mended or left out."""
+    filled: tuple[int, ...] = ()
+    """Nodes whose diameter the file does not tell: it was filled in."""
+    nodes: tuple[tuple[int, float, float, float, float], ...]
+    """Parent (-1: the base), x, y, z [m] and diameter [m] of each node, parents first."""
+    bunches: tuple[tuple[int, float], ...] = ()
+    """Node and mass [kg] of each bunch."""
+    wood: Wood
+
+    def skeleton(self) -> Skeleton:
+        """The plant's points as arrays."""
+        table = np.array(self.nodes, float).reshape(-1, 5)
+        bunch = np.zeros(len(table))
+        for node, mass in self.bunches:
+            bunch[node] = mass
+        return Skeleton(table[:, 1:4], table[:, 0].astype(int), table[:, 4], bunch, self.source, self.notes)
+
+    def write(self, path: str | pathlib.Path) -> None:
+        """Write the plant as a TOML file; :class:`~vinesim.errors.WriteError` if that fails."""
+        lines = [
+            f"source = {json.dumps(self.source, ensure_ascii=False)}", f'shape = "{self.shape}"',
+            f"piece = {self.piece!r} # m, length of a rigid body",
+            f"notes = {json.dumps(self.notes, ensure_ascii=False)}",
+            f"filled = {list(self.filled)} # nodes whose diameter the file does not tell",
+            f"bunches = {[list(one) for one in self.bunches]} # node, mass [kg]",
+            "nodes = [ # parent, x, y, z [m], diameter [m]", *(f"  {list(node)}," for node in self.nodes), "]",
+            "", "[wood]",
+        ]  # fmt: skip
+        for name in Wood.__struct_fields__:
+            number: Number = getattr(self.wood, name)
+            source = json.dumps(number.source, ensure_ascii=False)
+            lines.append(
+                f'{name} = {{ value = {number.value!r}, unit = "{number.unit}", grade = "{number.grade}", '
+                f"source = {source} }}"
+            )
+        with writing(path):
+            pathlib.Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def import_plant(
+    path: str | pathlib.Path, *, unit: str = "m", diameter_unit: str | None = None, plants: str = "vine",
+    shape: Literal["drawn", "slack"] = "drawn", piece: float = 0.06, old_wood: float | None = None,
+) -> ImportedPlant:  # fmt: skip
+    """Read a plant that another program has grown; what the file does not tell is filled from plant parameters.
+
+    Args:
+        path: an MTG (``.mtg``), a PLY skeleton (``.ply``), cylinders of TreeQSM or Helios (``.txt``), or Helios' XML.
+        unit: of the coordinates, ``m``, ``cm`` or ``mm``; cylinders and XML are in metres.
+        diameter_unit: of diameters and radii; as ``unit`` unless given.
+        plants: file of plant parameters, or its name in ``data/plants``, from which the wood is filled.
+        shape: what the points show: the plant under its weight (``drawn``), or without it (``slack``).
+        piece: length of the rigid bodies that wood is cut into, about [m].
+        old_wood: wood thicker than this stands still [m]; half more than the thickest cane unless given.
+
+    Raises:
+        PlantFileError: with file, place, finding and remedy.
+        UsageError: for an argument out of range.
+    """
+    path = pathlib.Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise PlantFileError(f"{path}: is no plant file that can be read; give one of: {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise PlantFileError(f"{path}: no such file; give a plant file ({', '.join(SUFFIXES)})")
+    for name, value in (("unit", unit), ("diameter_unit", diameter_unit or unit)):
+        if value not in UNITS:
+            raise UsageError(f"{name} is {value!r}; give one of: {', '.join(UNITS)}")
+    if not 0.005 <= piece <= 1.0:
+        raise UsageError(f"piece is {piece} m; give 0.005 to 1 m")
+    metres = UNITS[unit], UNITS[diameter_unit or unit]
+    suffix = path.suffix.lower()
+    if suffix == ".mtg":
+        skeleton = read_mtg(path, *metres)
+    elif suffix == ".ply":
+        skeleton = read_ply(path, *metres)
+    elif metres != (1.0, 1.0):
+        raise UsageError(f"unit is {unit!r}, but {suffix} files are in metres; leave it out")
+    else:
+        skeleton = read_cylinders(path) if suffix == ".txt" else read_helios_xml(path)
+    wood = _fill_wood(plants, old_wood)
+    diameter, filled = _fill_diameters(skeleton, plants)
+    points = skeleton.position - skeleton.position[0]
+    rows = [
+        (int(parent), round(float(x), 5), round(float(y), 5), round(float(z), 5), round(float(thick), 6))
+        for parent, (x, y, z), thick in zip(skeleton.parent, points, diameter, strict=True)
+    ]
+    return ImportedPlant(
+        source=f"{path.name}, {skeleton.format}", shape=shape, piece=piece, notes=skeleton.notes,
+        filled=tuple(np.flatnonzero(filled).tolist()), nodes=tuple(rows),
+        bunches=tuple((int(i), round(float(skeleton.bunch[i]), 4)) for i in np.flatnonzero(skeleton.bunch)), wood=wood,
+    )  # fmt: skip
+
+
+def _fill_wood(plants: str, old_wood: float | None) -> Wood:
+    """Moduli, density, damping and drag of plant parameters, marked as filled."""
+    cane = plant_parameters.load_plant(plants).cane
+    numbers = {}
+    for name in ("woody_modulus", "green_modulus", "woody_share", "density", "damping", "drag"):
+        number = getattr(cane, name)
+        numbers[name] = msgspec.structs.replace(
+            number, source=f"filled from cane.{name} of {plants!r}: {number.source}"
+        )
+    thick = 1.5 * cane.base_diameter.value[1] if old_wood is None else old_wood
+    source = "filled: half more than the thickest cane" if old_wood is None else "given when it was imported"
+    numbers["old_wood"] = Number(float(f"{thick:.6g}"), "m", "GUESSED", source)
+    return Wood(**numbers)
+
+
+def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.ndarray]:
+    """Diameters [node] m without gaps, and which were filled [node].
+
+    Between two that are known by the way between them, elsewhere by the taper of a cane over the whole plant.
+    """
+    parent, diameter = skeleton.parent, skeleton.diameter.copy()
+    filled = ~np.isfinite(diameter)
+    if not filled.any():
+        return diameter, filled
+    way = np.zeros(len(parent))
+    for node in range(1, len(parent)):
+        way[node] = way[parent[node]] + np.linalg.norm(skeleton.position[node] - skeleton.position[parent[node]])
+    cane = plant_parameters.load_plant(plants).cane
+    base, tip = cane.base_diameter.at(0.5), cane.tip_diameter.value
+    above = np.full(len(parent), -1)  # the nearest known node towards a tip, of the first child that has one
+    for node in range(len(parent) - 1, 0, -1):
+        known = above[node] if filled[node] else node
+        if known >= 0:
+            above[parent[node]] = known
+    taper = base + (tip - base) * way / way.max()
+    for node in np.flatnonzero(filled):
+        below, over = parent[node], above[node]
+        if below >= 0 and over >= 0:
+            share = (way[node] - way[below]) / (way[over] - way[below])
+            diameter[node] = diameter[below] + share * (diameter[over] - diameter[below])
+        elif over >= 0:
+            diameter[node] = diameter[over]
+        else:
+            diameter[node] = min(taper[node], diameter[below]) if below >= 0 else taper[node]
+    return diameter, filled
+
+
+@functools.cache
+def load_imported_plant(path: str) -> ImportedPlant:
+    """The imported plant in a TOML file; :class:`PlantFileError` in one line if it cannot be used."""
+    file = pathlib.Path(path)
+    if not file.is_file():
+        raise PlantFileError(f"{file}: no such file; write it with: vinesim scene import-plant")
+    plant = load_toml(file, ImportedPlant, PlantFileError)
+    for node, _ in plant.bunches:
+        if not 0 <= node < len(plant.nodes):
+            raise PlantFileError(f"{file}: bunches names node {node}; give one of 0 to {len(plant.nodes) - 1}")
+    check_skeleton(file, plant.skeleton())
+    for name in Wood.__struct_fields__:
+        value = getattr(plant.wood, name).value
+        if not value > 0.0:
+            raise PlantFileError(f"{file}: wood.{name}.value is {value}; give a number above 0")
+    return plant

@@ -1,0 +1,167 @@
+"""Multiscale tree graphs, the text files of OpenAlea's MTG (FORM-A): topology by columns, features by name.
+
+Read are entities with coordinates (XX, YY, ZZ), whatever their class; a point is where its entity ends. The wood of an
+entity leads there from the point of the entity that bears it, or of the nearest one below that has coordinates. Left
+out are classes, scales and all other features. The grammar: Godin et al. 1997, AMAPmod; OpenAlea's own reader takes
+``+`` for a branch that ends with its columns, and so does this one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+import re
+
+import numpy as np
+
+from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, sort_nodes
+
+_SECTIONS = ("CODE", "CLASSES", "DESCRIPTION", "FEATURES", "MTG")
+_STEP = re.compile(r"(\^|/|<<|<|\+\+|\+)([A-Za-z]+)?(\d+)?")
+_DIAMETERS = {"diameter": 1.0, "diam": 1.0, "topdia": 1.0, "radius": 2.0}
+"""Names of features that tell how thick the wood is, in small letters, and what makes a diameter of them."""
+_BUNCH = "bunch"
+"""Name of the feature that tells the mass [kg] of a bunch that hangs from an entity."""
+
+
+@dataclasses.dataclass
+class _Entity:
+    below: int
+    """The entity that bears it or that it is part of, -1 for none."""
+    values: dict[str, float]
+
+
+def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
+    """The skeleton of the plant in an MTG file.
+
+    Args:
+        path: the file.
+        unit: of its coordinates [m].
+        diameter_unit: of its diameters [m].
+
+    Raises:
+        PlantFileError: for a line that cannot be read, no coordinates, or several plants.
+    """
+    header, lines = _sections(path)
+    table, columns = _table_head(path, header, lines)
+    entities = _entities(path, table, columns)
+    placed = [i for i, e in enumerate(entities) if {"xx", "yy", "zz"} <= e.values.keys()]
+    if not placed:
+        raise PlantFileError(
+            f"{path}: no entity has coordinates XX, YY and ZZ; give a file with geometry (write them as FEATURES)"
+        )
+    number = {entity: node for node, entity in enumerate(placed)}
+    parent = np.full(len(placed), -1)
+    for node, entity in enumerate(placed):
+        below = entities[entity].below
+        while below >= 0 and below not in number:
+            below = entities[below].below
+        parent[node] = number.get(below, -1)
+    values = [entities[i].values for i in placed]
+    named = [[scale * v[n] for n, scale in _DIAMETERS.items() if n in v] for v in values]
+    return sort_nodes(
+        path,
+        unit * np.array([[v["xx"], v["yy"], v["zz"]] for v in values]),
+        parent,
+        diameter_unit * np.array([found[0] if found else np.nan for found in named]),
+        np.array([v.get(_BUNCH, 0.0) for v in values]),
+        "OpenAlea MTG",
+        (f"{len(entities) - len(placed)} entities have no coordinates of their own",) * (len(placed) < len(entities)),
+    )
+
+
+def _sections(path: pathlib.Path) -> tuple[list[str], list[tuple[int, str]]]:
+    """Names of the features, and the numbered lines of the section MTG."""
+    section, features, lines = "", [], []
+    for number, raw in enumerate(path.read_text("utf-8", "replace").splitlines(), 1):
+        line = raw.split("#", 1)[0].rstrip()
+        head = re.match(r"\s*([A-Z]+)\s*:\s*(.*)", line)
+        if head and head[1] in _SECTIONS:
+            section = head[1]
+            if section == "CODE" and head[2].strip() != "FORM-A":
+                raise PlantFileError(f"{path}: line {number}: CODE is {head[2].strip()!r}; only FORM-A can be read")
+        elif line.strip() and section == "FEATURES":
+            features.append(line.split()[0])
+        elif line.strip() and section == "MTG":
+            lines.append((number, line))
+    if not lines:
+        raise PlantFileError(f"{path}: has no section 'MTG:'; give a multiscale tree graph in text form (FORM-A)")
+    return features, lines
+
+
+def _table_head(
+    path: pathlib.Path, features: list[str], lines: list[tuple[int, str]]
+) -> tuple[list[tuple[int, str]], dict[int, str]]:
+    """The lines below the head of the table, and the feature of each column behind the topology's."""
+    number, head = lines[0]
+    cells = head.split("\t")
+    if cells[0].strip() not in ("ENTITY-CODE", "TOPO"):
+        raise PlantFileError(f"{path}: line {number}: begins with {cells[0].strip()!r}; give ENTITY-CODE or TOPO there")
+    columns = {i: cell.strip().lower() for i, cell in enumerate(cells) if i and cell.strip()}
+    known = {feature.lower() for feature in features}
+    if unknown := [name for name in columns.values() if name not in known]:
+        raise PlantFileError(f"{path}: line {number}: column {unknown[0]!r} is not in FEATURES; add it there")
+    return lines[1:], columns
+
+
+def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[int, str]) -> list[_Entity]:
+    """All entities, each with the one that it grows on or is part of."""
+    entities: list[_Entity] = []
+    first_feature = min(columns, default=1 << 30)
+    last: list[int] = []  # by column, the entity that the next line continues
+    for number, line in table:
+        cells = line.split("\t")
+        column = next((i for i, cell in enumerate(cells[:first_feature]) if cell.strip()), None)
+        place = f"{path}: line {number}"
+        if column is None:
+            raise PlantFileError(f"{place}: has features but no entity; give one, or remove the line")
+        code = cells[column].replace(" ", "")
+        steps = _steps(place, code)
+        same = steps[0][0] == "^"
+        if column > len(last) or (same and column >= len(last)):
+            raise PlantFileError(f"{place}: {code!r} has nothing above it to continue; give it fewer tabs")
+        below = last[column] if same else last[column - 1] if column else -1
+        steps = steps[same:]
+        branch = same and steps[0][0].startswith("+")  # its own lines stand one column further right
+        for operator, index in steps:
+            repeat = index - entities[below].values["index"] if len(operator) == 2 and below >= 0 else 1
+            if not 1 <= repeat <= 10_000:
+                raise PlantFileError(
+                    f"{place}: {code!r} counts from {index - repeat:g} to {index:g}; give a rising number"
+                )
+            for _ in range(int(repeat)):
+                entities.append(_Entity(below, {"index": float(index)}))
+                below = len(entities) - 1
+        entities[below].values.update(_features(place, cells, columns))
+        last = [*last[: column + 1], below] if branch else [*last[:column], below]
+    return entities
+
+
+def _steps(place: str, code: str) -> list[tuple[str, int]]:
+    """Operators and indices of one code: ``^<E2+U1`` gives ^, <2, +1."""
+    found, at = [], 0
+    while at < len(code):
+        match = _STEP.match(code, at)
+        is_continued = match is not None and match[1] == "^"
+        if match is None or is_continued != (match[2] is None) or (is_continued and at):
+            raise PlantFileError(
+                f"{place}: {code!r} cannot be read from {code[at:]!r} on; give /, <, +, << or ++ with a class and a "
+                "number, as in ^<E2"
+            )
+        found.append((match[1], int(match[3] or 0)))
+        at = match.end()
+    if found == [("^", 0)]:
+        raise PlantFileError(f"{place}: '^' continues with nothing; give an entity behind it")
+    return found
+
+
+def _features(place: str, cells: list[str], columns: dict[int, str]) -> dict[str, float]:
+    """Those features of one line that are read."""
+    values = {}
+    for i, name in columns.items():
+        if i < len(cells) and cells[i].strip() and (name in ("xx", "yy", "zz", _BUNCH) or name in _DIAMETERS):
+            try:
+                values[name] = float(cells[i])
+            except ValueError:
+                raise PlantFileError(f"{place}: {name} is {cells[i].strip()!r}; give a number") from None
+    return values

@@ -1,0 +1,97 @@
+"""Skeletons: what the readers of plant files have in common, a tree of points with diameters, checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+
+import numpy as np
+
+from vinesim.scene.toml_loader import DataError
+
+MAX_NODES = 20_000
+"""Largest number of points of one plant."""
+MAX_HEIGHT = 30.0
+"""[m] A plant that reaches further from its base has the wrong unit."""
+
+
+class PlantFileError(DataError):
+    """A plant file that cannot be used; one line with file, place, finding and remedy."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Skeleton:
+    """The wood of one plant as points that are joined to their parents; a parent comes before its children."""
+
+    position: np.ndarray
+    """[node, 3] m, z up."""
+    parent: np.ndarray
+    """[node] index of the node below; -1 for the base, which is the first."""
+    diameter: np.ndarray
+    """[node] m, of the wood that ends there; NaN where the file does not tell."""
+    bunch: np.ndarray
+    """[node] kg, mass of the bunch that hangs there; 0 for none."""
+    format: str
+    notes: tuple[str, ...] = ()
+    """What of the file was mended or left out, one fact each."""
+
+
+def check_skeleton(path: pathlib.Path, skeleton: Skeleton) -> Skeleton:
+    """The skeleton itself; :class:`PlantFileError` if it is no plant of one piece."""
+    nodes = np.arange(len(skeleton.parent))
+    if len(nodes) < 2:
+        raise PlantFileError(f"{path}: has {len(nodes)} points with coordinates; give a plant of at least 2")
+    if len(nodes) > MAX_NODES:
+        raise PlantFileError(f"{path}: has {len(nodes)} points; give at most {MAX_NODES}, thin the skeleton out")
+    bases = np.flatnonzero(skeleton.parent < 0)
+    if len(bases) != 1 or bases[0] != 0 or (skeleton.parent[1:] >= nodes[1:]).any():
+        raise PlantFileError(f"{path}: has {len(bases)} plants or a loop; give one plant, all of whose wood is joined")
+    if not np.isfinite(skeleton.position).all():
+        raise PlantFileError(
+            f"{path}: point {_first(np.asarray(~np.isfinite(skeleton.position).all(1)))} is not finite; mend it"
+        )
+    size = float(np.linalg.norm(skeleton.position - skeleton.position[0], axis=1).max())
+    if not 0.0 < size <= MAX_HEIGHT:
+        raise PlantFileError(
+            f"{path}: reaches {size:.4g} m from its base; give the unit of its lengths (m, cm or mm), at most "
+            f"{MAX_HEIGHT:.0f} m"
+        )
+    known = np.isfinite(skeleton.diameter)
+    if (bad := known & ~((skeleton.diameter > 0.0) & (skeleton.diameter <= 1.0))).any():
+        node = _first(bad)
+        raise PlantFileError(
+            f"{path}: diameter of point {node} is {skeleton.diameter[node]:.4g} m; give the unit of diameters, above 0 "
+            "and up to 1 m"
+        )
+    if (bad := ~((skeleton.bunch >= 0.0) & (skeleton.bunch <= 5.0))).any():
+        node = _first(bad)
+        raise PlantFileError(f"{path}: bunch of point {node} is {skeleton.bunch[node]:.4g} kg; give 0 to 5 kg")
+    return skeleton
+
+
+def _first(mask: np.ndarray) -> int:
+    return int(np.flatnonzero(mask)[0])
+
+
+def sort_nodes(
+    path: pathlib.Path, position: np.ndarray, parent: np.ndarray, diameter: np.ndarray, bunch: np.ndarray,
+    format: str, notes: tuple[str, ...] = (),
+) -> Skeleton:  # fmt: skip
+    """A checked skeleton of nodes in any order: those of each parent after it, the base first."""
+    count = len(parent)
+    if ((parent < -1) | (parent >= count)).any():
+        node = _first((parent < -1) | (parent >= count))
+        raise PlantFileError(f"{path}: parent of point {node} is {parent[node]}; give one of 0 to {count - 1}")
+    depth = np.where(parent < 0, 0, -1)
+    for level in range(count):
+        children = (depth < 0) & (parent >= 0) & (depth[parent] == level)
+        if not children.any():
+            break
+        depth[children] = level + 1
+    if (depth < 0).any():
+        raise PlantFileError(f"{path}: point {_first(depth < 0)} is in a loop or joined to none; give a tree")
+    order = np.argsort(depth, kind="stable")
+    place = np.empty(count, int)
+    place[order] = np.arange(count)
+    parent = np.where(parent < 0, -1, place[parent])[order]
+    return check_skeleton(path, Skeleton(position[order], parent, diameter[order], bunch[order], format, notes))

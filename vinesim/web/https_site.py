@@ -1,0 +1,104 @@
+"""A listener for https that answers plain http on its port with a sentence, instead of dropping it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import logging
+import os
+import socket
+import ssl
+
+from aiohttp import web
+
+log = logging.getLogger(__name__)
+
+_HANDSHAKE = b"\x16"
+"""First byte of every connection by TLS (RFC 8446, section 5.1)."""
+_FIRST_BYTE, _REQUEST, _POLL = 10.0, 2.0, 0.01
+"""[s] In which a connection has to begin, and in which a plain request is read; between two looks for the former."""
+_MAX_OPENING = 256
+"""Connections that have not begun yet; further ones are closed."""
+
+
+class HttpsSite:
+    """Accepts connections; those by TLS go to a server of aiohttp."""
+
+    def __init__(self, server: web.Server, tls: ssl.SSLContext, sentence: str) -> None:
+        """``sentence`` is the answer to plain http."""
+        self._server, self._tls, self._sentence = server, tls, sentence
+        self._listener: socket.socket | None = None
+        self._accepting: asyncio.Task[None] | None = None
+        self._opening: set[asyncio.Task[None]] = set()
+
+    def listen(self, host: str, port: int) -> int:
+        """Begin; returns the port. OSError if it is taken."""
+        self._listener = socket.create_server((host, port))
+        self._listener.setblocking(False)
+        self._accepting = asyncio.ensure_future(self._accept(self._listener))
+        return int(self._listener.getsockname()[1])
+
+    async def close(self) -> None:
+        """Accept nothing any more."""
+        tasks = [*self._opening, *([self._accepting] if self._accepting else [])]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        if self._listener is not None:
+            self._listener.close()
+
+    async def _accept(self, listener: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                connection, _ = await loop.sock_accept(listener)
+            except OSError as failure:  # the peer is gone already, or there are too many open files
+                if failure.errno in (errno.EMFILE, errno.ENFILE):
+                    log.warning("a page cannot connect: %s", os.strerror(failure.errno))
+                await asyncio.sleep(0.1)
+                continue
+            if len(self._opening) >= _MAX_OPENING:
+                connection.close()
+                continue
+            task = asyncio.ensure_future(self._open(connection))
+            self._opening.add(task)
+            task.add_done_callback(self._opening.discard)
+
+    async def _open(self, connection: socket.socket) -> None:
+        """One connection until it is handed over or answered."""
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        loop = asyncio.get_running_loop()
+        try:
+            if await asyncio.wait_for(_peek(connection), _FIRST_BYTE) == _HANDSHAKE:
+                await loop.connect_accepted_socket(self._server, connection, ssl=self._tls)
+                return
+            await asyncio.wait_for(self._answer(connection), _REQUEST)
+        except (OSError, TimeoutError):  # it said nothing, or no handshake
+            pass
+        except asyncio.CancelledError:
+            connection.close()
+            raise
+        connection.close()
+
+    async def _answer(self, connection: socket.socket) -> None:
+        """Read a plain request, as closing before it is read would take the answer back, and answer."""
+        loop, body = asyncio.get_running_loop(), f"{self._sentence}\n".encode()
+        await loop.sock_recv(connection, 1 << 16)
+        head = (
+            "HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain; charset=utf-8\r\n"
+            f"Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+        )
+        await loop.sock_sendall(connection, head.encode() + body)
+        connection.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(OSError):
+            await loop.sock_recv(connection, 1 << 16)
+
+
+async def _peek(connection: socket.socket) -> bytes:
+    """The first byte that comes, which stays to be read; empty if the peer has closed."""
+    while True:  # no event loop tells of this on every system
+        with contextlib.suppress(BlockingIOError):
+            return connection.recv(1, socket.MSG_PEEK)
+        await asyncio.sleep(_POLL)
