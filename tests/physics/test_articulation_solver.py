@@ -3,6 +3,7 @@ from __future__ import annotations
 import gc
 import itertools
 import threading
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -590,7 +591,20 @@ def run_with_events(**options: object) -> tuple[list[bytes], np.ndarray]:
     return arrays, response
 
 
+def filled_with_nan(make: Callable[..., wp.array]) -> Callable[..., wp.array]:
+    def made(*arguments: object, **options: object) -> wp.array:
+        array = make(*arguments, **options)
+        values = array.numpy()
+        if values.dtype.kind == "f":
+            values[...] = np.nan
+        return array
+
+    return made
+
+
 def test_threads_and_device_buffers_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("empty", "empty_like"):  # whatever reads memory before it is written shall show
+        monkeypatch.setattr(wp, name, filled_with_nan(getattr(wp, name)))
     monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_GROUPS_PER_THREAD", 0)
     monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_INTEGRATED_TREES_PER_THREAD", 0)
     single_threaded, response = run_with_events()

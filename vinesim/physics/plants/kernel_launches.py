@@ -44,7 +44,7 @@ DEVICE_RESULTS = (
 )  # fmt: skip
 """Rows that kernels write, or that are carried over when they are needed."""
 TREE_INPUTS = (
-    "stepping", "tree_moving", "tree_phi", "tree_euler_steps", "tree_steps", "tree_awake", "tree_budget",
+    "stepping", "tree_moving", "tree_phi", "tree_euler_steps", "tree_steps", "tree_rate", "tree_awake", "tree_budget",
     "tree_air", "root_turn", "root_turn_rate", "tie_stiffness", "tie_damping", "tie_anchor", "tie_anchor_velocity",
 )  # fmt: skip
 """Lists and numbers of trees and ties that kernels of a step read."""
