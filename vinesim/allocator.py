@@ -1,8 +1,10 @@
-"""The C allocator of this process: large blocks that are freed go back to the system at once.
+"""The C allocator of this process: large blocks that are freed go back to the system at once, small ones in time.
 
 glibc raises its threshold for blocks of their own to the largest block that was ever freed, up to 32 MiB: after the
 first tables of a vineyard have come and gone, all smaller ones lie in the heap, which keeps the gaps between them. A
-threshold that is set stays (mallopt(3)). Other C libraries are left as they are.
+threshold that is set stays (mallopt(3)). Gaps between small blocks it keeps for good: on a busy machine messages wait,
+and whenever more of them wait than ever before, the heap grows. So free pages are given back every minute. Other C
+libraries are left as they are.
 """
 
 from __future__ import annotations
@@ -11,11 +13,15 @@ import ctypes
 import functools
 import gc
 import sys
+import threading
+import time
 
 BLOCK_SIZE = 4 << 20
 """Blocks from this size on [bytes] lie outside the heap: tables of a scene do, arrays of one picture do not."""
 KEPT_SIZE = 64 << 20
 """So much free memory at the end of the heap is kept [bytes], as glibc does when it sets the threshold itself."""
+TRIM_PERIOD = 60.0
+"""From one time to the next at which free pages are given back [s]."""
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Numbers of glibc's malloc.h."""
 
@@ -34,6 +40,18 @@ def keep_large_blocks_apart() -> None:
     if (library := _glibc()) is not None:
         library.mallopt(_MMAP_THRESHOLD, BLOCK_SIZE)
         library.mallopt(_TRIM_THRESHOLD, KEPT_SIZE)
+
+
+def trim_regularly(period: float = TRIM_PERIOD) -> None:
+    """Give free pages of the heap back to the system every ``period`` [s] from now on, in a thread of its own."""
+    if (library := _glibc()) is not None:
+        threading.Thread(target=_trim_for_ever, args=(library, period), name="heap trimmer", daemon=True).start()
+
+
+def _trim_for_ever(library: ctypes.CDLL, period: float) -> None:
+    while True:
+        time.sleep(period)
+        library.malloc_trim(0)
 
 
 def release_free_memory() -> None:

@@ -76,6 +76,7 @@ def main() -> None:
     # MuJoCo draws nothing here, and looking for a window system takes 0.1 s.
     os.environ.setdefault("MUJOCO_GL", "disable")
     allocator.keep_large_blocks_apart()
+    allocator.trim_regularly()
     # A shell lets processes in the background ignore SIGINT; a sender means it to end them, and so with SIGTERM.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)

@@ -37,6 +37,7 @@ def _import_and_run(modules: Sequence[str], pipe: Connection, rehearsal: str) ->
     """The life of the process; it ends if the parent ends before it has sent a function."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     allocator.keep_large_blocks_apart()
+    allocator.trim_regularly()
     if rehearsal:
         with contextlib.suppress(OSError), open("/proc/self/comm", "w") as file:  # its name in ps
             file.write("standby process")

@@ -35,6 +35,7 @@ from typing import Any
 
 import numpy as np
 
+from vinesim import allocator
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 
@@ -306,6 +307,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if reason is not None:
         sys.stderr.write(reason + "\n")
         return 2
+    allocator.trim_regularly()
     middleware.clear_profile()
     message_packages.ensure_importable(["tf2_msgs", "vision_msgs", "audio_common_msgs"])
     requests: queue.SimpleQueue[str] = queue.SimpleQueue()
