@@ -164,7 +164,7 @@ def measure_dataset(report: Report, device: str, images: int) -> None:
     """Images a second on disk with their truth: all, and between the first and the last tenth of them."""
     with tempfile.TemporaryDirectory() as folder:
         out = pathlib.Path(folder) / "set"
-        command = [sys.executable, "-m", "vinesim.cli", "dataset", "--images", str(images), "--out", str(out)]
+        command = [sys.executable, "-m", "vinesim", "dataset", "--images", str(images), "--out", str(out)]
         start = time.time()
         subprocess.run([*command, "--device", device], check=True, stdout=subprocess.DEVNULL)
         took = time.time() - start

@@ -60,7 +60,7 @@ def pick(seed: int) -> dict[str, object]:
     command = [
         sys.executable,
         "-m",
-        "vinesim.cli",
+        "vinesim",
         "client",
         "--role",
         "robot",

@@ -54,7 +54,7 @@ def test_a_summary_is_written_before_pictures_that_find_no_room(tmp_path):
 @pytest.mark.parametrize("role", ["robot", "human", "spectator"])
 def test_a_client_whose_folder_cannot_be_made_says_so_at_once(role, tmp_path):
     (tmp_path / "file").write_text("")
-    command = [sys.executable, "-m", "vinesim.cli", "client", "--role", role, "--out", str(tmp_path / "file" / "out")]
+    command = [sys.executable, "-m", "vinesim", "client", "--role", role, "--out", str(tmp_path / "file" / "out")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 5
     assert done.stderr.splitlines()[-1].startswith(f"vinesim: {tmp_path / 'file' / 'out'} cannot be written: Not a dir")

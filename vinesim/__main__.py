@@ -1,4 +1,4 @@
-"""``python -m vinesim.cli``: the command line without its entry point."""
+"""``python -m vinesim``: the command line without its entry point."""
 
 from vinesim.cli import main
 

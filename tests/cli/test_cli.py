@@ -23,7 +23,7 @@ TIMEOUT = 300.0
 
 def vinesim(*arguments, cwd=None):
     return subprocess.run(
-        [sys.executable, "-m", "vinesim.cli", *arguments], capture_output=True, text=True, timeout=TIMEOUT, cwd=cwd
+        [sys.executable, "-m", "vinesim", *arguments], capture_output=True, text=True, timeout=TIMEOUT, cwd=cwd
     )
 
 
@@ -148,7 +148,7 @@ def test_a_second_actor_of_one_name_is_refused():
     with Server("tcp/127.0.0.1:0") as server:
         arguments = ["client", "--connect", server.endpoint, "--name", "twin", "--no-ros", "--status", "json"]
         first = subprocess.Popen(
-            [sys.executable, "-m", "vinesim.cli", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-m", "vinesim", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         try:
             assert first.stdout.readline()  # its first status: it is in
@@ -163,7 +163,7 @@ def test_a_second_actor_of_one_name_is_refused():
 def running_server(*arguments):
     """A server process and its first line."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "vinesim.cli", "server", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        [sys.executable, "-m", "vinesim", "server", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True,
     )  # fmt: skip
     try:
@@ -313,7 +313,7 @@ def test_three_roles_join_one_server_each_in_its_own_process():
             ("eva", "human", ["--spawn", "1"]),
             ("guest", "spectator", []),
         ):
-            command = [sys.executable, "-m", "vinesim.cli", *common, "--role", role, "--name", name, *options]
+            command = [sys.executable, "-m", "vinesim", *common, "--role", role, "--name", name, *options]
             clients[name] = stack.enter_context(
                 subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             )

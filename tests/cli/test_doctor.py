@@ -18,7 +18,7 @@ from vinesim.ros import dead_segments
 
 def test_every_check_gives_one_line_and_json_says_the_same():
     done = subprocess.run(
-        [sys.executable, "-m", "vinesim.cli", "doctor", "--json"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "vinesim", "doctor", "--json"], capture_output=True, text=True, check=False
     )
     report = json.loads(done.stdout)
     assert [each["check"] for each in report["checks"]] == [

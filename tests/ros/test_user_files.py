@@ -63,7 +63,7 @@ def robot(tmp_path_factory) -> Iterator[StockNode]:
         for name, value in (*domain.items(), ("ROS_LOG_DIR", str(folder))):
             monkeypatch.setenv(name, value)
         client = group.start(
-            "client", "-m", "vinesim.cli", "client", "--role", "robot", "--name", "vinebot", "--status", "none",
+            "client", "-m", "vinesim", "client", "--role", "robot", "--name", "vinebot", "--status", "none",
             "--robot", str(folder / "vinebot.urdf"), "--params-file", str(FOLDER / "parameters.yaml"),
         )  # fmt: skip
         with StockNode() as peer:
@@ -394,7 +394,7 @@ def test_the_launch_file_starts_a_robot_with_options_that_there_are(monkeypatch:
     (vinesim, rviz, relay) = started
     assert vinesim[:4] == ["vinesim", "client", "--role", "robot"]
     done = subprocess.run(
-        [sys.executable, "-m", "vinesim.cli", "client", "--help"], capture_output=True, text=True, check=True,
+        [sys.executable, "-m", "vinesim", "client", "--help"], capture_output=True, text=True, check=True,
         env=os.environ | {"COLUMNS": "200"},
     )  # fmt: skip
     assert [word for word in vinesim if str(word).startswith("--") and word not in done.stdout] == []

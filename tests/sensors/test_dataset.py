@@ -58,7 +58,7 @@ def _command(scene: pathlib.Path, out: pathlib.Path, workers: int) -> list[str]:
     options = {"images": IMAGES, "size": "160x120", "seed": 5, "scene": scene, "out": out, "workers": workers}
     options["actors"] = LIFE.share
     given = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-    return [sys.executable, "-m", "vinesim.cli", "dataset", *given]
+    return [sys.executable, "-m", "vinesim", "dataset", *given]
 
 
 @pytest.fixture(scope="module")

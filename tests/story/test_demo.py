@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-DEMO = [sys.executable, "-m", "vinesim.cli", "demo", "--headless"]
+DEMO = [sys.executable, "-m", "vinesim", "demo", "--headless"]
 
 
 def children_of(marker):

@@ -136,7 +136,7 @@ def test_each_robot_publishes_under_its_prefix():
             )
             for command in (
                 ["vinesim.ros.tools.topic_monitor", *options],
-                ["vinesim.cli", "client", *robots],
+                ["vinesim", "client", *robots],
             )
         )  # fmt: skip
         for process in (monitor, client):

@@ -94,7 +94,7 @@ def frame() -> str:
         "--out",
     ]
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-m", "vinesim.cli", *arguments, folder], check=True, stdout=subprocess.DEVNULL)
+        subprocess.run([sys.executable, "-m", "vinesim", *arguments, folder], check=True, stdout=subprocess.DEVNULL)
         return _hash(*(path.read_bytes() for path in sorted(pathlib.Path(folder).iterdir())))
 
 

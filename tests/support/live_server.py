@@ -34,7 +34,7 @@ class ServerProcess:
 
     def run(self) -> None:
         """Start the process and wait until it listens."""
-        command = [sys.executable, "-m", "vinesim.cli", "server", "--insecure", "--status", "none", "--listen"]
+        command = [sys.executable, "-m", "vinesim", "server", "--insecure", "--status", "none", "--listen"]
         command.append(self.endpoint)
         self.process = self._start(command, stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None

@@ -72,7 +72,7 @@ class Vineyard:
         self.picked: set[int] = set()
         """Bunches that the person has picked."""
         server, router = _free_endpoint(), _free_endpoint()
-        command = ("-m", "vinesim.cli", "server", "--status", "json", "--listen")
+        command = ("-m", "vinesim", "server", "--status", "json", "--listen")
         self._start("server", *command, server, "--state-dir", str(folder / "state"))
         if self.ros:
             words = [word for topic in TOPICS for word in ("--topic", topic)]
@@ -84,7 +84,7 @@ class Vineyard:
             options = ("--spawn", str(i), "--sensor-hz", SENSOR_HZ, "--namespace", name if i else "")
             options += () if self.ros else ("--no-ros",)
             self._start(
-                name, "-m", "vinesim.cli", "client", "--status", "json", "--scene", SCENE, "--name", name, "--connect",
+                name, "-m", "vinesim", "client", "--status", "json", "--scene", SCENE, "--name", name, "--connect",
                 endpoint, *options,
             )  # fmt: skip
         self._stack = contextlib.ExitStack()

@@ -166,7 +166,7 @@ def live(rows: Sequence[str], announce: Callable[[str], None]) -> Iterator[Measu
 def run_command(*arguments: str) -> float:
     """How long ``vinesim ARGUMENTS`` takes [s]; :class:`ProcessFailed` unless it ends with 0."""
     with own_processes() as group:
-        process = group.start(f"vinesim {arguments[0]}", "-m", "vinesim.cli", *arguments)
+        process = group.start(f"vinesim {arguments[0]}", "-m", "vinesim", *arguments)
         start = time.perf_counter()
         try:
             process.child.wait(COMMAND_TIMEOUT)

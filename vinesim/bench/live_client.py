@@ -65,7 +65,7 @@ def run_client(options: Sequence[str], topics: Sequence[str], seconds: float, **
         listener = RosListener(group, topics)
         listener.wait_until_listening()
         client = group.start(
-            "client", "-m", "vinesim.cli", "client", "--role", "robot", "--status", "json", "--tick-log", str(log),
+            "client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", "--tick-log", str(log),
             *options,
         )  # fmt: skip
         deadline = time.monotonic() + START_TIMEOUT

@@ -38,7 +38,7 @@ def page() -> Iterator[Measurement]:
     with own_processes() as group:
         port = free_port()
         options = ["--role", "human", "--name", NAME, "--page", str(port), "--status", "json"]
-        client = group.start(NAME, "-m", "vinesim.cli", "client", *options)
+        client = group.start(NAME, "-m", "vinesim", "client", *options)
         client.next_line(START_TIMEOUT)
         found = asyncio.run(_measure(f"http://127.0.0.1:{port}/"))
     took = 1e3 * np.array(found["took"])

@@ -22,7 +22,7 @@ GRAPH = ("nodes", "publishers", "services")
 
 def measure_resets(group: ProcessGroup, resets: int = RESETS, *options: str) -> Iterator[Measurement]:
     """Rows of so many resets of a client that is started with these further options."""
-    client = group.start("client", "-m", "vinesim.cli", "client", "--role", "robot", "--status", "json", *options)
+    client = group.start("client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", *options)
     caller = group.start("reset caller", "-m", "vinesim.bench.reset_caller", "--resets", str(resets))
     sampler = ProcessSampler([("client", client.child.pid)])
     rows: list[dict[str, Any]] = []

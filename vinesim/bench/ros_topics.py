@@ -238,7 +238,7 @@ def _measure_actions(group: ProcessGroup) -> Iterator[Measurement]:
 
 
 def _start_client(group: ProcessGroup, *options: str) -> Process:
-    return group.start("client", "-m", "vinesim.cli", "client", "--role", "robot", "--status", "json", *options)
+    return group.start("client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", *options)
 
 
 def _rest(client: Process, settling: float, window: float) -> tuple[float, float, float]:

@@ -78,7 +78,7 @@ def router(*options: str) -> Iterator[tuple[str, subprocess.Popen]]:
     command = [
         sys.executable,
         "-m",
-        "vinesim.cli",
+        "vinesim",
         "server",
         "--status",
         "none",

@@ -147,7 +147,7 @@ class _Run:
         """Start them; what they write goes below ``folder``."""
         self._folder = folder
         self.server = group.start(
-            "server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json",
+            "server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json",
             "--state-dir", str(folder / "state"),
         )  # fmt: skip
         self._figures: dict[str, Any] = json.loads(self.server.next_line(START_TIMEOUT))
@@ -160,7 +160,7 @@ class _Run:
         self.recorder = None
         if cast.records:
             self.recorder = group.start(
-                "recorder", "-m", "vinesim.cli", "record", str(folder / "soak.mcap"), "--connect", self._endpoint
+                "recorder", "-m", "vinesim", "record", str(folder / "soak.mcap"), "--connect", self._endpoint
             )
             self.processes.append(("recorder", self.recorder))
         self.sampler = ProcessSampler([(kind, process.child.pid) for kind, process in self.processes])
@@ -195,7 +195,7 @@ class _Run:
     def _start_client(self, group: ProcessGroup, role: str, name: str, cast: Cast, options: list[str]) -> None:
         common = ["--connect", self._endpoint, "--scene", cast.scene, "--status", "json"]
         self.clients[name] = group.start(
-            name, "-m", "vinesim.cli", "client", "--role", role, "--name", name, *common, "--out",
+            name, "-m", "vinesim", "client", "--role", role, "--name", name, *common, "--out",
             str(self._folder / name), *options,
         )  # fmt: skip
         self.processes.append(("robot client" if role == "robot" else "person's client", self.clients[name]))

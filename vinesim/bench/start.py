@@ -87,7 +87,7 @@ def _render_rows(folder: pathlib.Path) -> Iterator[Measurement]:
 
 def _median_wall(*command: str) -> float:
     """Median wall time [s] of a command of vinesim."""
-    return statistics.median([_run("-m", "vinesim.cli", *command)[0] for _ in range(RUNS + 1)][1:])
+    return statistics.median([_run("-m", "vinesim", *command)[0] for _ in range(RUNS + 1)][1:])
 
 
 def _run(*arguments: str) -> tuple[float, str]:

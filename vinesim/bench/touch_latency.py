@@ -78,7 +78,7 @@ def run_clients(line: Link) -> tuple[Rows, Rows]:
     """Traces of the picker and of the visitor, of the same bunch."""
     scene = load_scene("demo")
     bunch = str(find_reachable_bunch(generate(scene), spawn_pose(scene, 0)))
-    client = [sys.executable, "-m", "vinesim.cli", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
+    client = [sys.executable, "-m", "vinesim", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
     roles = {"picker": ["--push", bunch, "--spawn", "0"], "visitor": ["--watch", bunch, "--spawn", "1"]}
     with tempfile.TemporaryDirectory() as folder, NetworkEmulator(dict.fromkeys(roles, line)) as net:
         net.start_server("--insecure")

@@ -100,13 +100,13 @@ def _bursts() -> np.ndarray:
 
 def _start(group: ProcessGroup) -> list[str]:
     """Start a server and two people; addresses of their pages."""
-    server = group.start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json")
+    server = group.start("server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json")
     endpoint = json.loads(server.next_line(START_TIMEOUT))["endpoints"][0]
     ports, people = [], []
     for name, pose in (FIRST, SECOND):
         ports.append(free_port())
         people.append(group.start(
-            name, "-m", "vinesim.cli", "client", "--role", "human", "--name", name, "--connect", endpoint, "--page",
+            name, "-m", "vinesim", "client", "--role", "human", "--name", name, "--connect", endpoint, "--page",
             str(ports[-1]), "--pose", *pose.split(), "--status", "json",
         ))  # fmt: skip
     for person in people:

@@ -152,7 +152,7 @@ class NetworkEmulator:
 
     def start_server(self, *options: str) -> None:
         """Start ``vinesim server`` in the hub with some ``options``, and wait until it listens."""
-        command = [sys.executable, "-m", "vinesim.cli", "server", "--status", "none", *options]
+        command = [sys.executable, "-m", "vinesim", "server", "--status", "none", *options]
         server = self.start("hub", command, stdout=subprocess.PIPE, text=True)
         assert server.stdout is not None
         server.stdout.readline()

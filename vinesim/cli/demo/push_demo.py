@@ -131,7 +131,7 @@ def _start_clients(
 ) -> dict[str, Process]:  # fmt: skip
     """The clients by name, with ``common`` options: one pushes the ``bunch``, the other drives up to it and shows all
     of it on the port ``page``."""
-    common = ["-m", "vinesim.cli", "client", "--role", "robot", *common, "--status", "json", "--watch", str(bunch)]
+    common = ["-m", "vinesim", "client", "--role", "robot", *common, "--status", "json", "--watch", str(bunch)]
     own = {
         PICKER: [*poses[0], "--push", str(bunch)],
         VISITOR: [

@@ -49,7 +49,7 @@ def run_job(
     with process_group() as group:
         server, endpoint = group.start_server()
         console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
-        client = ["-m", "vinesim.cli", "client", "--connect", endpoint, "--scene", scene, "--seed", str(plan.seed)]
+        client = ["-m", "vinesim", "client", "--connect", endpoint, "--scene", scene, "--seed", str(plan.seed)]
         client += ["--device", device, "--status", "json"]
         common = [*client, "--role", "robot", "--robot", robot]
         visitor, newest = None, Statuses()

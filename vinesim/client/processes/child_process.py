@@ -149,7 +149,7 @@ class ProcessGroup:
 
     def start_server(self) -> tuple[Process, str]:
         """Start a server on a free port of this machine; the process and its endpoint."""
-        server = self.start("server", "-m", "vinesim.cli", "server", "--listen", "tcp/127.0.0.1:0")
+        server = self.start("server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0")
         return server, server.next_line(START_TIMEOUT).removeprefix("listening on ")
 
 
