@@ -1,9 +1,10 @@
-"""Commands of vinesim in the pages are accepted as they stand there, and Python in the pages runs."""
+"""Commands of vinesim in the pages are accepted as they stand there; short ones run, and so does the Python."""
 
 import os
 import pathlib
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 
@@ -13,35 +14,68 @@ import typer.main
 from tests.client.test_recorder import World
 from vinesim.cli import app
 from vinesim.cli.bench import BENCHES
+from vinesim.tune import Experiment, load_specimen, measure
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.S | re.M)
+RUNS = ("certs ", "experiment ", "render ", "replay run.mcap --out ", "scene ", "tune ")
+"""How commands begin that end by themselves, in seconds."""
 ELSEWHERE = {"docs/gradients.md", "docs/sensors.md", "README.md"}
 """Pages whose Python other tests run: test_gradients, test_reconstruction, test_docs."""
 
 
-def commands() -> list[str]:
-    """Every line of a block of shell that runs ``vinesim``, without comments."""
+def shell_lines(page: pathlib.Path) -> list[str]:
+    """Lines of the blocks of shell in a page, continued ones as one."""
+    blocks = [block for language, block in BLOCK.findall(page.read_text()) if language in ("", "sh", "bash", "console")]
+    return [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+
+
+def commands_of(page: pathlib.Path) -> list[str]:
+    """What a page's blocks of shell give to ``vinesim``, in their order, without comments."""
     found = []
+    for line in shell_lines(page):
+        if re.match(r"\s*(\S*/)?vinesim\s", line):
+            words = shlex.split(line, comments=True)[1:]
+            found.append(shlex.join(word for word in words if word != "..."))
+    return found
+
+
+def commands() -> list[str]:
+    """Those of all pages."""
+    return sorted({line for page in PAGES for line in commands_of(page)})
+
+
+def commands_in_prose() -> list[str]:
+    """What sentences, tables and headings give to ``vinesim``; such a command need not be complete."""
+    found = set()
     for page in PAGES:
-        for language, block in BLOCK.findall(page.read_text()):
-            if language in ("", "sh", "bash", "console"):
-                for line in block.replace("\\\n", " ").splitlines():
-                    if re.match(r"\s*(\S*/)?vinesim\s", line):
-                        words = shlex.split(line, comments=True)[1:]
-                        found.append(shlex.join(word for word in words if word != "..."))
-    return sorted(set(found))
+        found |= set(re.findall(r"`vinesim\s+([^`]+)`", BLOCK.sub("", page.read_text())))
+    return sorted(" ".join(line.split()) for line in found if not re.match(r"[.A-Z]", line))
+
+
+def resolve(line: str) -> tuple[typer.main.TyperCommand, typer.Context, list[str]]:
+    """The command that a line names, its context and the words that it is given; a usage error of click's if there is
+    none."""
+    command, words = typer.main.get_command(app), shlex.split(line)
+    context = command.context_class(command)
+    while hasattr(command, "resolve_command") and words and not words[0].startswith("-"):
+        name, command, words = command.resolve_command(context, words)
+        context = command.context_class(command, parent=context, info_name=name)
+    return command, context, words
 
 
 def parse(line: str) -> None:
     """Parse a command's words as the command line does, without running it; a usage error of click's if it fails."""
-    command, words = typer.main.get_command(app), shlex.split(line)
-    context = command.context_class(command)
-    while hasattr(command, "resolve_command"):
-        name, command, words = command.resolve_command(context, words)
-        context = command.context_class(command, parent=context, info_name=name)
+    command, context, words = resolve(line)
     command.parse_args(context, words)
+
+
+def unknown_options(line: str) -> list[str]:
+    """Options of a line that its command does not have."""
+    command, context, words = resolve(line)
+    known = {name for option in command.get_params(context) for name in (*option.opts, *option.secondary_opts)}
+    return [word for word in words if word.startswith("-") and word.partition("=")[0] not in known]
 
 
 @pytest.mark.parametrize("line", commands())
@@ -52,7 +86,51 @@ def test_a_command_of_the_pages_is_accepted(line):
         assert names[0] in BENCHES
 
 
+@pytest.mark.parametrize("line", commands_in_prose())
+def test_a_command_in_a_sentence_has_these_options(line):
+    assert not unknown_options(line)
+    if line.startswith("bench "):
+        assert line.split()[1] in BENCHES
+
+
+def test_no_command_of_a_page_is_overlooked():
+    """Every line of shell that runs ``vinesim`` begins with it, so that :func:`commands_of` sees it."""
+    for page in PAGES:
+        for line in shell_lines(page):
+            said = shlex.split(line, comments=True) if re.match(r"\s*(\S*/)?vinesim\s", line) else []
+            rest = line.partition("#")[0].partition("//")[0] if not said else shlex.join(said[1:])
+            assert not re.search(r"(^|[\s;&|/])vinesim\s", rest), f"{page.name}: {line}"
+
+
+def pages_that_run() -> list[pathlib.Path]:
+    return [page for page in PAGES if any(line.startswith(RUNS) for line in commands_of(page))]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", pages_that_run(), ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_short_commands_of_a_page_run(page, tmp_path):
+    """In their order, in a folder that has the examples and the files that a reader brings along."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    shutil.copy(ROOT / "examples/plants/vine.mtg", tmp_path)
+    lines = [line for line in commands_of(page) if line.startswith(RUNS)]
+    if any("pull.csv" in line for line in lines):
+        measure(load_specimen(ROOT / "examples/cane.toml"), Experiment(duration=2.0)).write(tmp_path / "pull.csv")
+    if any("run.mcap" in line for line in lines):
+        world = World(tmp_path / "run.mcap")
+        world.run(0.2)
+        world.recorded()
+    for line in lines:
+        done = subprocess.run(
+            [sys.executable, "-m", "vinesim.cli", *shlex.split(line)], cwd=tmp_path, check=False,
+            env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{line}: {done.stdout}{done.stderr}"
+        assert "Traceback" not in done.stderr, done.stderr
+
+
 def test_a_wrong_option_would_be_found():
+    assert unknown_options("client --role human --no-such-option") == ["--no-such-option"]
+    assert len(commands_in_prose()) > 20
     assert len(commands()) > 20
     for wrong in ("client --no-such-option", "render demo --size", "nothing", "scene paint demo"):
         with pytest.raises(Exception, match=r"No such|requires an argument") as refused:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from tests.support.tuning import bunch, cane, number
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.rollout import Rollout
 from vinesim.scene.builder import assemble
 from vinesim.scene.state import State
@@ -46,6 +48,22 @@ def test_a_candidate_moves_as_its_specimen_does_in_the_solver() -> None:
 
 def _x_axis(q: np.ndarray) -> np.ndarray:
     return frames.rotate(q, np.array([1.0, 0.0, 0.0]))
+
+
+def test_candidates_move_alike_where_kernels_have_copies_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a GPU what is not brought there and back is lost; copies of the CPU's stand for its memory."""
+    candidates = np.zeros((5, len(COLUMNS)))
+    candidates[:, 0], candidates[:, 5] = np.linspace(-0.5, 0.5, 5), 1.0
+    ticks = np.array([0, 3, 10, 31])
+    alone = Candidates(cane(5e9), dt=0.01).run(candidates, ticks)
+
+    def with_copies(*arguments: Any, device: str, **options: Any) -> ArticulationSolver:
+        return ArticulationSolver(*arguments, buffers=DeviceBuffers(device, interleave=4), **options)
+
+    monkeypatch.setattr("vinesim.tune.candidates.ArticulationSolver", with_copies)
+    copied = Candidates(cane(5e9), dt=0.01).run(candidates, ticks)
+    np.testing.assert_array_equal(copied.position, alone.position)
+    np.testing.assert_array_equal(copied.velocity, alone.velocity)
 
 
 def test_a_pulled_cane_takes_the_shape_of_a_beam() -> None:
