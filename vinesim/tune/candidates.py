@@ -200,7 +200,9 @@ class Candidates:
 
     def _advance(self, plants: ArticulationSolver, steps: int, pushed: np.ndarray | None) -> None:
         if pushed is None:
+            plants.upload()
             plants.advance(steps)
+            plants.download()
             return
         for _ in range(steps):
             self._push(plants, pushed)
