@@ -225,22 +225,28 @@ def test_a_bunch_that_a_person_cuts_with_shears_is_cut_on_all_clients():
     ahead = frames.from_yaw(0.5 * np.pi)
     palm = stalk - [0.0, 0.0, 0.02] - frames.rotate(ahead, appearance.load_shears().mouth[:3])
     root = frames.pose(np.array([stalk[0] + 0.2, stalk[1] - 0.6, 0.0]), ahead)
-    hand = dataclasses.replace(standing_pose(root), right=frames.pose(palm, ahead))
-    poses_now = [dataclasses.replace(hand, right_shears=True)]
-    eva = world.join("eva", None, root, lambda _: poses_now[-1])
+    standing = standing_pose(root)
+    places = np.stack([standing.right[:3], palm - [0.0, 0.3, 0.0], palm])  # first up, then ahead
+    state = {"right_shears": True}
+
+    def source(time: float) -> HumanPose:
+        place = np.array([np.interp(time, [0.0, 1.0, 1.4], places[:, axis]) for axis in range(3)])
+        return dataclasses.replace(standing, right=frames.pose(place, ahead), **state)
+
+    eva = world.join("eva", None, root, source)
     ida = world.join("ida", None, frames.pose(np.array([stalk[0], stalk[1] + 1.5, 0.0])))
     parts = {"eva/right_shears_blade", "eva/right_shears_hook"}
-    world.run(0.8)
+    world.run(1.6)
     for client in (eva, ida):
         assert parts <= {one.name for one in client.physics.snapshot().visuals}
         assert client.physics.state.bunch_attached.all()
-    poses_now.append(dataclasses.replace(hand, right_shears=True, right_closed=True))
+    state["right_closed"] = True
     world.run(0.5)
     for client in (eva, ida):
         assert not client.physics.state.bunch_attached.any()
         place = client.physics.rigid.visual_q()[[one.name for one in client.physics.rigid.visuals()].index("bunch/0")]
         assert place[2] < stalk[2] - 0.5, "it falls"
-    poses_now.append(hand)
+    state.clear()
     world.run(0.2)
     for client in (eva, ida):
         assert not parts & {one.name for one in client.physics.snapshot().visuals}
