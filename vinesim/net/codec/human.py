@@ -127,8 +127,14 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
         raise MessageError(f"human pose with an unknown intention, {rest[11]}")
     if flags >= 1 << len(_FLAGS):
         raise MessageError("human pose with unknown flags")
-    told = {name: bool(flags >> bit & 1) for bit, name in enumerate(_FLAGS)}
-    pose = HumanPose(*points, **told, left_fingers=tuple(bends[:5]), right_fingers=tuple(bends[5:]))
+    left_closed, right_closed, left_busy, right_busy, left_shears, right_shears = (
+        bool(flags >> bit & 1) for bit in range(len(_FLAGS))
+    )
+    pose = HumanPose(
+        *points, left_closed=left_closed, right_closed=right_closed, left_busy=left_busy, right_busy=right_busy,
+        left_fingers=tuple(bends[:5]), right_fingers=tuple(bends[5:]), left_shears=left_shears,
+        right_shears=right_shears,
+    )  # fmt: skip
     return HumanUpdate(actor, time, pose, velocity.reshape(_POINTS, 6), INTENTIONS[rest[11]])
 
 
