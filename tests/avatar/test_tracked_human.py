@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vinesim import frames
-from vinesim.avatar.gestures import FIST, OPEN_HAND
+from vinesim.avatar.gestures import FIST, OPEN_HAND, shears_grip
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 
 DT = 0.01
@@ -61,3 +61,10 @@ def test_closing_a_hand_and_bending_fingers_pass_through(human):
     pose = human(0.0)
     assert (pose.left_closed, pose.right_closed) == (False, True)
     assert pose.right_fingers == FIST
+
+
+def test_the_fingers_of_a_hand_with_shears_are_around_them(human):
+    human.take(TrackedPoints(human.pose.head, closed=(True, False), fingers=(FIST, FIST), shears=(True, False)))
+    pose = human(0.0)
+    assert (pose.left_shears, pose.right_shears) == (True, False)
+    assert (pose.left_fingers, pose.right_fingers) == (shears_grip(closed=True), FIST)

@@ -65,6 +65,11 @@ def test_help_shows_every_command_with_examples():
         assert "Examples:" in vinesim(*command, "--help").stdout, command
 
 
+def test_an_unknown_outfit_is_refused_with_the_known_ones():
+    done = vinesim("client", "--role", "human", "--outfit", "pink", "--status", "none")
+    assert_refused(done, 2, "--outfit pink", "orange", "brown")
+
+
 def test_an_unknown_scene_is_refused():
     assert_refused(vinesim("scene", "show", "nowhere"), 2, "nowhere", "demo", "tendone", "vsp")
 

@@ -14,18 +14,22 @@ from vinesim.avatar.leg_estimator import LegEstimator
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.cli.human_client import standing_place
 from vinesim.client.client import Client, label_index
+from vinesim.client.remote.remote_human import human_spec
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, start_pose
 from vinesim.net.codec import human as poses
+from vinesim.net.codec.messages import Hello
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.human_shapes import BODY_PARTS
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
+from vinesim.scene import appearance
+from vinesim.scene.appearance import AppearanceError
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label, unlabel
 from vinesim.scene.spec import load_scene as load_scene
-from vinesim.scene.values import HumanPose
+from vinesim.scene.values import HumanPose, HumanUpdate
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
@@ -174,6 +178,78 @@ def test_fingers_are_replicated():
     world.run(0.5)
     received = ida.replicator.receive(world.now).people["eva"].pose
     assert received.right_fingers == pytest.approx((0.2, 0.0, 1.0, 1.0, 1.0), abs=1 / 255)
+
+
+def colours(client: Client, name: str) -> dict[str, list]:
+    """Colours of all shapes of a person that this client draws, by link."""
+    visuals = client.physics.snapshot().visuals
+    return {one.name: [shape.rgba for shape in one.shapes] for one in visuals if one.name.startswith(f"{name}/")}
+
+
+def test_people_wear_outfits_that_are_alike_on_all_clients():
+    """By their own choice or by their names; cameras, lidars and pages draw these shapes."""
+    world = World()
+    outfits = {"anna": "", "eva": "green", "viewer": ""}
+    for number, (name, outfit) in enumerate(outfits.items()):
+        world.join(name, None, frames.pose(np.array([2.0 * number, 0.0, 0.0])), outfit=outfit)
+    world.run(0.8)
+    worn = {}
+    for name, outfit in outfits.items():
+        seen = [colours(client, name) for client in world.clients]
+        assert seen[0] == seen[1] == seen[2]
+        parts = appearance.load_human_model(1.75, outfit=outfit or appearance.outfit_of(name)).parts
+        assert seen[0][f"{name}/chest"] == [shape.rgba for shape in parts["chest"]]
+        worn[name] = {link.partition("/")[2]: rgba for link, rgba in seen[0].items()}
+    assert worn["anna"] != worn["eva"] != worn["viewer"] != worn["anna"]
+    tints = []
+    for client in world.clients:
+        primitives = Primitives(world.model)
+        primitives.update(client.physics.snapshot())
+        rows = slice(primitives.plant_count, primitives.count)
+        tints.append({tuple(tint) for tint in np.round(primitives.local_columns(rows)["tint"], 4).tolist()})
+    assert tints[0] == tints[1] == tints[2]
+
+
+def test_a_person_in_an_outfit_that_is_unknown_here_gets_that_of_its_name():
+    update = HumanUpdate("eva", 0.0, standing_pose(SIDE), np.zeros((7, 6)))
+    assert human_spec(Hello("eva", kind="human", outfit="no-such-outfit"), update).outfit == ""
+    assert human_spec(Hello("eva", kind="human", outfit="red"), update).outfit == "red"
+    with pytest.raises(AppearanceError, match="'pink' is unknown; give one of: orange"):
+        World().join("eva", None, SIDE, outfit="pink")
+
+
+def test_a_bunch_that_a_person_cuts_with_shears_is_cut_on_all_clients():
+    """The other client sees the shears come into the hand, cut, and go."""
+    world = World()
+    stalk = world.model.forward_kinematics(world.model.joint_settled)[world.model.bunch_body[0] - 1, :3].astype(float)
+    ahead = frames.from_yaw(0.5 * np.pi)
+    palm = stalk - [0.0, 0.0, 0.02] - frames.rotate(ahead, appearance.load_shears().mouth[:3])
+    root = frames.pose(np.array([stalk[0] + 0.2, stalk[1] - 0.6, 0.0]), ahead)
+    standing = standing_pose(root)
+    places = np.stack([standing.right[:3], palm - [0.0, 0.3, 0.0], palm])  # first up, then ahead
+    state = {"right_shears": True}
+
+    def source(time: float) -> HumanPose:
+        place = np.array([np.interp(time, [0.0, 1.0, 1.4], places[:, axis]) for axis in range(3)])
+        return dataclasses.replace(standing, right=frames.pose(place, ahead), **state)
+
+    eva = world.join("eva", None, root, source)
+    ida = world.join("ida", None, frames.pose(np.array([stalk[0], stalk[1] + 1.5, 0.0])))
+    parts = {"eva/right_shears_blade", "eva/right_shears_hook"}
+    world.run(1.6)
+    for client in (eva, ida):
+        assert parts <= {one.name for one in client.physics.snapshot().visuals}
+        assert client.physics.state.bunch_attached.all()
+    state["right_closed"] = True
+    world.run(0.5)
+    for client in (eva, ida):
+        assert not client.physics.state.bunch_attached.any()
+        place = client.physics.rigid.visual_q()[[one.name for one in client.physics.rigid.visuals()].index("bunch/0")]
+        assert place[2] < stalk[2] - 0.5, "it falls"
+    state.clear()
+    world.run(0.2)
+    for client in (eva, ida):
+        assert not parts & {one.name for one in client.physics.snapshot().visuals}
 
 
 def test_a_teleported_human_is_placed_at_once():

@@ -34,6 +34,7 @@ def random_human(seed: int = 0) -> HumanUpdate:
     points[1:, 3:] = frames.normalize(rng.normal(size=(6, 4)))
     fingers = tuple(rng.uniform(size=5))
     pose = dataclasses.replace(pose.with_points(points), left_closed=True, right_busy=True, right_fingers=fingers)
+    pose = dataclasses.replace(pose, left_shears=True)
     return HumanUpdate("eva", 12.5, pose, rng.normal(size=(7, 6)))
 
 
@@ -58,6 +59,7 @@ def test_a_human_pose_is_root_three_inputs_hips_and_feet_in_162_bytes():
     assert (error < fastest / 127).all()
     assert (received.pose.left_closed, received.pose.right_closed) == (True, False)
     assert (received.pose.left_busy, received.pose.right_busy) == (False, True)
+    assert (received.pose.left_shears, received.pose.right_shears) == (True, False)
     np.testing.assert_allclose(received.pose.right_fingers, sent.pose.right_fingers, atol=0.5 / 255 + 1e-9)
     assert received.pose.left_fingers == (0.0,) * 5
     for intention in INTENTIONS:

@@ -253,6 +253,7 @@ _NAN, _INF = float("nan"), float("inf")
         *({"seed": seed} for seed in (-2, 1 << 63)),
         *({"height": height} for height in (_NAN, _INF, -_INF, 0.0, 0.9, 2.6, 1e9)),
         {"kind": "ghost"},
+        *({"outfit": outfit} for outfit in ("x" * 49, "no outfit", "../green")),
     ],
     ids=str,
 )

@@ -433,6 +433,37 @@ def test_fingers_bend_as_commanded():
                     assert ahead[1] @ down > -0.1
 
 
+def test_shears_are_drawn_in_the_hand_that_has_them():
+    """They come and go between steps, follow the palm, and their halves meet when the hand closes; nothing collides."""
+    spec = eva()
+    rigid = RigidWorld(yard())
+    rigid.add_human(spec)
+    geoms = len(rigid.geoms.link)
+    plain = [one.name for one in rigid.visuals()]
+    turned = frames.pose(np.array([0.5, -0.3, 1.2]), frames.exp(np.array([0.3, -0.5, 0.9])))
+    openings = []
+    for is_closed in (False, True):
+        rigid.move_human("eva", put(spec.pose, turned, right_shears=True, right_closed=is_closed))
+        step(rigid, 30)
+        names = [one.name for one in rigid.visuals()]
+        assert names == [*plain, "eva/right_shears_blade", "eva/right_shears_hook"]
+        assert all(one.shapes for one in rigid.visuals())
+        at = dict(zip(names, rigid.visual_q(), strict=True))
+        blade, hook = (
+            frames.compose(frames.inverse(at["eva/right_hand"]), at[f"eva/right_shears_{half}"])
+            for half in ("blade", "hook")
+        )
+        np.testing.assert_allclose(blade[:3], hook[:3], atol=1e-9)
+        openings.append(frames.to_yaw(blade[3:]) - frames.to_yaw(hook[3:]))
+        assert rigid.human("eva").hand("right").held is None
+    assert openings[0] > 0.3
+    assert openings[1] == pytest.approx(0.0, abs=1e-9)
+    rigid.move_human("eva", spec.pose)
+    assert [one.name for one in rigid.visuals()] == plain
+    assert len(rigid.visual_q()) == len(plain)
+    assert len(rigid.geoms.link) == geoms
+
+
 # ---------------------------------------------------------------------- holding
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import cv2
 import numpy as np
@@ -181,6 +182,72 @@ def test_an_invalid_human_model_is_refused_in_one_line(tmp_path, line: str, reas
     with pytest.raises(AppearanceError, match=reason) as caught:
         appearance.load_human_model(1.75, str(file))
     assert "\n" not in str(caught.value)
+
+
+def worn(outfit: str) -> dict[str, np.ndarray]:
+    """Colours [3] of what people wear, and of their skin."""
+    parts = appearance.load_human_model(1.75, outfit=outfit).parts
+    pieces = {
+        "trousers": parts["left_thigh"][0], "shirt": parts["left_upper_arm"][0], "skin": parts["neck"][0],
+        "hat": next(shape for shape in parts["head"] if shape.surface == "straw"),
+        "vest": next(shape for shape in parts["chest"] if shape.kind == "box"),
+    }  # fmt: skip
+    return {name: np.array(shape.rgba[:3]) for name, shape in pieces.items()}
+
+
+def test_outfits_differ_visibly() -> None:
+    """Any two differ by a fifth of a channel or more in three of vest, shirt, trousers, hat and skin."""
+    outfits = appearance.outfit_names()
+    assert len(outfits) >= 6
+    for one, other in itertools.combinations(outfits, 2):
+        a, b = worn(one), worn(other)
+        differ = [name for name in a if np.abs(a[name] - b[name]).max() >= 0.2]
+        assert len(differ) >= 3, f"{one} and {other} differ in {differ} only"
+    colours = [rgba for outfit in outfits for rgba in worn(outfit).values()]
+    assert np.min(colours) >= 0.0
+    assert np.max(colours) <= 1.0
+
+
+def test_outfits_change_colours_and_nothing_else() -> None:
+    usual, other = (appearance.load_human_model(1.75, outfit=outfit).parts for outfit in ("", "blue"))
+    for part, shapes in usual.items():
+        for one, two in zip(shapes, other[part], strict=True):
+            assert one.mesh is two.mesh, "people in all outfits share their meshes"
+            assert (one.kind, one.size, one.surface) == (two.kind, two.size, two.surface)
+            np.testing.assert_array_equal(one.pose, two.pose)
+    vests = {shape.rgba[:3] for shape in other["chest"]}
+    assert (0.10, 0.22, 0.52) in vests
+    assert (1.00, 0.42, 0.08) not in vests
+
+
+def test_the_outfit_of_an_actor_follows_from_its_name() -> None:
+    assert [appearance.outfit_of(name) for name in ("anna", "ida", "viewer")] == ["brown", "orange", "white"]
+    assert {appearance.outfit_of(f"human-{k}") for k in range(100)} == set(appearance.outfit_names())
+
+
+def test_an_unknown_outfit_is_refused_with_the_known_ones(tmp_path) -> None:
+    with pytest.raises(AppearanceError, match="outfit 'pink' is unknown; give one of: orange, yellow, green"):
+        appearance.load_human_model(1.75, outfit="pink")
+    text = find_data_file("figures", "worker", ".toml").read_text()
+    file = tmp_path / "odd.toml"
+    file.write_text(text.replace("[outfits.yellow]", "[outfits.yellow]\ncape = [1.0, 0.0, 0.0]"))
+    with pytest.raises(AppearanceError, match=r"outfits\.yellow\.cape is no paint; give some of: skin, lips"):
+        appearance.load_human_model(1.75, str(file))
+
+
+def test_the_mouth_of_shears_is_between_their_blades() -> None:
+    """When they are open, blade and hook are on either side of the mouth's middle, and reach beyond it."""
+    shears = appearance.load_shears()
+    tips = []
+    for part, pose in zip(appearance.SHEARS_PARTS, shears.open, strict=True):
+        steel = [shape for shape in shears.parts[part] if shape.surface == "metal"]
+        at = frames.compose(pose, np.stack([shape.pose for shape in steel]))
+        tips.append(at[np.argmax(at[:, 0]), :3])
+    mouth, half = shears.mouth[:3], shears.mouth_half
+    assert tips[0][1] > mouth[1] > tips[1][1]
+    assert min(tip[0] for tip in tips) > mouth[0]
+    assert all(abs(tip[2] - mouth[2]) < half[2] for tip in tips)
+    assert mouth[0] - half[0] > shears.open[0, 0], "beyond the bolt"
 
 
 def test_an_unknown_posture_is_refused_with_the_known_ones() -> None:

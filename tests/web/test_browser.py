@@ -17,7 +17,9 @@ from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.scene import appearance
 from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import INTENTIONS
 from vinesim.web.page_server import WINDOW, PageServer
@@ -96,6 +98,12 @@ def open_page(page, live, before=""):
     wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
     assert page.run("vinesim.failure") is None
     assert page.errors == []
+
+
+def press(page, code):
+    """Press a key once."""
+    page.key(code, down=True)
+    page.key(code, down=False)
 
 
 @pytest.mark.slow
@@ -195,6 +203,52 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch(page):
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
+def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
+    """The page shows the shears where the cut then happens, and says what they have cut."""
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live:
+        open_page(page, live)
+        physics, model, shears = live.client.physics, live.client.model, appearance.load_shears()
+        stalk = int(model.body_parent[model.bunch_body[BUNCH]])
+        assert model.body_organ[stalk] == int(Organ.PEDUNCLE)
+
+        def middle():
+            """[3] m of the last piece of the peduncle, where it is now."""
+            half = frames.pose(np.array([0.5 * model.body_length[stalk], 0.0, 0.0]))
+            return frames.compose(physics.state.body_q[stalk].astype(float), half)[:3]
+
+        eye = np.array(page.run("vinesim.viewer.eyes.place"))
+        way = middle() - eye
+        ahead = np.sqrt(way @ way - shears.mouth[2] ** 2)
+        pitch = np.arctan2(way[2], np.hypot(*way[:2])) - np.arctan2(shears.mouth[2], ahead)
+        page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
+        page.run(f"vinesim.viewer.hand.distance = {ahead - shears.mouth[0]}, 0")
+        drawn = "vinesim.viewer.world.names.includes('viewer/right_shears_blade')"
+        press(page, "KeyT")
+        wait(lambda: live.client.humans["viewer"].pose.right_shears, "the hand has the shears")
+        wait(lambda: page.run(drawn), "the page draws them")
+        assert page.run("document.querySelector('#tools button').getAttribute('aria-pressed')") == "true"
+        press(page, "KeyR")
+
+        def is_between_blades():
+            apart = frames.compose(physics.hand("viewer", "right").pose, shears.mouth)[:3] - middle()
+            return np.abs(apart).max() < 0.012
+
+        wait(is_between_blades, "the peduncle is between the blades")
+        assert physics.state.bunch_attached[BUNCH]
+        press(page, "Space")
+        wait(lambda: not physics.state.bunch_attached[BUNCH], "the bunch is cut")
+        wait(lambda: page.run("vinesim.viewer.shears.told.at(-1)") == "The shears cut 1 bunch.", "the page says so")
+        assert "cut 1 bunch" in page.run("document.getElementById('notices').textContent")
+        wait(lambda: page.run("vinesim.haptics.right?.[0] > 0.99"), "the hand feels it")
+        press(page, "Space")
+        wait(lambda: not live.client.humans["viewer"].pose.right_closed, "the shears open")
+        page.run("document.querySelector('#tools button').click()")
+        wait(lambda: not page.run(drawn), "they are put away")
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
 def test_a_headset_moves_head_and_hands(page):
     """An emulated headset (iwer) at known places: the person in the physics is there, in the world's axes."""
     device = ";window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
@@ -225,6 +279,12 @@ def test_a_headset_moves_head_and_hands(page):
         page.run("device.controllers.right.updateButtonValue('squeeze', 0), 0")
         page.run("device.controllers.right.updateButtonValue('a-button', 1), 0")
         wait(lambda: human.pose.right_fingers == VICTORY, "a button makes the person's own pose")
+        page.run("device.controllers.right.updateButtonValue('thumbstick', 1), 0")
+        wait(lambda: human.pose.right_shears, "pressing the stick takes the shears into that hand")
+        assert not human.pose.left_shears
+        page.run("device.controllers.right.updateButtonValue('thumbstick', 0), 0")
+        page.run("vinesim.viewer.shears.toggle('right'), 0")
+        wait(lambda: not human.pose.right_shears, "they are put away")
         with live.paused():
             hand = "vinesim.viewer.world.bodies + 1 + vinesim.viewer.world.names.indexOf('viewer/right_hand')"
             z = page.run(f"vinesim.viewer.world.place({hand}).z")

@@ -162,6 +162,7 @@ def _paths(value, path=()):
 
 _HAND = {"pose": HERE, "closed": False, "fingers": [0.0] * 5}
 _WHOLE = {"drawn": 3, "view": HERE, "person": {"head": HERE, "left": _HAND, "right": _HAND, "intention": "pick"}}
+_WHOLE["person"]["shears"] = [False, True]
 _JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=40),
     lambda inner: st.lists(inner, max_size=9) | st.dictionaries(st.text(max_size=9), inner, max_size=5),

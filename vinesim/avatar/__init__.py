@@ -1,4 +1,4 @@
-"""People that this client moves: a person and its haptic feedback, finger poses, estimated legs, a scripted person.
+"""People that this client moves: a person, its haptic feedback and shears, finger poses, estimated legs, a script.
 
 Their bodies in the physics are in ``vinesim.physics.rigid``; copies of other clients' people in
 ``vinesim.client.remote``.

@@ -86,3 +86,8 @@ class Gestures:
 def finger_bend(*, closed: bool) -> FingerBend:
     """The fingers of a hand that is closed or open."""
     return FIST if closed else OPEN_HAND
+
+
+def shears_grip(*, closed: bool) -> FingerBend:
+    """The fingers of a hand around shears that are closed or open. GUESSED."""
+    return (0.4, 0.8, 0.8, 0.8, 0.8) if closed else (0.2, 0.5, 0.5, 0.5, 0.5)

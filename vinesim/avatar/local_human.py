@@ -1,4 +1,4 @@
-"""A person whom this client moves: pose from a source, update for other clients, haptic feedback."""
+"""A person whom this client moves: pose from a source, shears, update for other clients, haptic feedback."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.avatar.haptics import HapticFeedback
+from vinesim.avatar.shears import Closure, Shears
 from vinesim.physics.rigid.human_shapes import SIDES
 from vinesim.physics.step import Physics
 from vinesim.scene.values import INTENTIONS, POINT_NAMES, Haptic, HumanPose, HumanSpec, HumanUpdate
@@ -28,7 +29,10 @@ class LocalHuman:
         """What the person indicates to do; see :meth:`indicate`."""
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the person's controllers after the last step."""
+        self.closures: tuple[Closure, ...] = ()
+        """How shears in the hands closed in the last step."""
         self._feedback = HapticFeedback(physics, spec.name)
+        self._shears = tuple(Shears(physics, spec.name, side) for side in SIDES)
         self._sent_points = spec.pose.points
         self._busy_steps = physics.parameters.steps(physics.parameters.hand_contact_duration)
         """For how many steps a hand counts as busy after it pushed a robot or held something."""
@@ -45,11 +49,14 @@ class LocalHuman:
         """Before a step: move to where the source says."""
         self.pose = self.source(time)
         self.physics.move_human(self.name, self.pose)
+        for shears in self._shears:
+            shears.control(self.pose)
 
     def update(self, now: float) -> HumanUpdate:
         """After a step: pose and velocity for other clients; busy hands are where they are, not at their
         controllers."""
-        self.haptics = self._feedback.update()
+        self.closures = tuple(closure for shears in self._shears if (closure := shears.closure()) is not None)
+        self.haptics = (*self._feedback.update(), *(closure.haptic(self.name) for closure in self.closures))
         self._hand_wrenches, pushing = self.physics.rigid.hand_wrenches(self.name)
         points, before = self.pose.points, self._sent_points
         for i, side in enumerate(SIDES):

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim import frames
-from vinesim.avatar.gestures import OPEN_HAND, FingerBend, Gestures
+from vinesim.avatar.gestures import OPEN_HAND, FingerBend, Gestures, shears_grip
 from vinesim.avatar.leg_estimator import LegEstimator
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanPose
@@ -32,6 +32,8 @@ class TrackedPoints:
     closed: tuple[bool, bool] = (False, False)
     """Left, right."""
     fingers: tuple[FingerBend, FingerBend] = (OPEN_HAND, OPEN_HAND)
+    shears: tuple[bool, bool] = (False, False)
+    """Whether the left and the right hand have shears: their fingers are then around them."""
 
 
 class TrackedHuman:
@@ -82,12 +84,14 @@ class TrackedHuman:
         head, left, right = _between(self._start, self._goal, self._share)
         hips, left_foot, right_foot = self._legs.update(head)
         root = frames.pose(np.array([*hips[:2], self.pose.root[2]]), frames.from_yaw(frames.to_yaw(head[3:])))
-        closed, fingers = ((False, False), (OPEN_HAND, OPEN_HAND)) if self._points is None else (
-            self._points.closed, self._points.fingers
-        )  # fmt: skip
+        told = self._points or TrackedPoints(head)
+        fingers = [
+            shears_grip(closed=closed) if shears else bend
+            for shears, closed, bend in zip(told.shears, told.closed, told.fingers, strict=True)
+        ]
         self.pose = HumanPose(
-            root, head, left, right, hips, left_foot, right_foot, *closed, left_fingers=fingers[0],
-            right_fingers=fingers[1],
+            root, head, left, right, hips, left_foot, right_foot, *told.closed, left_fingers=fingers[0],
+            right_fingers=fingers[1], left_shears=told.shears[0], right_shears=told.shears[1],
         )  # fmt: skip
         return self.pose
 

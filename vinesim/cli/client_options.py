@@ -12,7 +12,7 @@ ROLES = ("robot", "human", "spectator")
 
 ROLES_OF_OPTION = {
     **dict.fromkeys(("robot", "approach", "namespace", "params_file", "ros", "push", "job", "watch"), ("robot",)),
-    **dict.fromkeys(("walk", "reach", "into", "height", "gestures"), ("human",)),
+    **dict.fromkeys(("walk", "reach", "into", "height", "gestures", "outfit"), ("human",)),
     "jitter_buffer": ("robot", "human"),
     "sensor_hz": ("robot", "spectator"),
     "renderer": ("robot", "spectator"),
@@ -77,6 +77,8 @@ class ClientOptions:
     """Whether other machines of the network may open the page."""
     gestures: pathlib.Path | None = None
     """File of a person's own finger poses."""
+    outfit: str | None = None
+    """What a person wears, by name; None: what follows from its own name."""
 
     @property
     def is_for_page(self) -> bool:
@@ -112,8 +114,12 @@ def check_options(options: ClientOptions) -> None:
     if options.params_file is not None and not options.params_file.is_file():
         raise UsageError(f"--params-file {options.params_file}: there is no such file; give a ROS 2 parameter file")
     from vinesim.physics.plants.device_buffers import find_device
+    from vinesim.scene import appearance
     from vinesim.sensors.raster import renderer_selection
 
+    if options.outfit is not None and options.outfit not in appearance.outfit_names():
+        known = ", ".join(appearance.outfit_names())
+        raise UsageError(f"--outfit {options.outfit}: there is no such outfit; give one of {known}")
     find_device(options.device)
     renderer_selection.check_renderer(options.renderer, options.device)
     if options.threads > 1 and options.device != "cpu":

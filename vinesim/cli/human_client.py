@@ -39,7 +39,7 @@ def run(options: ClientOptions) -> int:
             human = TrackedHuman(start, options.height, gestures=gestures)
         client = Client(
             session.scene, session.model, None, session.bus(session.name), pose=start, source=human,
-            height=options.height, **session.client_options(),
+            height=options.height, outfit=options.outfit or "", **session.client_options(),
         )  # fmt: skip
         session.leave_at_end(client)
         if options.walk is not None and isinstance(human, ScriptedHuman):

@@ -84,6 +84,7 @@ class Client:
         pose: np.ndarray,
         source: Callable[[float], HumanPose] | None = None,
         height: float = 1.75,
+        outfit: str = "",
         interest_radius: float = interest.INTEREST_RADIUS,
         jitter_buffer: float = 0.0,
         device: str = "cpu",
@@ -91,7 +92,8 @@ class Client:
         clock: Callable[[], float] = time.monotonic,
         executor: Executor | None = None,
     ) -> None:
-        """A robot of this ``description`` at ``pose`` [7] m, 1; None: a human of ``height`` [m].
+        """A robot of this ``description`` at ``pose`` [7] m, 1; None: a human of ``height`` [m] in an
+        ``outfit`` (:func:`vinesim.scene.appearance.outfit_names`; empty: what follows from its name).
 
         ``source(time)`` gives the human's pose; without one it stands still. ``interest_radius`` [m]: actors nearer
         than this to an object receive its motion. ``jitter_buffer`` [s]: delay of remote actors. ``executor`` compiles
@@ -113,7 +115,7 @@ class Client:
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
         self.objects = ObjectSync(self.physics, self.replicators, self._is_present)
         self.couplings = PlantCouplings(self.physics)
-        self._description, self._executor = description, executor
+        self._description, self._executor, self._outfit = description, executor, outfit
         self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
         self._add_own_actor(description, pose, source, height, bus)
         self.replicator = self.replicators[name]
@@ -188,8 +190,8 @@ class Client:
     ) -> None:  # fmt: skip
         """Add the actor that gives this client its name."""
         if description is None:
-            spec = HumanSpec(self.name, label_index(self.name), standing_pose(pose, height), height)
-            self.add_human(spec, source, bus)
+            standing, index = standing_pose(pose, height), label_index(self.name)
+            self.add_human(HumanSpec(self.name, index, standing, height, outfit=self._outfit), source, bus)
         else:
             self.robot = self.add_robot(description, self.name, pose, bus)
 
@@ -201,14 +203,7 @@ class Client:
             digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
             seed=self.scene.seed,
         )  # fmt: skip
-        replicator = Replicator(
-            bus,
-            hello,
-            self.model,
-            interest_radius=self._interest_radius,
-            jitter_buffer=self._jitter_buffer,
-            hand_force=self.physics.parameters.hand_force,
-        )
+        replicator = self._new_replicator(bus, hello)
         robot = self._add_robot_body(description, name, pose)
         self.meshes.offer(bus, description.urdf)
         self._add_replicator(name, replicator)
@@ -223,16 +218,9 @@ class Client:
         """Add a local human with the poses of ``source(time)`` (None: still); ``bus`` must have its name."""
         hello = Hello(
             name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
-            height=spec.height, seed=self.scene.seed,
+            height=spec.height, seed=self.scene.seed, outfit=spec.outfit,
         )  # fmt: skip
-        replicator = Replicator(
-            bus,
-            hello,
-            self.model,
-            interest_radius=self._interest_radius,
-            jitter_buffer=self._jitter_buffer,
-            hand_force=self.physics.parameters.hand_force,
-        )
+        replicator = self._new_replicator(bus, hello)
         self.humans[spec.name] = human = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
         self._add_replicator(spec.name, replicator)
         return human
@@ -242,6 +230,12 @@ class Client:
         self.physics.remove_human(name)
         del self.humans[name], self.replicators[name]
         self._share_client()
+
+    def _new_replicator(self, bus: Bus, hello: Hello) -> Replicator:
+        return Replicator(
+            bus, hello, self.model, interest_radius=self._interest_radius, jitter_buffer=self._jitter_buffer,
+            hand_force=self.physics.parameters.hand_force,
+        )  # fmt: skip
 
     def _add_replicator(self, name: str, replicator: Replicator) -> None:
         self.replicators[name] = replicator

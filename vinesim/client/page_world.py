@@ -92,6 +92,8 @@ class PageWorld:
         """Of the person's left and right hand [2, 7]: as simulated, and the controllers that they followed."""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
+        self._closures, self._closure_sentence = 0, ""
+        """How often the person's shears have closed, and what they cut when they closed last."""
 
     # ------------------------------------------------------------------ in the client's loop
 
@@ -126,6 +128,8 @@ class PageWorld:
             for haptic in human.haptics:
                 if (before := self._haptics.get(haptic.hand)) is None or before.amplitude < haptic.amplitude:
                     self._haptics[haptic.hand] = haptic
+            for closure in human.closures:
+                self._closures, self._closure_sentence = self._closures + 1, closure.sentence
         if self._sway is None or not server.has_viewers:
             return
         self._contacts = physics.contacts if self._overlay_pages else ()
@@ -201,6 +205,8 @@ class PageWorld:
         shown: dict[str, Any] = {"owners": page_overlays.owners(self._client)} if self._overlay_pages else {}
         if self._replay is not None:
             shown["replay"] = self._replay.status()
+        if self._person is not None:
+            shown["shears"] = {"closures": self._closures, "said": self._closure_sentence}
         state = array_message.encode(
             {
                 **shown, "tick": tick, "time": snapshot.time, "rigid": self._rigid_version,
@@ -311,6 +317,7 @@ def _tracked(person: TrackedPerson) -> TrackedPoints:
     return TrackedPoints(
         np.array(person.head), left, right, (bool(hands[0] and hands[0].closed), bool(hands[1] and hands[1].closed)),
         (OPEN_HAND if hands[0] is None else hands[0].fingers, OPEN_HAND if hands[1] is None else hands[1].fingers),
+        person.shears,
     )  # fmt: skip
 
 

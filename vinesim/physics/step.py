@@ -250,7 +250,7 @@ class Physics:
     def remove_robot(self, name: str) -> None:
         """See :meth:`RigidWorld.remove_robot`; its blades go with it."""
         self.rigid.remove_robot(name)
-        self.detachment_monitor.blades = [blade for blade in self.detachment_monitor.blades if blade.actor != name]
+        self._remove_blades_of(name)
 
     def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
         """See :meth:`RigidWorld.add_human`; a remote one touches only trees whose state its own client sends."""
@@ -259,8 +259,9 @@ class Physics:
             self.contact_solver.remote_actors.add(spec.name)
 
     def remove_human(self, name: str) -> None:
-        """See :meth:`RigidWorld.remove_human`; what the hands held is released."""
+        """See :meth:`RigidWorld.remove_human`; what the hands held is released, and its blades go with it."""
         self.rigid.remove_human(name)
+        self._remove_blades_of(name)
         self.grasp_manager.remove_ties_of(name)
         self.contact_solver.remote_actors.discard(name)
 
@@ -311,7 +312,7 @@ class Physics:
         self.level_of_detail.set_focus(points, radius)
 
     def add_blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
-        """Give a robot's link a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
+        """Give a link of an actor a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
 
         x runs along the blades, y from one to the other. :meth:`Blade.close` cuts what passes through the mouth.
         """
@@ -319,3 +320,6 @@ class Physics:
         blade = Blade(actor, link, np.asarray(pose, float), np.asarray(half, float))
         self.detachment_monitor.blades.append(blade)
         return blade
+
+    def _remove_blades_of(self, actor: str) -> None:
+        self.detachment_monitor.blades = [blade for blade in self.detachment_monitor.blades if blade.actor != actor]

@@ -32,6 +32,8 @@ class TrackedPerson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     right: TrackedHand | None = None
     intention: Annotated[str, msgspec.Meta(max_length=32)] = ""
     """What the person indicates to do; empty: nothing."""
+    shears: tuple[bool, bool] = (False, False)
+    """Whether the left and the right hand have shears."""
 
 
 class ReplayCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

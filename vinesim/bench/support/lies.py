@@ -333,6 +333,7 @@ def _greeting(draw: Draw, model: Model) -> Lie:
         draw(st.sampled_from((model.digest(), model.digest(), model.digest(), "", "0" * 64))),
         index=draw(st.sampled_from((0, 1, 4095))), joints=draw(st.sampled_from((-1, 0, 1, 27, 256))),
         seed=draw(st.sampled_from((-1, 0, (1 << 63) - 1))), height=draw(st.sampled_from((1.0, 1.75, 2.5))),
+        outfit=draw(st.sampled_from(("", "green", "no-such-outfit"))),
     )  # fmt: skip
     return Lie(draw(st.sampled_from(("greet", "greet", "join"))), messages.encode_hello(hello))
 

@@ -63,6 +63,10 @@ PageLan = Annotated[
 OwnGestures = Annotated[
     pathlib.Path | None, typer.Option("--gestures", help="Of a human: TOML file of finger poses for the buttons.")
 ]
+Outfit = Annotated[
+    str | None,
+    typer.Option(help="Of a human: what it wears: orange, yellow, green, ...; follows from its name unless given."),
+]
 # what the clients of a demo and of a benchmark are told to do
 Push = Annotated[int | None, typer.Option(hidden=True, help="Of a robot: reach for this bunch and push it repeatedly.")]
 Watch = Annotated[
@@ -91,7 +95,7 @@ def client(
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
     sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,
-    page_lan: PageLan = False, gestures: OwnGestures = None,
+    page_lan: PageLan = False, gestures: OwnGestures = None, outfit: Outfit = None,
 ) -> None:  # fmt: skip
     """Join the vineyard as one actor, with a simulation of its own.
 
@@ -103,7 +107,7 @@ def client(
       vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
       vinesim client --role spectator --connect tcp/127.0.0.1:7447 --pose 2 0 1.57 --out pictures
       vinesim client --role spectator --connect tcp/127.0.0.1:7447
-      vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva
+      vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva --outfit green
     """
     gc.disable()  # a sixth of the time of the start; the loop enables it
     values = {option: value for option, value in locals().items() if option != "ctx"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from vinesim.net.codec.messages import Hello
 from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.scene import appearance
 from vinesim.scene.values import HumanPose, HumanSpec, HumanUpdate
 
 
@@ -29,5 +30,7 @@ class RemoteHuman:
 
 
 def human_spec(hello: Hello, update: HumanUpdate) -> HumanSpec:
-    """A person as physics needs one, from what another client sent."""
-    return HumanSpec(hello.name, hello.index, update.pose, hello.height)
+    """A person as physics needs one, from what another client sent; one in an outfit that is unknown here gets that of
+    its name."""
+    outfit = hello.outfit if hello.outfit in appearance.outfit_names() else ""
+    return HumanSpec(hello.name, hello.index, update.pose, hello.height, outfit=outfit)

@@ -64,6 +64,8 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Seed of its scene, from which others can generate the same; -1: not given."""
     height: float = 1.75
     """Height of a person [m], in :data:`HEIGHT_RANGE`."""
+    outfit: str = ""
+    """Name of the outfit that a person has chosen; empty: the one that follows from its own name."""
 
 
 class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -155,6 +157,10 @@ def _check_hello(hello: Hello) -> None:
     """Raise :class:`MessageError` unless the kind exists and every number is in its range."""
     if hello.kind not in ACTOR_KINDS:
         raise MessageError(f"greeting of {hello.name!r} with kind {hello.kind[:60]!r}, not {', '.join(ACTOR_KINDS)}")
+    if hello.outfit and not is_valid_name(hello.outfit):
+        raise MessageError(
+            f"greeting of {hello.name!r} with outfit {hello.outfit[:60]!r}: give 1 to 48 letters, digits, '_', '-', '.'"
+        )
     for what, value, low, high in (
         ("index", hello.index, 0, LABEL_STRIDE - 1),
         ("joints", hello.joints, -1, MAX_JOINTS),

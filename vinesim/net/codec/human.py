@@ -1,7 +1,7 @@
 """Wire format of a person's pose, and encoding of any actor's pose.
 
 A person is transmitted as the root, the tracked points (head, two hands; CANOPIES D6.4, section 5.3), hips and feet,
-the flexion of ten fingers, four flags, the intention and the velocities of all points: always 162 bytes. Positions
+the flexion of ten fingers, six flags, the intention and the velocities of all points: always 162 bytes. Positions
 except the root are relative to the root in steps of 0.2 mm, up to 6.5 m; rotations are rotation vectors of 3 i16;
 velocities are i8 of two scales of the message.
 """
@@ -46,7 +46,7 @@ _HIPS, _BODY = POINT_NAMES.index("hips"), slice(1, None)
 
 _HUMAN = struct.Struct(f"<3f{6 * _POINTS - 3}h2H{6 * _POINTS}bB10BB")
 
-_FLAGS = ("left_closed", "right_closed", "left_busy", "right_busy")
+_FLAGS = ("left_closed", "right_closed", "left_busy", "right_busy", "left_shears", "right_shears")
 
 
 def encode_pose(update: RobotUpdate | HumanUpdate) -> bytes:
@@ -127,10 +127,13 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
         raise MessageError(f"human pose with an unknown intention, {rest[11]}")
     if flags >= 1 << len(_FLAGS):
         raise MessageError("human pose with unknown flags")
-    left_closed, right_closed, left_busy, right_busy = (bool(flags >> bit & 1) for bit in range(len(_FLAGS)))
+    left_closed, right_closed, left_busy, right_busy, left_shears, right_shears = (
+        bool(flags >> bit & 1) for bit in range(len(_FLAGS))
+    )
     pose = HumanPose(
         *points, left_closed=left_closed, right_closed=right_closed, left_busy=left_busy, right_busy=right_busy,
-        left_fingers=tuple(bends[:5]), right_fingers=tuple(bends[5:]),
+        left_fingers=tuple(bends[:5]), right_fingers=tuple(bends[5:]), left_shears=left_shears,
+        right_shears=right_shears,
     )  # fmt: skip
     return HumanUpdate(actor, time, pose, velocity.reshape(_POINTS, 6), INTENTIONS[rest[11]])
 

@@ -112,7 +112,7 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
         _object(
             "vinesim.Greeting", "How an actor introduced itself.", name=_TEXT, kind=_TEXT, robot=_TEXT, urdf=_TEXT,
             sidecar=_TEXT, scene=_TEXT, digest=_TEXT, seed=_COUNT, protocol=_COUNT, index=_COUNT, joints=_COUNT,
-            height=_NUMBER, **_COMMON,
+            height=_NUMBER, outfit=_TEXT, **_COMMON,
         ),
     ),
     "live": ("vinesim.Live", _object("vinesim.Live", "An actor came or went.", live=_YES, **_COMMON)),

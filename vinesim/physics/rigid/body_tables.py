@@ -9,7 +9,7 @@ import numpy as np
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.human_body import HumanBody
 from vinesim.physics.rigid.human_posture import VISUAL_PARTS
-from vinesim.physics.rigid.human_shapes import BODY_PARTS
+from vinesim.physics.rigid.human_shapes import BODY_PARTS, SIDES
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.scene import appearance
@@ -39,10 +39,11 @@ def list_visuals(
             if shapes:
                 visuals.append(RigidVisual(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
                 bodies.append(robot.bodies[link])
+    shears = {f"{side}_{part}": shapes for side in SIDES for part, shapes in appearance.load_shears().parts.items()}
     for name, human in humans.items():
-        shapes_of_part = appearance.load_human_model(human.spec.height).parts
+        shapes_of_part = human.looks.parts | shears
         simulated = [(part, human.bodies[part]) for part in (*BODY_PARTS, *(hand.link for hand in human.hands))]
-        for part, body in (*simulated, *((part, 0) for part in VISUAL_PARTS)):
+        for part, body in (*simulated, *((part, 0) for part in (*VISUAL_PARTS, *human.shears_parts))):
             visuals.append(RigidVisual(f"{name}/{part}", Organ.HUMAN, human.spec.index, shapes_of_part[part]))
             bodies.append(body)
     for bunch, (free_bunch, body) in bunches.items():

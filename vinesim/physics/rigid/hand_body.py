@@ -33,6 +33,8 @@ class HandBody:
         self.contact_steps = p.steps(p.hand_contact_duration)
         self.closed = False
         """Whether the hand is to hold what it is near to."""
+        self.has_shears = self.is_squeezed = False
+        """Whether the hand has shears, and whether it closes, on them or on what it holds: to be seen."""
         self.busy = False
         """Of a remote person's hand: it touches nothing here, since its own client computes what it pushes or holds."""
         self.steps_since_contact = self.contact_steps

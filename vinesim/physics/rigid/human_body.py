@@ -25,6 +25,8 @@ from vinesim.physics.rigid.human_shapes import BODY_PARTS, SIDES, body_shapes, h
 from vinesim.physics.rigid.passing_parts import HEAVY_PART_MASS, PassingParts
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, ROBOTS, contact_friction, geom_user
+from vinesim.scene import appearance
+from vinesim.scene.appearance import SHEARS_PARTS
 from vinesim.scene.materials import Material
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
 
@@ -61,7 +63,8 @@ class HumanBody:
     ) -> None:
         """``code``: of :data:`HUMAN_CODES`.
 
-        ``is_remote``: another client moves the person and computes what the hands hold.
+        ``is_remote``: another client moves the person and computes what the hands hold. Raises :class:`HumanError` for
+        numbers that cannot be, :class:`vinesim.scene.appearance.AppearanceError` for an unknown outfit.
         """
         stiffness = parameters.hand_stiffness if spec.stiffness is None else spec.stiffness
         force = parameters.hand_force if spec.force is None else spec.force
@@ -80,6 +83,10 @@ class HumanBody:
         self._part_force = np.full(len(BODY_PARTS), np.inf)  # not known before the first step
         self._pushes_too_hard = np.zeros(len(BODY_PARTS), bool)
         self._posture = PostureSolver(spec.height)
+        outfit = spec.outfit or appearance.outfit_of(spec.name)
+        self.looks = appearance.load_human_model(spec.height, outfit=outfit)
+        """Its shapes, in its outfit."""
+        self._shears = appearance.load_shears()
         self.set_pose(spec.pose)
         self._last_poses = self._poses
 
@@ -112,13 +119,25 @@ class HumanBody:
         self._poses = np.concatenate([self._posture.body_parts(pose), [pose.left, pose.right]])
         """Poses of :data:`BODY_PARTS`, then of both controllers."""
         for hand in self.hands:
-            hand.closed = bool(getattr(pose, f"{hand.side}_closed")) and not self.is_remote
+            hand.has_shears = bool(getattr(pose, f"{hand.side}_shears"))
+            hand.is_squeezed = bool(getattr(pose, f"{hand.side}_closed"))
+            hand.closed = hand.is_squeezed and not (hand.has_shears or self.is_remote)
             hand.busy = bool(getattr(pose, f"{hand.side}_busy")) and self.is_remote
 
+    @property
+    def shears_parts(self) -> tuple[str, ...]:
+        """Links of the shears that the hands have."""
+        return tuple(f"{hand.side}_{part}" for hand in self.hands if hand.has_shears for part in SHEARS_PARTS)
+
     def visual_poses(self, hands: np.ndarray) -> np.ndarray:
-        """Poses [part, 7] of :data:`VISUAL_PARTS` for palms at ``hands`` [2, 7]."""
+        """Poses [part, 7] of :data:`VISUAL_PARTS`, then of :attr:`shears_parts`, for palms at ``hands`` [2, 7]."""
         chest, head = self.part_poses[BODY_PARTS.index("chest")], self.part_poses[BODY_PARTS.index("head")]
-        return self._posture.visual_parts(chest, head, hands, self._fingers)
+        poses = [self._posture.visual_parts(chest, head, hands, self._fingers)]
+        for hand, palm in zip(self.hands, hands, strict=True):
+            if hand.has_shears:
+                halves = self._shears.closed if hand.is_squeezed else self._shears.open
+                poses.append(frames.compose(palm, halves))
+        return np.concatenate(poses)
 
     def hand(self, side: str) -> HandBody:
         """The left or the right hand; :class:`HumanError` otherwise."""

@@ -24,7 +24,6 @@ from vinesim.physics.rigid.body_tables import list_owners, list_visuals
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.hand_body import HandBody
 from vinesim.physics.rigid.human_body import HumanBody, HumanError
-from vinesim.physics.rigid.human_posture import VISUAL_PARTS
 from vinesim.physics.rigid.link_sensors import LinkSensors
 from vinesim.physics.rigid.pair_friction import PairFriction
 from vinesim.physics.rigid.recompile import WorldNames
@@ -173,8 +172,17 @@ class WorldCore:
         self._kinematics_current = False
 
     def link_pose(self, name: str, link: str) -> np.ndarray:
-        """World pose [7] of a robot's link, also of one that is fixed to its parent."""
-        body = self._link_body(name, link)
+        """World pose [7] of a robot's link, also of one that is fixed to its parent, or of a person's.
+
+        ``ValueError`` if there is none of this name.
+        """
+        if name in self._humans:
+            bodies = self._humans[name].bodies
+            if link not in bodies:
+                raise HumanError(f"human {name!r} has no link {link!r}; it has: {', '.join(bodies)}")
+            body = bodies[link]
+        else:
+            body = self._link_body(name, link)
         self.update_kinematics()
         return np.concatenate([self.mj_data.xpos[body], frames.from_wxyz(self.mj_data.xquat[body])])
 
@@ -193,7 +201,8 @@ class WorldCore:
             pose[self._visual_row[human.part_bodies]] = human.part_poses
             hands = self._visual_row[[hand.body for hand in human.hands]]
             first = hands[-1] + 1
-            pose[first : first + len(VISUAL_PARTS)] = human.visual_poses(pose[hands])
+            placed = human.visual_poses(pose[hands])
+            pose[first : first + len(placed)] = placed
         return pose
 
     # ------------------------------------------------------------------ compilation
@@ -279,16 +288,21 @@ class WorldCore:
 
     def _update_tables(self) -> None:
         """List all bodies and geoms anew after bodies were added or removed, and count :attr:`generation`."""
-        m = self.mj_model
+        bunch_body = self._list_visuals()
+        self.owners = list_owners(self._boxes, self._names, self._robots, self._humans, bunch_body)
+        self._owned_geoms = collision_geoms.owned_geoms(self.mj_model, self.owners)
+        self._update_geoms()
+
+    def _list_visuals(self) -> dict[int, int]:
+        """List what sensors draw anew after bodies were added or removed, or a hand took shears or put them away; the
+        MuJoCo body of every free bunch."""
         bunch_body = {i: self._names.body[free_bunch.slot_name(slot)] for i, slot in self._bunch_slot.items()}
         bunches = {i: (body, bunch_body[i]) for i, body in self._free_bunches.items()}
         self._visuals, self._visual_body = list_visuals(self._boxes, self._names, self._robots, self._humans, bunches)
-        self._visual_row = np.zeros(m.nbody, int)
+        self._visual_row = np.zeros(self.mj_model.nbody, int)
         own = self._visual_body > 0
         self._visual_row[self._visual_body[own]] = np.flatnonzero(own)
-        self.owners = list_owners(self._boxes, self._names, self._robots, self._humans, bunch_body)
-        self._owned_geoms = collision_geoms.owned_geoms(m, self.owners)
-        self._update_geoms()
+        return bunch_body
 
     def _show_lamps(self, robot: RobotBody) -> None:
         """List the shapes of a robot anew after its indicator lights changed; only sensors need to know."""

@@ -17,10 +17,13 @@ class HumanAccess(WorldCore):
     """People of a rigid world. Every method raises :class:`HumanError` if no person or hand has the name given."""
 
     def move_human(self, name: str, pose: HumanPose) -> None:
-        """Set where a person's tracked points are at the end of the coming step, and which hands are closed."""
+        """Set where a person's tracked points are at the end of the coming step, which hands are closed or have
+        shears."""
         human = self.human(name)
-        busy = [hand.busy for hand in human.hands]
+        busy, shears = [hand.busy for hand in human.hands], human.shears_parts
         human.set_pose(pose)
+        if shears != human.shears_parts:
+            self._list_visuals()
         if busy != [hand.busy for hand in human.hands]:
             human.update_hand_collisions(self.mj_model)
             self._update_geoms()

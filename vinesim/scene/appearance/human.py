@@ -1,10 +1,11 @@
-"""The human model: shapes of every part of a person of a given height, fingers included."""
+"""The human model: shapes of every part of a person of a given height and outfit, fingers included."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import pathlib
+import zlib
 from typing import Any
 
 import msgspec
@@ -60,6 +61,8 @@ class HumanFile(Table, frozen=True):
     source: str
     height: float
     paints: dict[str, Paint]
+    outfits: dict[str, dict[str, Point]]
+    """Colours [sRGB, 0 to 1] of paints by name, of each outfit."""
     parts: dict[str, tuple[ShapeSpec, ...]]
     limbs: Limbs
     fingers: dict[str, Finger]
@@ -81,16 +84,52 @@ class HumanModel:
     """[finger, phalanx] rad, all the way."""
 
 
+def outfit_names(name: str = "worker") -> tuple[str, ...]:
+    """Names of the outfits that people can wear."""
+    return tuple(_load_file(find_data_file("figures", name, ".toml")).outfits)
+
+
+def outfit_of(actor: str, name: str = "worker") -> str:
+    """The outfit of an actor that has chosen none: the same on every client, from the actor's name alone."""
+    outfits = outfit_names(name)
+    return outfits[zlib.crc32(actor.encode()) % len(outfits)]
+
+
+@functools.lru_cache(64)
+def load_human_model(height: float, name: str = "worker", outfit: str = "") -> HumanModel:
+    """The human model of this height [m] in an outfit (empty: the first one), from ``data/figures``.
+
+    :class:`AppearanceError` if it cannot be read or has no such outfit.
+    """
+    outfits = _load_file(find_data_file("figures", name, ".toml")).outfits
+    if outfit and outfit not in outfits:
+        raise AppearanceError(f"outfit {outfit!r} is unknown; give one of: {', '.join(outfits)}")
+    colours = outfits[outfit or next(iter(outfits))]
+    model, paints = _build_model(height, name)
+    parts = {
+        part: tuple(
+            dataclasses.replace(shape, rgba=(*colours[paint], 1.0)) if paint in colours else shape
+            for shape, paint in zip(shapes, paints[part], strict=True)
+        )
+        for part, shapes in model.parts.items()
+    }
+    return dataclasses.replace(model, parts=parts)
+
+
 @functools.lru_cache(16)
-def load_human_model(height: float, name: str = "worker") -> HumanModel:
-    """The human model of this height [m], from ``data/figures``; :class:`AppearanceError` if it cannot be read."""
+def _build_model(height: float, name: str) -> tuple[HumanModel, dict[str, list[str]]]:
+    """The human model of this height [m] in the colours of its paints, which all outfits share the meshes of; the
+    paint of every shape, by part."""
     file = _load_file(find_data_file("figures", name, ".toml"))
     scale = height / file.height
     parts: dict[str, tuple[Shape, ...]] = {}
+    paints: dict[str, list[str]] = {}
     for part, specs in file.parts.items():
         sides = ((part, False),) if not part.startswith("left_") else ((part, False), (f"right_{part[5:]}", True))
         for link, mirror in sides:
-            parts[link] = tuple(s for p in specs for s in build_shapes(p, file.paints, scale, mirror))
+            built = [build_shapes(spec, file.paints, scale, mirror) for spec in specs]
+            parts[link] = tuple(shape for shapes in built for shape in shapes)
+            paints[link] = [one for spec, shapes in zip(specs, built, strict=True) for one in _paints_of(spec, shapes)]
     paint = file.paints[file.finger_paint]
     roots = []
     for side, mirror in (("left", 1.0), ("right", -1.0)):
@@ -103,13 +142,22 @@ def load_human_model(height: float, name: str = "worker") -> HumanModel:
             for k, length in enumerate(one.lengths):
                 r = one.radii[k], one.radii[k + 1]
                 bone = rod_shape((0, 0, 0), (length, 0, 0), r, scale, paint)
-                parts[f"{side}_{FINGERS[number]}_{k + 1}"] = (bone,)
+                link = f"{side}_{FINGERS[number]}_{k + 1}"
+                parts[link], paints[link] = (bone,), [file.finger_paint]
     limbs = msgspec.convert(_scaled(msgspec.to_builtins(file.limbs), scale), Limbs)
     every = [file.fingers[finger] for finger in FINGERS] * 2
-    return HumanModel(
+    model = HumanModel(
         parts=parts, limbs=limbs, root=np.array(roots), length=scale * np.array([f.lengths for f in every]),
         bent=np.array([f.bent for f in every]),
     )  # fmt: skip
+    return model, paints
+
+
+def _paints_of(spec: ShapeSpec, shapes: list[Shape]) -> list[str]:
+    """The paint of each of the ``shapes`` that were built from a description: of a loft there is one for each paint,
+    and all of them twice if it has a twin."""
+    names = [spec.paint] if isinstance(spec.paint, str) else list(dict.fromkeys(spec.paint))
+    return names * (len(shapes) // len(names))
 
 
 @functools.cache
@@ -119,6 +167,13 @@ def _load_file(path: pathlib.Path) -> HumanFile:
     for part, specs in file.parts.items():
         for i, spec in enumerate(specs):
             check_spec(file.paints, spec, f"{path}: parts.{part}[{i}]")
+    for outfit, colours in file.outfits.items():
+        if missing := colours.keys() - file.paints:
+            raise AppearanceError(
+                f"{path}: outfits.{outfit}.{min(missing)} is no paint; give some of: {', '.join(file.paints)}"
+            )
+    if not file.outfits:
+        raise AppearanceError(f"{path}: outfits is empty; give one, which may be without colours of its own")
     return file
 
 

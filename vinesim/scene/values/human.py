@@ -36,6 +36,9 @@ class HumanPose:
     """The human's own client reports that the hand pushes a robot or holds an object: ``left`` is then the palm, not
     the controller, and the remote copy is placed there without contacts. Unused on the human's own client."""
     right_busy: bool = False
+    left_shears: bool = False
+    """Whether the hand has shears: when it closes, they cut what is between their blades, and it holds nothing."""
+    right_shears: bool = False
 
     @property
     def points(self) -> np.ndarray:
@@ -67,6 +70,8 @@ class HumanSpec:
     """Force of a hand in contact per offset from its controller [N/m]; None: ``PhysicsParameters.hand_stiffness``."""
     force: float | None = None
     """Largest force of a hand [N]; None: ``PhysicsParameters.hand_force``."""
+    outfit: str = ""
+    """What it wears, one of :func:`vinesim.scene.appearance.outfit_names`; empty: what follows from its name."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

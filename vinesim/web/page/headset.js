@@ -12,12 +12,18 @@ const FORWARD = new THREE.Quaternion(-0.5, 0.5, 0.5, 0.5);
 const FINGERS = ["thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"];
 /** Angles [rad] between the first and the last bone of a finger that is bent all the way; the thumb has one joint less. */
 const FULL_BEND = [1.6, 3.8, 3.8, 3.8, 3.8];
+const STICK = 3; // number of the button under a stick, by the standard mapping of WebXR
 const PINCH = 0.025, CLOSED = 0.5; // m between the tips, mean bend of the fingers
 
 export class Headset {
-  /** `rig` carries camera and controllers: the floor that the person stands on. */
-  constructor(renderer, rig, camera, poses) {
-    this.poses = poses; // finger poses of the buttons a and b
+  /**
+   * `rig` carries camera and controllers: the floor that the person stands on. `poses`: finger poses of the buttons a
+   * and b; `press(side)` is called when a stick is pressed.
+   */
+  constructor(renderer, rig, camera, poses, press) {
+    this.poses = poses;
+    this.press = press;
+    this.pressed = [false, false];
     this.renderer = renderer;
     this.rig = rig;
     this.turned = false;
@@ -50,6 +56,11 @@ export class Headset {
     const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
     if (viewer) this.viewer.fromArray(viewer.transform.matrix);
     this.tracked = this.sources.map((source) => this.trackHand(frame, source?.hand));
+    this.sources.forEach((source, k) => {
+      const pressed = source?.gamepad?.buttons?.[STICK]?.pressed ?? false;
+      if (pressed && !this.pressed[k]) this.press(source.handedness);
+      this.pressed[k] = pressed;
+    });
     for (const source of this.sources) {
       const [x, y] = source?.gamepad?.axes?.slice(-2) ?? [0, 0];
       if (source?.handedness === "left" && Math.hypot(x, y) > DEAD) {

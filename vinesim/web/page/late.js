@@ -3,7 +3,7 @@
 import * as THREE from "./vendor/three.module.js";
 
 const SIDES = ["left", "right"];
-const PART = /\/(left|right)_(hand|thumb|index|middle|ring|little)/;
+const PART = /\/(left|right)_(hand|thumb|index|middle|ring|little|shears)/;
 
 export class LateHands {
   constructor(world) {

@@ -8,6 +8,7 @@ import { Absence, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { LateHands } from "./late.js";
 import { DeskHand, Pace, WalkingEyes } from "./person.js";
+import { Shears } from "./shears.js";
 import { Timeline } from "./timeline.js";
 import { Voice } from "./voice.js";
 import { World } from "./world.js";
@@ -38,7 +39,8 @@ class Viewer {
     this.hand = this.isPerson ? new DeskHand(this.renderer.domElement, world.header.gestures) : null;
     this.rig = new THREE.Group();
     this.scene.add(this.rig);
-    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons);
+    this.shears = new Shears(this.isPerson);
+    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons, (side) => this.shears.toggle(side));
     this.offerHeadset();
     this.absence = new Absence();
     this.overlays = new Overlays(world);
@@ -59,7 +61,7 @@ class Viewer {
     this.frame = 1 / 60; // time of a frame, smoothed [s]
     this.labels = new Map();
     addEventListener("resize", () => this.resize());
-    addEventListener("keydown", (event) => this.press(event.code));
+    addEventListener("keydown", (event) => { if (!event.repeat) this.press(event.code); });
     this.resize();
     this.connect();
     this.renderer.setAnimationLoop((_, frame) => this.draw(frame));
@@ -124,6 +126,7 @@ class Viewer {
     this.heardAt = performance.now();
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
     this.headset.pulse(state.haptics);
+    this.shears.take(state);
     if (state.rigid !== this.world.rigidVersion && !this.loading) {
       this.loading = true;
       const header = await load("rigid").catch(() => null); // a client that goes meanwhile is waited for by the socket
@@ -144,6 +147,7 @@ class Viewer {
       const actors = this.actors();
       this.followed = actors.length ? (this.followed + 2) % (actors.length + 1) - 1 : -1;
     }
+    if (code === "KeyT") this.shears.toggle("right");
     if (code === "KeyN") element("names").hidden = !element("names").hidden;
     if (code === "KeyH") this.help.hidden = !this.help.hidden;
   }
@@ -210,7 +214,7 @@ class Viewer {
   message(pose) {
     const message = { drawn: page.tick, view: pose, overlays: this.overlays.areShown };
     if (!this.isPerson) return message;
-    return { ...message, person: { ...this.person, intention: this.intention } };
+    return { ...message, person: { ...this.person, intention: this.intention, shears: this.shears.inHands } };
   }
 
   /** The person's tracked head and hands in this frame, a time [s] after the last one. */

@@ -1,0 +1,105 @@
+"""Shears in a hand: closing cuts what is between the blades and nothing else, and the person is told."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.support.contact_scenes import bunch_scene, cane
+from vinesim import frames
+from vinesim.avatar.local_human import LocalHuman
+from vinesim.avatar.shears import CUT_PULSE, MISS_PULSE
+from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.physics.step import Physics
+from vinesim.scene import appearance
+from vinesim.scene.builder import assemble
+from vinesim.scene.values import HumanSpec
+
+AHEAD = frames.from_yaw(0.5 * np.pi)
+"""The person looks along y."""
+
+
+class Person:
+    """Eva, who stands before a point with the mouth of the shears in her right hand there."""
+
+    def __init__(self, physics: Physics, point: np.ndarray, **hand: bool) -> None:
+        root = frames.pose(np.array([point[0] + 0.2, point[1] - 0.6, 0.0]), AHEAD)
+        palm = point - frames.rotate(AHEAD, appearance.load_shears().mouth[:3])
+        self.physics = physics
+        self.pose = dataclasses.replace(standing_pose(root), right=frames.pose(palm, AHEAD), **hand)
+        self.human = LocalHuman(physics, HumanSpec("eva", 1, self.pose), lambda _: self.pose)
+
+    def run(self, steps: int, **hand: bool) -> list:
+        """Do some steps with the hand in another state; how the shears closed meanwhile."""
+        self.pose = dataclasses.replace(self.pose, **hand)
+        found = []
+        for _ in range(steps):
+            self.human.control(self.physics.time)
+            self.physics.step()
+            self.human.update(self.physics.time)
+            found += self.human.closures
+        return found
+
+
+def at_peduncle(aside: float = 0.0) -> tuple[Physics, int, Person]:
+    """Before the lower half of a bunch's peduncle, the shears open around it or ``aside`` [m]; the bunch's body."""
+    model, body, _ = bunch_scene()
+    physics = Physics(model)
+    stalk = physics.snapshot().body_q[body - 1, :3].astype(float)
+    return physics, body, Person(physics, stalk + np.array([aside, 0.0, -0.02]), right_shears=True)
+
+
+def test_shears_cut_the_peduncle_between_their_blades_when_the_hand_closes():
+    physics, body, eva = at_peduncle()
+    assert eva.run(10) == []
+    assert physics.state.bunch_attached.all(), "open shears cut nothing"
+    eva.run(1, right_closed=True)
+    (detachment,) = physics.detachments
+    assert (detachment.bunch, detachment.body, detachment.cause, detachment.actor) == (0, body, "blade", "eva")
+    (closure,) = eva.human.closures
+    assert (closure.side, closure.bunches, closure.canes) == ("right", 1, 0)
+    assert closure.sentence == "The shears cut 1 bunch."
+    assert ("right", *CUT_PULSE) in [(one.hand, one.amplitude, one.duration) for one in eva.human.haptics]
+    assert eva.run(20) == [], "a hand that stays closed has closed once"
+    assert physics.hand("eva", "right").held is None, "a hand with shears holds nothing"
+
+
+def test_shears_beside_the_wood_miss_and_may_close_again():
+    physics, _, eva = at_peduncle(aside=0.05)
+    (closure,) = eva.run(5, right_closed=True)
+    assert (closure.has_cut, closure.resistance) == (False, 0.0)
+    assert "missed" in closure.sentence
+    assert closure.haptic("eva").amplitude == MISS_PULSE[0]
+    assert eva.run(5, right_closed=False) == []
+    assert len(eva.run(5, right_closed=True)) == 1
+    assert physics.state.bunch_attached.all()
+
+
+def test_a_hand_that_closes_without_shears_cuts_nothing():
+    physics, _, eva = at_peduncle()
+    assert eva.run(5, right_shears=False, right_closed=True) == []
+    assert eva.run(5, right_shears=True) == [], "it was closed already when it took the shears"
+    assert physics.state.bunch_attached.all()
+
+
+@pytest.mark.parametrize(("radius", "is_cut"), [(0.0055, True), (0.009, False)])
+def test_wood_that_resists_more_than_the_shears_can_do_stays_and_the_person_is_told(radius, is_cut):
+    """13.16 MPa over the cross-section: 1,251 N at 11 mm, 3,349 N at 18 mm."""
+    physics = Physics(assemble([cane((0.0, 0.0, 1.3), radius=radius)]))
+    at = physics.snapshot().body_q[8].astype(float)
+    eva = Person(physics, at[:3] + frames.rotate(at[3:], np.array([0.03, 0.0, 0.0])), right_shears=True)
+    (closure,) = eva.run(2, right_closed=True)
+    expected = physics.parameters.cutting_strength * np.pi * radius**2
+    assert closure.resistance == pytest.approx(expected, rel=1e-3)
+    assert (closure.bunches, closure.canes) == (0, int(is_cut))
+    assert physics.state.body_cut.any() == is_cut
+    assert is_cut or f"too weak: this wood takes {expected:,.0f} N" in closure.sentence
+
+
+def test_the_blades_go_with_the_person():
+    physics, _, _ = at_peduncle()
+    assert {blade.actor for blade in physics.detachment_monitor.blades} == {"eva"}
+    physics.remove_human("eva")
+    assert physics.detachment_monitor.blades == []
+    with pytest.raises(ValueError, match="no robot 'eva'"):
+        physics.add_blade("eva", "right_hand", frames.pose(np.zeros(3)), np.ones(3))

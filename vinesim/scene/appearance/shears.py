@@ -1,0 +1,75 @@
+"""Pruning shears for a person's hand: shapes of both halves, where they turn, and where and how strongly they cut."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Literal
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.appearance.lofts import build_shapes
+from vinesim.scene.appearance.shapes import AppearanceError, Paint, Point, ShapeSpec, Table, check_spec
+from vinesim.scene.data_files import find_data_file
+from vinesim.scene.toml_loader import load_toml
+from vinesim.scene.values import Shape
+
+SHEARS_PARTS = ("shears_blade", "shears_hook")
+"""Links of shears, after the side of the hand that holds them: ``left_shears_blade``."""
+
+
+class ShearsFile(Table, frozen=True):
+    source: str
+    bolt: Point
+    """[m] in the palm's frame: both halves turn about it."""
+    opening: float
+    """Angle by which either half turns when the shears are open [rad]."""
+    mouth: Point
+    """[m] Middle of the space between the open blades, in the palm's frame."""
+    mouth_half: Point
+    """[m] Half edges of that space: along the blades, from one to the other, across their plane."""
+    force: float
+    """Largest force of the closing blades [N]."""
+    paints: dict[str, Paint]
+    parts: dict[Literal["blade", "hook"], tuple[ShapeSpec, ...]]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ShearsModel:
+    """Shapes of shears and what they cut; palms carry them."""
+
+    parts: dict[str, tuple[Shape, ...]]
+    """By name, :data:`SHEARS_PARTS`."""
+    open: np.ndarray
+    """Poses [2, 7] of the parts in the palm's frame when the shears are open."""
+    closed: np.ndarray
+    mouth: np.ndarray
+    """Pose [7] of the mouth in the palm's frame: x along the blades, y from one to the other, z across their plane."""
+    mouth_half: np.ndarray
+    """[3] m, half edges of the mouth."""
+    force: float
+    """Largest force of the closing blades [N]."""
+
+
+@functools.cache
+def load_shears(name: str = "shears") -> ShearsModel:
+    """The shears of ``data/figures``; :class:`AppearanceError` if the file cannot be read."""
+    path = find_data_file("figures", name, ".toml")
+    file = load_toml(path, ShearsFile, AppearanceError)
+    parts = {}
+    for link in SHEARS_PARTS:
+        half: Literal["blade", "hook"] = "blade" if link == "shears_blade" else "hook"
+        if half not in file.parts:
+            raise AppearanceError(f"{path}: parts has no {half}; give its shapes")
+        for i, spec in enumerate(file.parts[half]):
+            check_spec(file.paints, spec, f"{path}: parts.{half}[{i}]")
+        parts[link] = tuple(
+            shape for spec in file.parts[half] for shape in build_shapes(spec, file.paints, 1.0, mirror=False)
+        )
+    bolt = np.array(file.bolt)
+    turned = [frames.pose(bolt, frames.from_yaw(sign * file.opening)) for sign in (1.0, -1.0)]
+    return ShearsModel(
+        parts=parts, open=np.stack(turned), closed=np.stack([frames.pose(bolt)] * 2),
+        mouth=frames.pose(np.array(file.mouth)), mouth_half=np.array(file.mouth_half), force=file.force,
+    )  # fmt: skip
