@@ -382,7 +382,7 @@ def whole(domain: str) -> Iterator[CyclonePeer]:
     """A whole client, and the peer after it has heard all that it will hear."""
     with process_group(10.0) as group:
         client = group.start(
-            "client", "-m", "vinesim.cli", "client", "--role", "robot", "--name", "vinebot", "--status", "none",
+            "client", "-m", "vinesim", "client", "--role", "robot", "--name", "vinebot", "--status", "none",
             "--sensor-hz", "5",
         )  # fmt: skip
         peer = CyclonePeer(group.start("peer", str(PROGRAM), domain))

@@ -76,7 +76,7 @@ class World:
     def start(self, name: str, spawn: int) -> None:
         """Start a client whose robot has this name and namespace."""
         self.clients[name] = self._group.start(
-            name, "-m", "vinesim.cli", "client", "--role", "robot", "--connect", self._endpoint, "--name", name,
+            name, "-m", "vinesim", "client", "--role", "robot", "--connect", self._endpoint, "--name", name,
             "--namespace", name, "--spawn", str(spawn), "--status", "none",
         )  # fmt: skip
 
