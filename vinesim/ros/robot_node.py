@@ -5,7 +5,9 @@ Every message is built and sent by the thread that passes its values, in order.
 
 from __future__ import annotations
 
+import logging
 import pathlib
+import time as wall
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
@@ -25,16 +27,22 @@ from vinesim.ros.publishers.control import ControlPublisher
 from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
 from vinesim.ros.publishers.lights import LightsPublisher
 from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
-from vinesim.ros.publishers.robot import RobotPublisher
+from vinesim.ros.publishers.robot import ODOMETRY, RobotPublisher
 from vinesim.ros.publishers.sound import SoundPublisher
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage
 from vinesim.scene.values import ComponentStatus, ControllerSpec, Intention, RobotSample
 from vinesim.scene.values.signals import Color
 
+log = logging.getLogger(__name__)
+
 FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
 MAP_TO_ODOM, TRUTH, ENVIRONMENT_RATE = "publish_map_to_odom", "publish_truth", "environment_rate"
 """Names of parameters."""
+LOOK_PERIOD = 1.0
+"""Wall time between two looks for another robot under the same names [s]."""
+UNKNOWN = "_NODE_NAME_UNKNOWN_"
+"""The name of a node, to rmw, that has not introduced itself yet."""
 OWN_MESSAGES = ("tf2_msgs", "control_msgs", "audio_common_msgs")
 """Message packages that no wheel has."""
 
@@ -72,6 +80,8 @@ class RobotNode(Node):
         self._bunch_of_body = np.zeros(0, np.int32) if bunch_of_body is None else bunch_of_body
         self._commands = CommandQueue()
         self._steps = 0
+        self._next_look = 0.0
+        self._shares_topics = False
         names = [spec.name for spec in controllers]
         super().__init__(name, namespace, [*names, *imus, *wrenches], params_file, parameters)
 
@@ -135,6 +145,21 @@ class RobotNode(Node):
     def _look_around(self) -> None:
         if self._clock is not None:
             self._clock.update()
+        if not self._shares_topics and wall.monotonic() >= self._next_look:
+            self._next_look = wall.monotonic() + LOOK_PERIOD
+            self._warn_if_shared()
+
+    def _warn_if_shared(self) -> None:
+        """Say once that another robot has this one's names."""
+        own, topic = self._node.get_fully_qualified_name(), self._node.resolve_topic_name(ODOMETRY)
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        nodes = {f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers if one.node_name != UNKNOWN}
+        if others := nodes - {own}:
+            self._shares_topics = True
+            log.warning(
+                "%s and %s publish %s: frames, joints and commands of two robots mix; give each client a --namespace "
+                "of its own", own, ", ".join(sorted(others)), topic,
+            )  # fmt: skip
 
     def publish_clock(self, time: float) -> None:
         """Publish /clock at ``time`` [s], if this node is the one that does; for every step."""

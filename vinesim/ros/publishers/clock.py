@@ -1,7 +1,8 @@
 """/clock: time of the world for nodes that run with use_sim_time. Of all nodes of a ROS domain one publishes it.
 
-A node that has seen no other publisher of /clock for a second becomes one; of two that did so at once the one with the
-greater identifier of its publisher gives way. When the publisher goes, another node follows within a few seconds.
+A node that has seen no other publisher of /clock for a second becomes one, but sends nothing yet: of two that did so at
+once the one with the greater identifier of its publisher gives way meanwhile, so that two clocks do not mix. When the
+publisher goes, another node follows within a few seconds.
 """
 
 from __future__ import annotations
@@ -18,10 +19,16 @@ from vinesim.ros.messages.serialized import stamp_writer
 from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage, Topic
 
 CLOCK = "/clock"
-FREE_TIME = 1.0
-"""[s] Without a publisher of /clock before a node becomes it: discovery of a node on the same machine takes 0.3 s."""
 LOOK_PERIOD = 0.25
 """Wall time between two looks at the publishers [s]."""
+FREE_LOOKS = 4
+"""Looks in a row that find no publisher of /clock before a node becomes it, a second. Looks are counted, not time: a
+process without a processor discovers nothing meanwhile."""
+CLAIM_LOOKS = 3
+"""Looks in a row that find no other publisher before a node that has become it sends its first message."""
+FIRST_LOOKS = 13
+"""Looks of a new node before it sends. Discovery of a node on the same machine takes 0.3 s as a rule, but where that
+fails, until Fast DDS announces it again after 3 s."""
 
 
 class ClockPublisher:
@@ -30,15 +37,17 @@ class ClockPublisher:
     def __init__(self, node: rclpy.node.Node, advertise: Advertise, withdraw: Callable[[Topic], None]) -> None:
         self._node, self._advertise, self._withdraw = node, advertise, withdraw
         self._topic: Topic | None = None
+        self._sends = False
         self._write = stamp_writer(convert.clock)
-        self._free_since = wall.monotonic()
-        self._next_look = 0.0
+        self._lone_looks = 0
+        """Looks in a row that found no other publisher."""
+        self._looks, self._next_look = 0, 0.0
 
     @property
     def has_subscribers(self) -> bool:
         """Whether this node publishes /clock, and has subscribers."""
         topic = self._topic
-        return topic is not None and topic.subscription_count > 0
+        return topic is not None and self._sends and topic.subscription_count > 0
 
     def update(self) -> None:
         """Look who publishes /clock, and begin or stop; called by the receiving thread of the node."""
@@ -52,17 +61,19 @@ class ClockPublisher:
                 self._node.get_name(), self._node.get_namespace()
             )  # fmt: skip
             (own if is_own else others).append(tuple(publisher.endpoint_gid))
+        self._looks += 1
+        self._lone_looks = 0 if others else self._lone_looks + 1
         if self._topic is None:
-            if others:
-                self._free_since = now
-            elif now - self._free_since >= FREE_TIME:
-                self._topic = self._advertise(ClockMessage, CLOCK, RELIABLE)
+            if self._lone_looks >= FREE_LOOKS:
+                self._topic, self._lone_looks = self._advertise(ClockMessage, CLOCK, RELIABLE), 0
         elif own and any(other < own[0] for other in others):
-            topic, self._topic, self._free_since = self._topic, None, now
+            topic, self._topic, self._sends = self._topic, None, False
             self._withdraw(topic)
+        elif self._lone_looks >= CLAIM_LOOKS and self._looks >= FIRST_LOOKS:
+            self._sends = True
 
     def pending(self, time: float) -> Iterator[PendingMessage]:
         """The message of a time [s], if this node publishes it."""
         topic = self._topic
-        if topic is not None:
+        if topic is not None and self._sends:
             yield topic, partial(self._write, time)

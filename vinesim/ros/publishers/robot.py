@@ -17,6 +17,8 @@ from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessa
 from vinesim.scene.values import JointSample, RobotSample
 
 MAP_FRAME, ODOM_FRAME = "map", "odom"
+ODOMETRY = "mobile_base_controller/odom"
+"""Topic."""
 
 
 class RobotPublisher:
@@ -42,7 +44,7 @@ class RobotPublisher:
 
         self._joints = advertise(JointState, "joint_states", RELIABLE)
         self._tf = advertise(tf_message, "tf", RELIABLE)
-        self._odometry = advertise(Odometry, "mobile_base_controller/odom", RELIABLE)
+        self._odometry = advertise(Odometry, ODOMETRY, RELIABLE)
 
         advertise(String, "robot_description", TRANSIENT_LOCAL).send(String(data=urdf))
         static = SerializedTransforms([(parent, child) for parent, child, _ in static_transforms])
