@@ -75,7 +75,8 @@ def unknown_options(line: str) -> list[str]:
     """Options of a line that its command does not have."""
     command, context, words = resolve(line)
     known = {name for option in command.get_params(context) for name in (*option.opts, *option.secondary_opts)}
-    return [word for word in words if word.startswith("-") and word.partition("=")[0] not in known]
+    options = [word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)]  # a number may be negative
+    return [name for name in options if name not in known]
 
 
 @pytest.mark.parametrize("line", commands())
