@@ -75,7 +75,8 @@ def unknown_options(line: str) -> list[str]:
     """Options of a line that its command does not have."""
     command, context, words = resolve(line)
     known = {name for option in command.get_params(context) for name in (*option.opts, *option.secondary_opts)}
-    return [word for word in words if word.startswith("-") and word.partition("=")[0] not in known]
+    options = [word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)]  # a number may be negative
+    return [name for name in options if name not in known]
 
 
 @pytest.mark.parametrize("line", commands())
@@ -121,7 +122,7 @@ def test_the_short_commands_of_a_page_run(page, tmp_path):
         world.recorded()
     for line in lines:
         done = subprocess.run(
-            [sys.executable, "-m", "vinesim.cli", *shlex.split(line)], cwd=tmp_path, check=False,
+            [sys.executable, "-m", "vinesim", *shlex.split(line)], cwd=tmp_path, check=False,
             env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
         )  # fmt: skip
         assert done.returncode == 0, f"{line}: {done.stdout}{done.stderr}"

@@ -101,8 +101,8 @@ def mujoco_track(case: Case, dt: float = 5e-4) -> Trajectory:
         body = data.body(f"plant/{len(model.body_mass) - 1}")
         return body.xpos + body.xmat.reshape(3, 3) @ tip
 
-    clock = np.arange(math.ceil((e.hold + e.duration) * e.rate)) / e.rate
-    ticks = int(e.duration / dt) + 2
+    clock = np.arange(math.ceil((e.hold + e.seconds) * e.rate)) / e.rate
+    ticks = int(e.seconds / dt) + 2
     path = np.empty((ticks, 3))
     for tick in range(ticks):
         path[tick] = position()

@@ -255,6 +255,8 @@ def _check_specimen(specimen: Specimen, path: str) -> None:
     if specimen.direction is not None and not any(specimen.direction):
         raise DataError(f"{path}: specimen.direction is {specimen.direction}; give a vector that is not zero")
     for name, place in specimen.markers.items():
+        if name.lower() == "base":  # a track's columns of that name say how the base was moved
+            raise DataError(f"{path}: specimen.markers.{name} is no name for a marker; give it another one")
         if not 0.0 < place <= specimen.length.value:
             raise DataError(
                 f"{path}: specimen.markers.{name} is {place}; give its distance from the base, "

@@ -1,12 +1,16 @@
 """Many candidates of one specimen at once: trees of one launch, each with its own stiffness, damping, mass and pull.
 
 The dynamics are those of :class:`~vinesim.physics.plants.articulation_solver.ArticulationSolver`. A run begins in the
-static equilibrium under a pull at the tip, found by the same solver in long steps, and lets go.
+static equilibrium under a pull at the tip, found by the same solver in long steps, and lets go. A base that is shaken
+is the origin of a frame that moves without turning: in it the base rests, every body has the weight of minus the base's
+acceleration beside its own, and the air streams past.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -81,13 +85,17 @@ class Candidates:
         """World axes [2, 3] along which ``pull_y`` and ``pull_z`` act."""
         return self._axes[:, 1:].T
 
-    def run(self, candidates: np.ndarray, ticks: np.ndarray, pushed: bool = False) -> Motion:
+    def run(
+        self, candidates: np.ndarray, ticks: np.ndarray, pushed: bool = False, base_velocity: np.ndarray | None = None
+    ) -> Motion:
         """Let candidates [n, 7] (:data:`COLUMNS`) go from under their pull.
 
         Args:
             candidates: [n, 7].
             ticks: [k] whole numbers of steps after the release, increasing, 0 or more.
             pushed: the other way round: from rest, the force begins to act at tick 0 and stays.
+            base_velocity: [tick, 3] m/s of the base in the world, up to the tick after the last of ``ticks``; none: it
+                rests. The motion that comes back is relative to the base.
         """
         count, candidates = len(candidates), self._padded(candidates)
         still, plants = self._solvers[len(candidates)]
@@ -98,14 +106,15 @@ class Candidates:
         for name in ("joint_q", "joint_qd"):
             getattr(plants.state, name)[:] = getattr(still.state, name)
         self.runs += count
+        load = self._load(plants, candidates, pushed, base_velocity)
         rows = [np.empty((count, len(ticks), len(self.markers), 3), np.float32) for _ in range(3)]
         at = 0
         bodies = self._bodies(count)
         point = np.broadcast_to(self._point, (count, len(self.markers), 3)).astype(np.float32)
         for place, tick in enumerate(ticks.tolist()):
-            self._advance(plants, tick - at, candidates if pushed else None)
-            if pushed:
-                self._push(plants, candidates)
+            _advance(plants, at, tick, load)
+            if load is not None:
+                load(tick)
             plants.predict()
             for row, value in zip(rows, _marker_motion(plants, bodies, point), strict=True):
                 row[:, place] = value
@@ -198,16 +207,40 @@ class Candidates:
         arm = frames.rotate(turn, np.broadcast_to(self._pulled_at, force.shape))
         plants.body_load[body] = np.concatenate([force, np.cross(arm, force)], -1)
 
-    def _advance(self, plants: ArticulationSolver, steps: int, pushed: np.ndarray | None) -> None:
-        if pushed is None:
-            plants.upload()
-            plants.advance(steps)
-            plants.download()
-            return
-        for _ in range(steps):
-            self._push(plants, pushed)
-            plants.predict()
-            plants.integrate()
+    def _load(
+        self, plants: ArticulationSolver, candidates: np.ndarray, pushed: bool, base_velocity: np.ndarray | None
+    ) -> Callable[[int], None] | None:
+        """What loads the bodies for the step that begins at a tick; None if nothing changes from step to step."""
+        plants.body_load[:] = 0.0
+        plants.tree_air[:] = 0.0
+        if base_velocity is None and not pushed:
+            return None
+        plants.forward_kinematics()  # levers of the first step
+        if base_velocity is None:
+            return lambda _: self._push(plants, candidates)
+        return functools.partial(_shake, plants, np.asarray(base_velocity, float))
+
+
+def _advance(plants: ArticulationSolver, first: int, end: int, load: Callable[[int], None] | None) -> None:
+    """Take the steps from one tick to another."""
+    if load is None:
+        plants.upload()
+        plants.advance(end - first)
+        plants.download()
+        return
+    for tick in range(first, end):
+        load(tick)
+        plants.predict()
+        plants.integrate()
+
+
+def _shake(plants: ArticulationSolver, base_velocity: np.ndarray, tick: int) -> None:
+    """Load every body with what the mean acceleration of the base [tick, 3] m/s over the step makes it weigh."""
+    now, later = base_velocity[tick : tick + 2]
+    force = plants.body_mass[:, None] * ((now - later) / plants.dt).astype(np.float32)
+    plants.body_load[:, :3] = force
+    plants.body_load[:, 3:] = frames.cross(frames.rotate(plants.state.body_q[:, 3:], plants.body_com), force)
+    plants.tree_air[:] = -0.5 * (now + later)
 
 
 def _marker_motion(

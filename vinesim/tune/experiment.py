@@ -11,6 +11,7 @@ import numpy as np
 
 from vinesim.errors import UsageError
 from vinesim.scene.plant_parameters import Specimen
+from vinesim.tune.base_motion import Sweep
 from vinesim.tune.candidates import COLUMNS, Candidates
 from vinesim.tune.specimen import TIP
 from vinesim.tune.trajectory import Trajectory
@@ -20,6 +21,10 @@ TRUTH_STEP = 1e-3
 """[s] Step of the simulation that stands for the plant."""
 TRUTH_SEGMENTS = 64
 """Its segments, at least."""
+MAX_SHARE = 0.3
+"""[1] Fastest shaking over the pictures a second: samples of a faster one do not tell the acceleration between them."""
+KINDS = {"pull-release": 3.0, "push": 3.0, "shake": 10.0}
+"""The kinds of experiments, and how long one is unless said otherwise [s]."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -27,13 +32,20 @@ class Experiment:
     """How a plant is moved and watched."""
 
     kind: str = "pull-release"
-    """``pull-release``: held aside, then let go at :attr:`hold`. ``push``: at rest, then a steady force on its tip."""
+    """``pull-release``: held aside, then let go at :attr:`hold`. ``push``: at rest, then a steady force on its tip.
+    ``shake``: at rest, then its base is moved to and fro in a sine sweep."""
     displacement: float = 0.1
     """[m] Of the tip, by the pull; by the push, once it has come to rest."""
     angle: float = 90.0
-    """[deg] Direction of the force about the base's x axis: 0 along its y, 90 along its z axis."""
-    duration: float = 3.0
-    """[s] After the force begins or ends."""
+    """[deg] Direction of the force or of the shaking about the base's x axis: 0 along its y, 90 along its z axis."""
+    amplitude: float = 0.005
+    """[m] Of the base that is shaken."""
+    from_frequency: float = 1.0
+    """[Hz] At the start of the sweep."""
+    to_frequency: float = 8.0
+    """[Hz] At its end."""
+    duration: float | None = None
+    """[s] After the force begins or ends; of the sweep. None: as :data:`KINDS` says."""
     hold: float = 0.2
     """[s] Before that."""
     rate: float = 30.0
@@ -47,13 +59,28 @@ class Experiment:
     """Which axes of the world are tracked."""
     seed: int = 0
 
+    @property
+    def seconds(self) -> float:
+        """[s] The duration, given or not."""
+        return KINDS[self.kind] if self.duration is None else self.duration
+
     def check(self) -> None:
         """:class:`UsageError` naming the first number that is out of range."""
-        if self.kind not in ("pull-release", "push"):
-            raise UsageError(f"no experiment {self.kind!r}; there are: pull-release, push")
-        for name in ("displacement", "duration", "rate"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise UsageError(f"{name} is {getattr(self, name)}; give a finite number above 0")
+        if self.kind not in KINDS:
+            raise UsageError(f"no experiment {self.kind!r}; there are: {', '.join(KINDS)}")
+        for name in ("displacement", "amplitude", "from_frequency", "to_frequency", "duration", "rate"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise UsageError(f"{name} is {value}; give a finite number above 0")
+        if self.kind == "shake":
+            fastest = max(self.from_frequency, self.to_frequency)
+            if fastest > MAX_SHARE * self.rate:
+                raise UsageError(
+                    f"the sweep reaches {fastest:g} Hz, of which {self.rate:g} pictures a second see too little; give "
+                    f"a rate of {fastest / MAX_SHARE:g} or more, or lower frequencies"
+                )
+            if self.force_noise is not None:
+                raise UsageError(f"force_noise is {self.force_noise}; nothing pulls at a shaken plant, leave it out")
         for name in ("hold", "noise", "force_noise"):
             value = getattr(self, name)
             if value is not None and not 0.0 <= value < math.inf:
@@ -70,13 +97,19 @@ def measure(specimen: Specimen, experiment: Experiment = Experiment(), *, exact:
     candidates = Candidates(specimen, e.markers, dt=TRUTH_STEP)
     row = np.zeros((1, len(COLUMNS)))
     row[0, 3:5] = specimen.bow
-    row[0, 5:] = pull_for(candidates, e.displacement, math.radians(e.angle))
-    time = np.arange(math.ceil((e.hold + e.duration) * e.rate - 1e-9)) / e.rate
-    after = np.maximum(time - e.hold, 0.0)
+    shaking = _sweep(candidates, e) if e.kind == "shake" else None
+    if shaking is None:
+        row[0, 5:] = pull_for(candidates, e.displacement, math.radians(e.angle))
+    time = np.arange(math.ceil((e.hold + e.seconds) * e.rate - 1e-9)) / e.rate
+    after = time if shaking else np.maximum(time - e.hold, 0.0)
     tick = np.floor(after / TRUTH_STEP + 1e-6).astype(int)
     ticks, index = np.unique(tick, return_inverse=True)
-    motion = candidates.run(row, ticks, pushed=e.kind == "push")
+    moved = shaking.velocity(TRUTH_STEP * np.arange(ticks[-1] + 2)) if shaking else None
+    motion = candidates.run(row, ticks, pushed=e.kind == "push", base_velocity=moved)
     position = motion.at(index, (after - tick * TRUTH_STEP)[None])[0][0].astype(float)
+    base = shaking.position(time) if shaking else None
+    if base is not None:
+        position += base[:, None]
     held = time <= e.hold
     force = None
     if e.force_noise is not None:
@@ -88,7 +121,15 @@ def measure(specimen: Specimen, experiment: Experiment = Experiment(), *, exact:
     for axis in range(3):
         if "xyz"[axis] not in e.axes:
             position[..., axis] = np.nan
-    return Trajectory(time, position, e.markers, force, f"{e.kind} of seed {e.seed}")
+    return Trajectory(time, position, e.markers, force, f"{e.kind} of seed {e.seed}", base)
+
+
+def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:
+    """How the base is shaken."""
+    e, angle = experiment, math.radians(experiment.angle)
+    direction = np.array([math.cos(angle), math.sin(angle)]) @ candidates.pull_axes()
+    direction[np.abs(direction) < 1e-12] = 0.0  # no column of rounding errors
+    return Sweep(direction, e.amplitude, (e.from_frequency, e.to_frequency), e.hold, e.seconds)
 
 
 def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.ndarray:

@@ -1,42 +1,51 @@
 """What a track tells without a model and without phase: frequency, logarithmic decrement, rest position, release.
 
 A damped sinusoid is fitted to all columns at once; for a given frequency and damping ratio its amplitudes follow by
-linear least squares, so gaps and irregular times do no harm.
+linear least squares, so gaps and irregular times do no harm. Where the base was shaken it is the response of a damped
+oscillator to the base's acceleration instead.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 
 import numpy as np
 
+from vinesim.tune.base_motion import SampledMotion
 from vinesim.tune.trajectory import Trajectory
 
 FREQUENCIES_PER_BIN = 4
 """Trial frequencies within 1 / duration."""
+RELATIVE_STEP = 0.03
+"""[1] Between trial frequencies of an oscillator that is shaken, over the frequency."""
+SUBSTEPS = 8
+"""Parts of a sample interval in each of which the acceleration of a base is taken for constant."""
 DAMPING_RATIOS = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35])
 """Trial damping ratios."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Features:
-    """A damped sinusoid through a track."""
+    """A damped sinusoid, or the response of a damped oscillator, through a track."""
 
     frequency: float
     """[Hz]"""
     damping_ratio: float
     """[1]"""
     release: float
-    """[s] When it was let go, on the track's clock: the turning point at or before the onset of motion."""
+    """[s] When it was let go, on the track's clock: the turning point at or before the onset of motion; when the track
+    begins, if the base is shaken."""
     rest: np.ndarray
     """[column] m, where it comes to rest."""
     displacement: np.ndarray
-    """[column] m, of the sinusoid from there at the release."""
+    """[column] m, of the sinusoid from there at the release; the largest of the oscillator's response."""
     noise: float
-    """[m] What the sinusoid leaves unexplained: robust standard deviation, no less than the noise."""
+    """[m] What that curve leaves unexplained: robust standard deviation, no less than the noise."""
     explained: float
-    """[1] Share of the motion after the release that the sinusoid explains."""
+    """[1] Share of the motion after the release, relative to the base, that the curve explains."""
 
     @property
     def log_decrement(self) -> float:
@@ -95,11 +104,31 @@ def _basis(time: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.nda
     return np.stack([np.ones_like(decay), decay * np.cos(omega * time), decay * np.sin(omega * time)], -1)
 
 
-def _misfit(
-    time: np.ndarray, values: np.ndarray, weight: np.ndarray, frequency: np.ndarray, ratio: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted squares left over [trial], and coefficients [trial, 3, column], for trials [trial]."""
-    basis = _basis(time, frequency, ratio)
+def _response_basis(time: np.ndarray, motion: SampledMotion, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """[trial, sample, 3]: one, and, each with a mean square of one, the displacement of a damped oscillator whose base
+    is moved so, and the base's acceleration, which higher modes follow without delay.
+
+    The response is exact for an acceleration that is constant over each of :data:`SUBSTEPS` parts of a sample interval.
+    """
+    omega = 2.0 * np.pi * frequency
+    pole = omega * (-ratio + 1j * np.sqrt(1.0 - ratio**2))
+    rows = np.zeros((len(time), len(pole)))
+    z = np.zeros(len(pole), complex)
+    for i, interval in enumerate(np.diff(time)):
+        h = interval / SUBSTEPS
+        turn = np.exp(pole * h)
+        velocity = motion.velocity(time[i] + h * np.arange(SUBSTEPS + 1))
+        for gain in np.diff(velocity) / h:
+            z = turn * z + gain * (turn - 1.0) / pole
+        rows[i + 1] = -z.imag
+    acceleration = motion.acceleration(time)
+    rows /= np.maximum(np.sqrt((rows**2).mean(0)), 1e-300)
+    acceleration = np.broadcast_to(acceleration / max(float(np.sqrt((acceleration**2).mean())), 1e-300), rows.T.shape)
+    return np.stack([np.ones_like(rows.T), rows.T, acceleration], -1)
+
+
+def _misfit(basis: np.ndarray, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted squares left over [trial], and coefficients [trial, 3, column], for bases [trial, sample, 3]."""
     clean = np.where(weight > 0.0, values, 0.0)
     normal = np.einsum("tsi,sc,tsj->tcij", basis, weight, basis) + 1e-9 * np.eye(3)
     right = np.einsum("tsi,sc->tci", basis, weight * clean)
@@ -109,28 +138,81 @@ def _misfit(
 
 
 def extract_features(track: Trajectory, onset: float | None = None) -> Features:
-    """Frequency, damping ratio and the rest from the motion after ``onset`` [s], found unless given."""
+    """Frequency, damping ratio and the rest from the motion after ``onset`` [s], found unless given.
+
+    Of a track whose base is shaken all is used, from its first sample, at which the plant must be at rest.
+    """
+    if track.base is not None:
+        return _shaken_features(track)
     onset = find_onset(track) if onset is None else onset
     here = track.time >= onset
     time, values = track.time[here] - onset, columns_of(track)[here]
-    weight = np.isfinite(values).astype(float)
     duration = float(time[-1] - time[0])
     step = 1.0 / (FREQUENCIES_PER_BIN * duration)
     grid = np.arange(0.5 / duration, max(0.45 * track.rate, 1.0 / duration), step)
-    ratio = DAMPING_RATIOS
-    best = (0.0, 0.0)
+    best, found, off = _search(functools.partial(_basis, time), values, grid, lambda _: step, 0.05 / duration)
+    return _describe(onset, best, found, off, values, 1.0 / track.rate)
+
+
+def _shaken_features(track: Trajectory) -> Features:
+    """Those of the oscillator whose response to the base's motion is nearest to the track."""
+    assert track.base is not None
+    along = _direction(track.base)
+    motion = SampledMotion(track.time, track.base @ along)
+    values = columns_of(track) - track.base[:, np.nonzero(track.tracked)[1]]
+    lowest = 0.5 / float(track.time[-1] - track.time[0])
+    grid = np.exp(np.arange(math.log(lowest), math.log(max(0.45 * track.rate, 2.0 * lowest)), RELATIVE_STEP))
+    basis = functools.partial(_response_basis, track.time, motion)
+    best, found, off = _search(basis, values, grid, lambda frequency: RELATIVE_STEP * frequency, 0.1 * lowest)
+    response = basis(*(np.array([x]) for x in best))[0, :, 1]
+    return Features(
+        frequency=best[0], damping_ratio=best[1], release=float(track.time[0]), rest=found[0],
+        displacement=np.abs(response).max() * found[1], noise=max(robust_deviation(off), 1e-9),
+        explained=_explained(off, values),
+    )  # fmt: skip
+
+
+def _direction(base: np.ndarray) -> np.ndarray:
+    """Unit vector [3] along which a base [sample, 3] was moved most."""
+    return np.linalg.svd(base, full_matrices=False)[2][0]
+
+
+def _search(
+    basis: Callable[[np.ndarray, np.ndarray], np.ndarray], values: np.ndarray, grid: np.ndarray,
+    step_at: Callable[[float], float], lowest: float,
+) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:  # fmt: skip
+    """Frequency and damping ratio whose curves explain values [sample, column] best.
+
+    Args:
+        basis: curves [trial, sample, 3] of trial frequencies and damping ratios [trial].
+        values: NaN where there are none.
+        grid: frequencies that are tried first [Hz].
+        step_at: their spacing about a frequency [Hz].
+        lowest: no lower frequency is tried [Hz].
+
+    Returns frequency and ratio, coefficients [3, column], and what is left [sample, column].
+    """
+    weight = np.isfinite(values).astype(float)
+    ratio, best, step = DAMPING_RATIOS, (0.0, 0.0), 0.0
     for turn in range(7):  # each finer; outliers weigh less once something is known
         trials = [x.ravel() for x in np.meshgrid(grid, ratio, indexing="ij")]
-        left, found = _misfit(time, values, weight, *trials)
+        curves = basis(*trials)
+        left, found = _misfit(curves, values, weight)
         at = int(np.argmin(left))
         best = (float(trials[0][at]), float(trials[1][at]))
-        off = values - _basis(time, *(np.array([x]) for x in best))[0] @ found[at]
+        off = values - curves[at] @ found[at]
         noise = max(robust_deviation(off), 1e-9)
         weight = np.where(np.isfinite(off), 1.0 / np.maximum(1.0, np.abs(np.nan_to_num(off)) / (3.0 * noise)), 0.0)
-        step = step if turn == 0 else 0.3 * step
-        grid = np.maximum(best[0] + step * np.linspace(-1.0, 1.0, 9), 0.05 / duration)
+        step = step_at(best[0]) if turn == 0 else 0.3 * step
+        grid = np.maximum(best[0] + step * np.linspace(-1.0, 1.0, 9), lowest)
         ratio = np.clip(best[1] * np.exp(np.linspace(-1.0, 1.0, 9) * 0.9 * 0.45**turn), 1e-3, 0.6)
-    return _describe(onset, best, found[at], off, values, noise, 1.0 / track.rate)
+    return best, found[at], off
+
+
+def _explained(off: np.ndarray, values: np.ndarray) -> float:
+    """Share [1] of the variance of values [sample, column] that is not left in ``off``."""
+    moved = np.nanvar(values, axis=0).sum()
+    return float(1.0 - np.nanvar(off, axis=0).sum() / max(moved, 1e-18))
 
 
 def _describe(
@@ -139,7 +221,6 @@ def _describe(
     found: np.ndarray,
     off: np.ndarray,
     values: np.ndarray,
-    noise: float,
     step: float,
 ) -> Features:
     frequency, ratio = best
@@ -151,9 +232,8 @@ def _describe(
     if shift > 1.5 * step:  # the track begins within a swing: it was let go before
         shift -= 0.5 / frequency
     basis = _basis(np.array([shift]), np.array([frequency]), np.array([ratio]))[0, 0]
-    moved = np.nanvar(values, axis=0).sum()
     return Features(
         frequency=frequency, damping_ratio=ratio, release=onset + shift, rest=rest,
-        displacement=basis[1:] @ found[1:], noise=noise,
-        explained=float(1.0 - np.nanvar(off, axis=0).sum() / max(moved, 1e-18)),
+        displacement=basis[1:] @ found[1:], noise=max(robust_deviation(off), 1e-9),
+        explained=_explained(off, values),
     )  # fmt: skip

@@ -151,6 +151,8 @@ class Fit:
         return lines + [f"fault    {fault}" for fault in self.faults]
 
     def _remedy(self, direction: dict[str, float]) -> str:
+        if "modulus" in direction and "mass" in direction and self.track.base is not None:
+            return "shaking tells modulus over mass only; fix the mass, or measure a pull and its force"
         if "modulus" in direction and "mass" in direction and self.force is None:
             return "a free swing tells modulus over mass only; fix the mass, or add a column 'force [N]' of the pull"
         return "what is given there is the prior; fix one of them, or measure it otherwise"

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from vinesim.scene.plant_parameters import Specimen
+from vinesim.tune.base_motion import SampledMotion
 from vinesim.tune.candidates import COLUMNS, Candidates
 from vinesim.tune.features import Features, columns_of
 from vinesim.tune.priors import Prior
@@ -55,6 +56,8 @@ class Problem:
         dt: step of the simulation [s].
         device: ``cpu``, ``cuda`` or ``cuda:N``.
         pushed: from rest, a steady force begins to act at the release.
+
+    Where the track says how the base was shaken, there is neither pull nor release: it begins at rest.
     """
 
     def __init__(
@@ -68,10 +71,14 @@ class Problem:
         self.seen = np.isfinite(self.observed)
         self.axes = np.flatnonzero(track.tracked.any(0))
         tips = self.candidates.pull_axes()[:, self.axes]
-        self.pulls = tuple(name for name, way in zip(COLUMNS[5:], tips, strict=True) if np.linalg.norm(way) > 0.3)
+        self.shaking = None if track.base is None else SampledMotion(track.time, track.base)
+        pulls = tuple(name for name, way in zip(COLUMNS[5:], tips, strict=True) if np.linalg.norm(way) > 0.3)
+        self.pulls = pulls if self.shaking is None else ()
+        self.begins = ("release",) if self.shaking is None else ()
+        """The parameter that says when the motion begins, if there is one."""
         free = "bow_y" not in fitted and "bow_z" not in fitted
         self.origins = tuple(f"origin_{'xyz'[axis]}" for axis in self.axes) if free else ()
-        self.names = (*fitted, *self.pulls, "release", *self.origins)
+        self.names = (*fitted, *self.pulls, *self.begins, *self.origins)
         self.simulated = tuple(name for name in self.names if name in COLUMNS)
         turn = max(2.0 / track.rate, 0.1 / features.frequency)
         flat = Prior(0.0, math.inf, "flat")
@@ -112,18 +119,31 @@ class Problem:
         parameter] say, at the samples up to ``end`` [s]."""
         thetas = thetas + self.shift
         time = self.track.time[self.track.time <= end]
-        at = self.names.index("release")
-        release = thetas[:, at]
+        release = self._release(thetas)
         after = np.maximum(time - release.mean(), 0.0)
         tick = np.floor(after / self.candidates.dt + 1e-6).astype(int)
         ticks, index = np.unique(tick, return_inverse=True)
-        motion = self.candidates.run(candidates, ticks, self.pushed)
+        motion = self.candidates.run(candidates, ticks, self.pushed, self._base_velocity(int(ticks[-1])))
         begun = time > release[:, None]
         offset = np.where(begun, time - release[:, None] - tick * self.candidates.dt, 0.0)
         position, velocity = motion.at(index, offset)
         velocity = velocity * begun[..., None, None]
         x, v = (rows[:, :, self.track.tracked] for rows in (position, velocity))
+        if self.track.base is not None:
+            x = x + self.track.base[: len(time), np.nonzero(self.track.tracked)[1]]
         return x + self._origin(thetas)[:, None], v
+
+    def _release(self, thetas: np.ndarray) -> np.ndarray:
+        """[n] s, when the motion of each candidate begins."""
+        if not self.begins:
+            return np.full(len(thetas), self.track.time[0])
+        return thetas[:, self.names.index("release")]
+
+    def _base_velocity(self, last: int) -> np.ndarray | None:
+        """[tick, 3] m/s of the base up to the tick after the ``last`` one; None if it rests."""
+        if self.shaking is None:
+            return None
+        return self.shaking.velocity(self.track.time[0] + self.candidates.dt * np.arange(last + 2))
 
     def correct_discretisation(self, theta: np.ndarray, noise: float) -> np.ndarray:
         """Find by how much the coarse chain and step bias a fit near ``theta``; the parameters without that bias.
@@ -171,7 +191,8 @@ class Problem:
         jacobian = np.zeros((int(seen.sum()), len(self.names)))
         for i, (name, h) in enumerate(zip(self.simulated, steps, strict=True)):
             jacobian[:, self.names.index(name)] = ((x[1 + 2 * i] - x[2 + 2 * i]) / (2.0 * h))[seen]
-        jacobian[:, self.names.index("release")] = -v[0][seen]
+        for name in self.begins:
+            jacobian[:, self.names.index(name)] = -v[0][seen]
         axis = np.broadcast_to(np.nonzero(self.track.tracked)[1], seen.shape)[seen]
         for i, name in enumerate(self.origins):
             jacobian[:, self.names.index(name)] = axis == self.axes[i]

@@ -23,7 +23,8 @@ def start_values(problem: Problem) -> np.ndarray:
     features = problem.features
     theta = np.zeros(len(problem.names))
     at = {name: i for i, name in enumerate(problem.names)}
-    theta[at["release"]] = features.release
+    for name in problem.begins:
+        theta[at[name]] = features.release
     for name in ("bow_y", "bow_z"):
         if name in at:
             theta[at[name]] = problem.specimen.bow["yz".index(name[-1])]
@@ -40,9 +41,7 @@ def start_values(problem: Problem) -> np.ndarray:
 
 def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None:
     """The pull that displaces the markers as far as the track begins, and the origin at which they then rest."""
-    specimen = problem.specimen
-    radius = 0.5 * specimen.base_diameter.value
-    unit = 0.1 * 3.0 * specimen.modulus.value * math.pi * radius**4 / 4.0 / specimen.length.value**2
+    unit = _unit_pull(problem)
     base = problem.row(theta)
     base[5:] = 0.0
     rows = np.repeat(base[None], 1 + len(problem.pulls), 0)
@@ -51,7 +50,9 @@ def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None
     shape = problem.candidates.shape(rows)[:, problem.track.tracked]
     response = (shape[1:] - shape[0]) / unit  # [pull, column]
     way = -1.0 if problem.pushed else 1.0  # a push ends where the swing does
-    pull = np.linalg.lstsq(response.T, way * problem.features.displacement, rcond=None)[0]
+    pull = np.zeros(0)
+    if problem.pulls:
+        pull = np.linalg.lstsq(response.T, way * problem.features.displacement, rcond=None)[0]
     for name, value in zip(problem.pulls, pull, strict=True):
         theta[at[name]] = value
     problem.pull_scale = max(float(np.linalg.norm(pull)), 1e-3 * unit)
@@ -61,11 +62,23 @@ def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None
         theta[at[name]] = (problem.features.rest - rest)[axis == problem.axes[i]].mean()
 
 
+def _unit_pull(problem: Problem) -> float:
+    """[N] What moves the tip of a cane without taper by a tenth of its length."""
+    specimen = problem.specimen
+    radius = 0.5 * specimen.base_diameter.value
+    return 0.1 * 3.0 * specimen.modulus.value * math.pi * radius**4 / 4.0 / specimen.length.value**2
+
+
 def _scan(problem: Problem, theta: np.ndarray, features: Features) -> tuple[float, float]:
-    """Logarithms of modulus and damping, over the specimen's, that give the track's frequency and decay."""
+    """Logarithms of modulus and damping, over the specimen's, that give the track's frequency and decay.
+
+    By free swings, from the pull of ``theta`` or, of a base that was shaken, from any.
+    """
     own = problem.specimen.damping.value
     base = problem.row(theta)
     base[1] = math.log(SCAN_DAMPING_RATIO / (math.pi * features.frequency) / own)
+    if problem.shaking is not None:
+        base[5:] = 0.5 * _unit_pull(problem)
     rows = np.repeat(base[None], len(RATIOS), 0)
     if "modulus" in problem.names:
         rows[:, 0] = np.log(RATIOS)

@@ -18,7 +18,9 @@ MIN_SAMPLES = 8
 MAX_MISSING = 0.6
 """Share of a column that may be missing."""
 _SCALE = {"s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "N": 1.0}
-_UNITS = {"time": ("s", "ms"), "force": ("N",), "position": ("m", "cm", "mm")}
+_UNITS = {"time": ("s", "ms"), "force": ("N",), "position": ("m", "cm", "mm"), "base": ("m", "cm", "mm")}
+BASE = "base"
+"""Names the columns that say how the base was moved; no marker is called so."""
 _HEADER = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
 
 
@@ -28,7 +30,7 @@ class TrajectoryError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Where markers were while a plant was pulled, let go and swung.
+    """Where markers were while a plant was pulled, let go and swung, or shaken at its base.
 
     :class:`TrajectoryError` if shapes or numbers contradict each other.
     """
@@ -43,6 +45,9 @@ class Trajectory:
     """[sample] N: the pull that a gauge showed at the tip; NaN where there is no reading. None without gauge."""
     source: str = "data"
     """Where it comes from: the name of the file."""
+    base: np.ndarray | None = None
+    """[sample, 3] m: how far the base was moved from where it rested at the first sample, without turning; None: not
+    at all."""
 
     def __post_init__(self) -> None:
         count, trouble = len(self.time), None
@@ -50,10 +55,16 @@ class Trajectory:
             trouble = f"position has the shape {self.position.shape}; give [{count}, {len(self.markers)}, 3]"
         elif self.force is not None and self.force.shape != (count,):
             trouble = f"force has the shape {self.force.shape}; give [{count}]"
+        elif self.base is not None and self.base.shape != (count, 3):
+            trouble = f"base has the shape {self.base.shape}; give [{count}, 3]"
         elif count < MIN_SAMPLES:
             trouble = f"{count} samples; give {MIN_SAMPLES} or more"
         elif not np.isfinite(self.time).all() or (np.diff(self.time) <= 0.0).any():
             trouble = "time does not increase; sort the samples and remove repeated ones"
+        elif self.base is not None and not np.isfinite(self.base).all():
+            trouble = "the motion of the base has gaps; give it at every sample"
+        elif self.base is not None and self.force is not None:
+            trouble = "it has a pull at the tip and a motion of the base; remove the columns of one"
         elif not self.tracked.any():
             trouble = "no axis of a marker was tracked; give a column such as 'x [mm]'"
         if trouble:
@@ -73,7 +84,8 @@ class Trajectory:
         """The samples from one time to another [s]."""
         here = (self.time >= start) & (self.time <= end)
         force = None if self.force is None else self.force[here]
-        return dataclasses.replace(self, time=self.time[here], position=self.position[here], force=force)
+        base = None if self.base is None else self.base[here]
+        return dataclasses.replace(self, time=self.time[here], position=self.position[here], force=force, base=base)
 
     def write(self, path: str | pathlib.Path) -> None:
         """Write as CSV that :func:`read_trajectory` reads; positions in mm."""
@@ -83,11 +95,18 @@ class Trajectory:
             columns.append((f"{name} [mm]", 1e3 * self.position[:, marker, axis]))
         if self.force is not None:
             columns.append(("force [N]", self.force))
+        if self.base is not None:
+            columns += [(f"base {'xyz'[axis]} [mm]", 1e3 * self.base[:, axis]) for axis in _moved_axes(self.base)]
         with writing(path), pathlib.Path(path).open("w", newline="", encoding="utf-8") as file:
             out = csv.writer(file, lineterminator="\n")
             out.writerow([name for name, _ in columns])
             for row in zip(*(values.tolist() for _, values in columns), strict=True):
                 out.writerow(["" if math.isnan(value) else f"{value:.6g}" for value in row])
+
+
+def _moved_axes(base: np.ndarray) -> list[int]:
+    """Axes along which a base [sample, 3] moved; the first one if it stood still."""
+    return np.flatnonzero(np.any(base != 0.0, axis=0)).tolist() or [0]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -102,8 +121,8 @@ def read_trajectory(path: str | pathlib.Path) -> Trajectory:
     """A track from CSV.
 
     The first line names columns with units: ``time [s]``, ``x [mm]`` for the tip, ``NAME x [mm]`` for a marker,
-    ``force [N]``; axes x, y, z of the world, z up; s or ms, m, cm or mm. Empty cells and ``nan`` are gaps. Lines that
-    begin with ``#`` are skipped.
+    ``base x [mm]`` for how far the base was moved, ``force [N]``; axes x, y, z of the world, z up; s or ms, m, cm or
+    mm. Empty cells and ``nan`` are gaps, which time and base must not have. Lines that begin with ``#`` are skipped.
 
     :class:`TrajectoryError` with line, column, value and remedy if a line does not fit.
     """
@@ -132,9 +151,12 @@ def read_trajectory(path: str | pathlib.Path) -> Trajectory:
 def _assemble(path: pathlib.Path, columns: list[_Column], table: np.ndarray, clock: int) -> Trajectory:
     markers = tuple(dict.fromkeys(column.marker for column in columns if column.kind == "position"))
     position, force = np.full((len(table), len(markers), 3), np.nan), None
+    base = np.zeros((len(table), 3)) if any(column.kind == "base" for column in columns) else None
     for i, column in enumerate(columns):
         if column.kind == "force":
             force = table[:, i]
+        elif column.kind == "base" and base is not None:
+            base[:, column.axis] = table[:, i]
         elif column.kind == "position":
             missing = float(np.mean(np.isnan(table[:, i]))) if len(table) else 1.0
             if missing > MAX_MISSING:
@@ -143,7 +165,7 @@ def _assemble(path: pathlib.Path, columns: list[_Column], table: np.ndarray, clo
                     f"remove the column, or track it in more than {1.0 - MAX_MISSING:.0%}"
                 )
             position[:, markers.index(column.marker), column.axis] = table[:, i]
-    return Trajectory(table[:, clock], position, markers, force, path.name)
+    return Trajectory(table[:, clock], position, markers, force, path.name, base)
 
 
 def _read_header(path: pathlib.Path, line: int, names: list[str]) -> list[_Column]:
@@ -171,10 +193,14 @@ def _read_name(place: str, text: str) -> _Column:
         kind, marker, axis = "time", "", 0
     elif name.lower() in ("force", "f"):
         kind, marker, axis = "force", "", 0
+    elif len(words) == 2 and words[0].lower() == BASE and words[1].lower() in ("x", "y", "z"):
+        kind, marker, axis = "base", "", "xyz".index(words[1].lower())
     elif words and words[-1].lower() in ("x", "y", "z"):
         kind, marker, axis = "position", " ".join(words[:-1]) or TIP, "xyz".index(words[-1].lower())
     else:
-        raise TrajectoryError(f"{place} is not known; name it time, x, y, z, 'MARKER x' or force, with its unit")
+        raise TrajectoryError(
+            f"{place} is not known; name it time, x, y, z, 'MARKER x', 'base x' or force, with its unit"
+        )
     if unit not in _UNITS[kind]:
         raise TrajectoryError(f"{place}: unit {unit!r} of a {kind}; give {' or '.join(_UNITS[kind])}")
     return _Column(kind, _SCALE[unit], marker, axis)
@@ -190,8 +216,9 @@ def _read_row(path: pathlib.Path, line: int, row: list[str], columns: list[_Colu
             value = float(text) if text else math.nan
         except ValueError:
             value = math.inf
-        if math.isinf(value) or (column.kind == "time" and math.isnan(value)):
-            remedy = "give a number" + ", or leave the cell empty where there is none" * (column.kind != "time")
+        whole = column.kind in ("time", "base")
+        if math.isinf(value) or (whole and math.isnan(value)):
+            remedy = "give a number" + ", or leave the cell empty where there is none" * (not whole)
             raise TrajectoryError(f"{path}:{line}: column {name.strip()!r} is {text!r}; {remedy}")
         values.append(value * column.scale)
     return values

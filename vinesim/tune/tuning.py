@@ -12,7 +12,7 @@ import numpy as np
 from vinesim.errors import UsageError
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.tune.candidates import COLUMNS
-from vinesim.tune.features import Features, extract_features, find_onset, robust_deviation
+from vinesim.tune.features import Features, extract_features, robust_deviation
 from vinesim.tune.fit import Fit, Minimum
 from vinesim.tune.posterior import Posterior, importance_sample, laplace
 from vinesim.tune.priors import physical_priors
@@ -37,11 +37,12 @@ def tune(
     release: float | None = None, samples: int = 0, seed: int = 0, device: str = "cpu",
     pushed: bool = False,
 ) -> Fit:  # fmt: skip
-    """Fit a specimen to a track of a pull and release.
+    """Fit a specimen to a track of a pull and release, or of a base that is shaken.
 
     Args:
         specimen: the plant as far as it is known; modulus and damping may be off by any factor up to 40.
-        track: of one or more markers, from before or after the release on.
+        track: of one or more markers, from before or after the release on; from rest on, if it says how the base was
+            moved.
         parameters: of :data:`PARAMETERS`; none to test the plant as it is on another release. ``mass`` scales all
             masses alike and needs a force reading; ``rest`` is the slack shape and needs positions from the base.
         release: when it was let go [s]; found unless given.
@@ -54,7 +55,10 @@ def tune(
     :class:`~vinesim.errors.UsageError` for other parameters. A fit that has failed is returned and says so.
     """
     fitted = _columns(parameters)
-    features = extract_features(track, find_onset(track) if release is None else release)
+    if track.base is not None and (pushed or release is not None):
+        what = "push" if pushed else "release"
+        raise UsageError(f"{track.source}: its base is shaken, so there is no {what}; leave out --{what}")
+    features = extract_features(track, release)
     if release is not None:
         features = dataclasses.replace(features, release=release)
     _check_track(specimen, track, features)
@@ -91,8 +95,8 @@ def _columns(parameters: Sequence[str]) -> tuple[str, ...]:
 
 def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> None:
     """Refuse what cannot be a track of this plant."""
-    duration = float(track.time[-1] - features.release)
-    if duration * features.frequency < 1.0:
+    duration, shaken = float(track.time[-1] - features.release), track.base is not None
+    if duration * features.frequency < 1.0 and not shaken:
         raise TrajectoryError(
             f"{track.source}: {duration:.2g} s after the release at {features.release:.2f} s are less than one period "
             f"of {1.0 / features.frequency:.2g} s; track longer, or say when it was let go (--release)"
@@ -105,9 +109,12 @@ def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> N
             "header (m, cm or mm) or specimen.length"
         )
     if reach < 3.0 * features.noise or features.explained < 0.3:
+        remedy = "cut the track to one release, or pull further"
+        if shaken:
+            remedy = "sweep through the plant's first mode, or shake further"
         raise TrajectoryError(
             f"{track.source}: no swing stands out: {1e3 * reach:.3g} mm of it, {1e3 * features.noise:.3g} mm of noise; "
-            "check the unit and the columns, cut the track to one release, or pull further"
+            f"check the unit and the columns, {remedy}"
         )
     if reach < 0.002 * length:
         raise TrajectoryError(
@@ -168,17 +175,17 @@ def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> 
     """Frequency and damping ratio of the fitted candidate, noise-free, at the track's own times."""
     position = np.full(problem.track.position.shape, np.nan)
     position[:, problem.track.tracked] = model
-    release = theta[problem.names.index("release")]
-    return extract_features(dataclasses.replace(problem.track, position=position), float(release))
+    release = float(theta[problem.names.index("release")]) if problem.begins else None
+    return extract_features(dataclasses.replace(problem.track, position=position), release)
 
 
 def _faults(problem: Problem, posterior: Posterior, noise: float, model: np.ndarray) -> tuple[str, ...]:
     """Why the fit is not to be believed; empty if nothing speaks against it."""
     faults = []
-    features = problem.features
+    features, curve = problem.features, "sinusoid" if problem.shaking is None else "oscillator"
     if noise > UNEXPLAINED * features.noise:
         faults.append(
-            f"the fit leaves {1e3 * noise:.3g} mm, a damped sinusoid only {1e3 * features.noise:.3g} mm: another "
+            f"the fit leaves {1e3 * noise:.3g} mm, a damped {curve} only {1e3 * features.noise:.3g} mm: another "
             "minimum, or a plant that the specimen does not describe (length, diameters, direction, tip mass)"
         )
     if posterior.correlation_time > 4.0:

@@ -18,7 +18,10 @@ Model = Annotated[
 def tune(
     data: Annotated[
         pathlib.Path,
-        typer.Argument(help="CSV: time [s], x [mm] ... of the tip, 'NAME x [mm]' of a marker, force [N] if measured."),
+        typer.Argument(
+            help="CSV: time [s], x [mm] ... of the tip, 'NAME x [mm]' of a marker, force [N] if measured, "
+            "'base x [mm]' if it was shaken."
+        ),
     ],
     model: Model,
     fit: Annotated[
@@ -39,7 +42,7 @@ def tune(
     seed: Annotated[int, typer.Option(min=0, help="Of these draws.")] = 0,
     device: Device = "cpu",
 ) -> None:
-    """Fit a cane, or a bunch on its peduncle, to the track of a pull and release.
+    """Fit a cane, or a bunch on its peduncle, to the track of a pull and release, a push, or a shaken base.
 
     Prints modulus, damping and what else is fitted with 90 % intervals, what the data do not decide, and what speaks
     against the fit; with such a fault the exit code is 5, and --out is not written. Needs scipy (extra: tune).
@@ -56,12 +59,24 @@ def tune(
 
 
 def experiment(
-    kind: Annotated[str, typer.Argument(help="pull-release: held aside, then let go. push: a steady force begins.")],
+    kind: Annotated[
+        str,
+        typer.Argument(
+            help="pull-release: held aside, then let go. push: a steady force begins. shake: the base moves in a sweep."
+        ),
+    ],
     model: Model,
     out: Annotated[pathlib.Path | None, typer.Option(help="Write the track as CSV; KIND.csv unless given.")] = None,
     displacement: Annotated[float, typer.Option(help="Of the tip, by the pull or the push [m].")] = 0.1,
-    angle: Annotated[float, typer.Option(help="Of the force about the base's x axis, from its y axis [deg].")] = 90.0,
-    duration: Annotated[float, typer.Option(help="Of the track after the release [s].")] = 3.0,
+    angle: Annotated[
+        float, typer.Option(help="Of force or shaking about the base's x axis, from its y axis [deg].")
+    ] = 90.0,
+    amplitude: Annotated[float, typer.Option(help="Of the base that is shaken [m].")] = 0.005,
+    from_frequency: Annotated[float, typer.Option("--from", help="Of the sweep, at its start [Hz].")] = 1.0,
+    to_frequency: Annotated[float, typer.Option("--to", help="Of the sweep, at its end [Hz].")] = 8.0,
+    duration: Annotated[
+        float | None, typer.Option(help="Of the track after the release, or of the sweep [s]; 3, or 10 of a sweep.")
+    ] = None,
     hold: Annotated[float, typer.Option(help="Before it [s].")] = 0.2,
     rate: Annotated[float, typer.Option(help="Pictures a second.")] = 30.0,
     noise: Annotated[float, typer.Option(help="Standard deviation of a tracked position [m].")] = 0.002,
@@ -84,12 +99,14 @@ def experiment(
       vinesim experiment pull-release --model examples/cane.toml --rate 120 --duration 2 --axes z
       vinesim experiment pull-release --model examples/cane.toml --force-noise 0.01 --fit modulus,damping,mass
       vinesim experiment push --model examples/cane.toml --out push.csv
+      vinesim experiment shake --model examples/cane.toml --amplitude 0.003 --from 2 --to 6 --rate 60
     """
     from vinesim.cli.tune import plan
     from vinesim.tune.experiment import Experiment
 
     what = Experiment(
-        kind=kind, displacement=displacement, angle=angle, duration=duration, hold=hold, rate=rate, noise=noise,
-        force_noise=force_noise, markers=tuple(marker or ["tip"]), axes=axes, seed=seed,
+        kind=kind, displacement=displacement, angle=angle, amplitude=amplitude, from_frequency=from_frequency,
+        to_frequency=to_frequency, duration=duration, hold=hold, rate=rate, noise=noise, force_noise=force_noise,
+        markers=tuple(marker or ["tip"]), axes=axes, seed=seed,
     )  # fmt: skip
     raise typer.Exit(plan(what, model, out, fit, json))
