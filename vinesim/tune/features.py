@@ -120,7 +120,7 @@ def _response_basis(time: np.ndarray, motion: SampledMotion, frequency: np.ndarr
         velocity = motion.velocity(time[i] + h * np.arange(SUBSTEPS + 1))
         for gain in np.diff(velocity) / h:
             z = turn * z + gain * (turn - 1.0) / pole
-        rows[i + 1] = -z.imag
+        rows[i + 1] = -np.imag(z)
     acceleration = motion.acceleration(time)
     rows /= np.maximum(np.sqrt((rows**2).mean(0)), 1e-300)
     acceleration = np.broadcast_to(acceleration / max(float(np.sqrt((acceleration**2).mean())), 1e-300), rows.T.shape)
