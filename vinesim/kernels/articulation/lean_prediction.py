@@ -1,4 +1,4 @@
-"""Prediction for GPUs: :mod:`vinesim.kernels.articulation.prediction` with little traffic to memory.
+"""Prediction for GPUs: the three passes of :mod:`vinesim.kernels.articulation.prediction` with little traffic to memory.
 
 There, what is left of a subtree is added to its parent's record and read again; on a GPU, where every tree is a thread and
 none of these records stays in a cache, that is most of the time. Here a body's own inertia is made when its joint is
@@ -8,17 +8,18 @@ alone. The functions of one body and the order of sums are the same, but where t
 
 import warp as wp
 
-from vinesim.kernels.articulation.body_dynamics import joint_terms, terms_left
-from vinesim.kernels.articulation.kinematics import body_kinematics, parent_kinematics
-from vinesim.kernels.articulation.prediction import (
-    accelerate_bodies,
-    add_terms,
-    applied_terms,
-    chosen_phi,
-    is_conservative,
-    predict_tree,
+from vinesim.kernels.articulation.body_dynamics import (
+    accelerate_body,
+    drag_terms,
+    joint_terms,
+    own_terms,
+    terms_left,
+    tie_terms,
+    turned_rest_moment,
 )
-from vinesim.kernels.articulation.spatial import inverse_symmetric, symmetric
+from vinesim.kernels.articulation.kinematics import body_kinematics, parent_kinematics
+from vinesim.kernels.articulation.prediction import add_terms, chosen_phi, is_conservative, predict_tree
+from vinesim.kernels.articulation.spatial import inverse_symmetric, symmetric, world_inertia
 from vinesim.kernels.articulation.structs import (
     AppliedForces,
     ArticulationModel,
@@ -68,6 +69,65 @@ def place_bodies(
 
 
 @wp.func
+def applied_terms(
+    k: int,
+    tree: int,
+    p: SolverParameters,
+    phi: float,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    joints: JointState,
+    pose: wp.transform,
+    motion: wp.spatial_vector,
+    axes: wp.quat,
+    q: wp.quat,
+    stiffness: wp.vec3,
+    damping: wp.vec3,
+):
+    """Implicit inertia J, H, M of body k, its bias and its tension: its own, of drag and of its ties."""
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+    com = rotation * model.body_com[k]
+    inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+    falls = float(0.0)
+    fall = wp.vec3()
+    root = model.body_root[k]
+    if root >= 0:
+        falls = 1.0
+        fall = joints.joint_xd[root]
+    load = forces.body_load[k]
+    if model.body_parent[k] < 0:
+        load = load + wp.spatial_vector(
+            wp.vec3(),
+            turned_rest_moment(
+                p.dt, phi, axes, q, stiffness, damping, forces.root_turn[tree], forces.root_turn_rate[tree]
+            ),
+        )  # fmt: skip
+    J, H, M, bias, tension, _steady = own_terms(
+        p, phi, motion, model.body_mass[k], com, inertia, load, wp.spatial_top(forces.body_wrench[k]), falls, fall
+    )
+    area = model.body_drag[k]
+    if area > 0.0:
+        J_more, H_more, M_more, bias_more, tension_more = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
+        J += J_more
+        H += H_more
+        M += M_more
+        bias += bias_more
+        tension += tension_more
+    ties = model.tie_span[k]
+    for t in range(ties[0], ties[1]):
+        J_more, H_more, M_more, bias_more, tension_more = tie_terms(
+            p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+            forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
+        )  # fmt: skip
+        J += J_more
+        H += H_more
+        M += M_more
+        bias += bias_more
+        tension += tension_more
+    return J, H, M, bias, tension
+
+
+@wp.func
 def eliminate_bodies(
     p: SolverParameters, model: ArticulationModel, forces: AppliedForces, joints: JointState, bodies: BodyState,
     is_branching: wp.array(dtype=wp.bool), tree: int, phi: float, factors_out: Factors, scratch_out: Scratch,
@@ -91,7 +151,7 @@ def eliminate_bodies(
         q = joints.joint_q[k]
         stiffness = model.joint_stiffness[k]
         damping = model.joint_damping[k]
-        J, H, M, bias, tension, _steady_force = applied_terms(
+        J, H, M, bias, tension = applied_terms(
             k, tree, p, phi, model, forces, joints, pose, motion, axes, q, stiffness, damping
         )
         if is_branching[k]:
@@ -149,6 +209,49 @@ def eliminate_bodies(
             motion = bodies.body_qd[k - model.pitch]
 
 
+@wp.func
+def accelerate_tree(
+    dt: float,
+    model: ArticulationModel,
+    joints: JointState,
+    bodies: BodyState,
+    factors: Factors,
+    scratch: Scratch,
+    tree: int,
+    prediction_out: Prediction,
+):
+    """From the root to the tips of one tree: accelerations, and the rates and velocities they lead to."""
+    first = model.tree_first[tree]
+    acceleration = wp.spatial_vector()
+    velocity = wp.spatial_vector()
+    omega = wp.vec3()
+    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
+        parent = model.body_parent[k]
+        turning = omega
+        if parent < 0:
+            acceleration = wp.spatial_vector()
+            velocity = wp.spatial_vector()
+            turning = wp.vec3()
+            if model.body_root[k] >= 0:
+                force = wp.spatial_top(scratch.bias[k]) + wp.transpose(scratch.H[k]) * scratch.Du[k]
+                falling = -(factors.root_inverse_mass[k] * force)
+                acceleration = wp.spatial_vector(falling, wp.vec3())
+                prediction_out.joint_xd_free[k] = joints.joint_xd[k] + dt * falling
+                velocity = wp.spatial_vector(prediction_out.joint_xd_free[k], wp.vec3())
+        elif parent != k - model.pitch:
+            acceleration = prediction_out.body_acceleration[parent]
+            velocity = prediction_out.body_qd_free[parent]
+            turning = wp.spatial_bottom(bodies.body_qd[parent])
+        omega = wp.spatial_bottom(bodies.body_qd[k])
+        acceleration, rate, velocity = accelerate_body(
+            dt, acceleration, velocity, turning, omega, factors.lever[k], factors.axes[k], joints.joint_qd[k],
+            factors.DJ[k], factors.DH[k], scratch.Du[k],
+        )  # fmt: skip
+        prediction_out.body_acceleration[k] = acceleration
+        prediction_out.joint_qd_free[k] = rate
+        prediction_out.body_qd_free[k] = velocity
+
+
 @wp.kernel
 def predict_lean(
     # model
@@ -185,4 +288,4 @@ def predict_lean(
         eliminate_bodies(
             step, model, forces, joints, bodies_out, is_branching, tree, phi, factors_out, scratch_out
         )  # fmt: skip
-        accelerate_bodies(step.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)
+        accelerate_tree(step.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)

@@ -62,65 +62,6 @@ def add_terms(
 
 
 @wp.func
-def applied_terms(
-    k: int,
-    tree: int,
-    p: SolverParameters,
-    phi: float,
-    model: ArticulationModel,
-    forces: AppliedForces,
-    joints: JointState,
-    pose: wp.transform,
-    motion: wp.spatial_vector,
-    axes: wp.quat,
-    q: wp.quat,
-    stiffness: wp.vec3,
-    damping: wp.vec3,
-):
-    """Implicit inertia J, H, M of body k, its bias and its tension, of itself, of drag and of its ties; its steady force."""
-    rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
-    com = rotation * model.body_com[k]
-    inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
-    falls = float(0.0)
-    fall = wp.vec3()
-    root = model.body_root[k]
-    if root >= 0:
-        falls = 1.0
-        fall = joints.joint_xd[root]
-    load = forces.body_load[k]
-    if model.body_parent[k] < 0:
-        load = load + wp.spatial_vector(
-            wp.vec3(),
-            turned_rest_moment(
-                p.dt, phi, axes, q, stiffness, damping, forces.root_turn[tree], forces.root_turn_rate[tree]
-            ),
-        )  # fmt: skip
-    J, H, M, bias, tension, steady_force = own_terms(
-        p, phi, motion, model.body_mass[k], com, inertia, load, wp.spatial_top(forces.body_wrench[k]), falls, fall
-    )
-    area = model.body_drag[k]
-    if area > 0.0:
-        J_more, H_more, M_more, bias_more, tension_more = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
-        J += J_more
-        H += H_more
-        M += M_more
-        bias += bias_more
-        tension += tension_more
-    ties = model.tie_span[k]
-    for t in range(ties[0], ties[1]):
-        J_more, H_more, M_more, bias_more, tension_more = tie_terms(
-            p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
-            forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
-        )  # fmt: skip
-        J += J_more
-        H += H_more
-        M += M_more
-        bias += bias_more
-        tension += tension_more
-    return J, H, M, bias, tension, steady_force
-
-
-@wp.func
 def assemble_bodies(
     p: SolverParameters,
     model: ArticulationModel,
@@ -145,18 +86,45 @@ def assemble_bodies(
         bodies_out.body_qd[k] = motion
         factors_out.axes[k] = axes
         factors_out.lever[k] = lever
-        J, H, M, bias, tension, steady_force = applied_terms(
-            k, tree, p, phi, model, forces, joints, pose, motion, axes, joints.joint_q[k], model.joint_stiffness[k],
-            model.joint_damping[k],
-        )  # fmt: skip
-        if conservative:
-            com = wp.quat_to_matrix(wp.transform_get_rotation(pose)) * model.body_com[k]
-            J = J + reach * shear_stiffness(com, steady_force)
+        rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+        com = rotation * model.body_com[k]
+        inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+        falls = float(0.0)
+        fall = wp.vec3()
+        if model.body_root[k] >= 0:
+            falls = 1.0
+            fall = joints.joint_xd[model.body_root[k]]
+        contact = wp.spatial_top(forces.body_wrench[k])
+        load = forces.body_load[k]
+        if model.body_parent[k] < 0:
+            load = load + wp.spatial_vector(
+                wp.vec3(),
+                turned_rest_moment(
+                    p.dt, phi, axes, joints.joint_q[k], model.joint_stiffness[k], model.joint_damping[k],
+                    forces.root_turn[tree], forces.root_turn_rate[tree],
+                ),
+            )  # fmt: skip
+        J, H, M, bias, tension, steady_force = own_terms(
+            p, phi, motion, model.body_mass[k], com, inertia, load, contact, falls, fall
+        )
         scratch_out.J[k] = J
         scratch_out.H[k] = H
         scratch_out.M[k] = M
         scratch_out.bias[k] = bias
         scratch_out.tension[k] = tension
+        if conservative:
+            scratch_out.J[k] = scratch_out.J[k] + reach * shear_stiffness(com, steady_force)
+        area = model.body_drag[k]
+        if area > 0.0:
+            J, H, M, bias, tension = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
+            add_terms(k, J, H, M, bias, tension, scratch_out)
+        ties = model.tie_span[k]
+        for t in range(ties[0], ties[1]):
+            J, H, M, bias, tension = tie_terms(
+                p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+                forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
+            )  # fmt: skip
+            add_terms(k, J, H, M, bias, tension, scratch_out)
 
 
 @wp.func
@@ -268,30 +236,24 @@ def accelerate_bodies(
 ):
     """From the root to the tips of one tree: accelerations, and the rates and velocities they lead to."""
     first = model.tree_first[tree]
-    acceleration = wp.spatial_vector()
-    velocity = wp.spatial_vector()
-    omega = wp.vec3()
     for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
         parent = model.body_parent[k]
-        turning = omega
-        if parent < 0:
-            acceleration = wp.spatial_vector()
-            velocity = wp.spatial_vector()
-            turning = wp.vec3()
-            if model.body_root[k] >= 0:
-                force = wp.spatial_top(scratch.bias[k]) + wp.transpose(scratch.H[k]) * scratch.Du[k]
-                falling = -(factors.root_inverse_mass[k] * force)
-                acceleration = wp.spatial_vector(falling, wp.vec3())
-                prediction_out.joint_xd_free[k] = joints.joint_xd[k] + dt * falling
-                velocity = wp.spatial_vector(prediction_out.joint_xd_free[k], wp.vec3())
-        elif parent != k - model.pitch:
-            acceleration = prediction_out.body_acceleration[parent]
-            velocity = prediction_out.body_qd_free[parent]
+        above = wp.spatial_vector()
+        motion = wp.spatial_vector()
+        turning = wp.vec3()
+        if parent >= 0:
+            above = prediction_out.body_acceleration[parent]
+            motion = prediction_out.body_qd_free[parent]
             turning = wp.spatial_bottom(bodies.body_qd[parent])
-        omega = wp.spatial_bottom(bodies.body_qd[k])
+        elif model.body_root[k] >= 0:
+            force = wp.spatial_top(scratch.bias[k]) + wp.transpose(scratch.H[k]) * scratch.Du[k]
+            falling = -(factors.root_inverse_mass[k] * force)
+            above = wp.spatial_vector(falling, wp.vec3())
+            prediction_out.joint_xd_free[k] = joints.joint_xd[k] + dt * falling
+            motion = wp.spatial_vector(prediction_out.joint_xd_free[k], wp.vec3())
         acceleration, rate, velocity = accelerate_body(
-            dt, acceleration, velocity, turning, omega, factors.lever[k], factors.axes[k], joints.joint_qd[k],
-            factors.DJ[k], factors.DH[k], scratch.Du[k],
+            dt, above, motion, turning, wp.spatial_bottom(bodies.body_qd[k]), factors.lever[k], factors.axes[k],
+            joints.joint_qd[k], factors.DJ[k], factors.DH[k], scratch.Du[k],
         )  # fmt: skip
         prediction_out.body_acceleration[k] = acceleration
         prediction_out.joint_qd_free[k] = rate
