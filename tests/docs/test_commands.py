@@ -19,7 +19,7 @@ from vinesim.tune import Experiment, load_specimen, measure
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.S | re.M)
-RUNS = ("certs ", "experiment ", "render ", "replay run.mcap --out ", "scene ", "tune ")
+RUNS = ("certs ", "experiment ", "render ", "scene ", "tune ")
 """How commands begin that end by themselves, in seconds."""
 ELSEWHERE = {"docs/gradients.md", "docs/sensors.md", "README.md"}
 """Pages whose Python other tests run: test_gradients, test_reconstruction, test_docs."""
@@ -116,10 +116,6 @@ def test_the_short_commands_of_a_page_run(page, tmp_path):
     lines = [line for line in commands_of(page) if line.startswith(RUNS)]
     if any("pull.csv" in line for line in lines):
         measure(load_specimen(ROOT / "examples/cane.toml"), Experiment(duration=2.0)).write(tmp_path / "pull.csv")
-    if any("run.mcap" in line for line in lines):
-        world = World(tmp_path / "run.mcap")
-        world.run(0.2)
-        world.recorded()
     for line in lines:
         done = subprocess.run(
             [sys.executable, "-m", "vinesim", *shlex.split(line)], cwd=tmp_path, check=False,
