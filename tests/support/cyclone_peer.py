@@ -117,7 +117,8 @@ class Peer:
     def look(self) -> None:
         """Take what has come."""
         for one in self._publications.take(1000):
-            if one.topic_name.startswith("rt/"):  # mangled names: design.ros2.org/articles/topic_and_service_names
+            # no name of a publication that is gone; mangled ones: design.ros2.org/articles/topic_and_service_names
+            if (one.topic_name or "").startswith("rt/"):
                 self._topics[one.topic_name[2:]] = one.type_name.replace("::dds_::", "/").replace("::", "/").rstrip("_")
         for (topic, qos), reader in list(self._readers.items()):
             messages = [one for one in reader.take(1) if isinstance(one, IdlStruct)]
