@@ -4,6 +4,8 @@ There, what is left of a subtree is added to its parent's record and read again;
 none of these records stays in a cache, that is most of the time. Here a body's own inertia is made when its joint is
 eliminated, and what is left goes on in registers to the parent, which mostly is the body before; records serve branches
 alone. The functions of one body and the order of sums are the same, but where two branches or more leave one body.
+
+What a loop carries in registers Warp's adjoint does not restore: gradients go through the passes of the other module.
 """
 
 import warp as wp
