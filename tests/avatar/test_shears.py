@@ -1,4 +1,4 @@
-"""Shears in a hand: closing cuts what is between the blades and nothing else, and the person is told."""
+"""Shears in a hand: closing them cuts the bodies between the blades and no others; the page receives the result."""
 
 import dataclasses
 

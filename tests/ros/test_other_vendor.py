@@ -423,7 +423,7 @@ def test_a_peer_of_another_vendor_hears_every_topic(whole: CyclonePeer, topic: s
 
 @pytest.mark.slow
 def test_a_peer_of_another_vendor_moves_the_arm(whole: CyclonePeer) -> None:
-    """It commands a joint of the arm, and hears of it in /joint_states until it is there."""
+    """The peer publishes a trajectory for a joint of the arm and reads /joint_states until the joint is at its goal."""
     joint, goal = "arm_left_4_joint", 1.85
     place = VINEBOT.joints.index(joint)
     key = "/joint_states", "default"
