@@ -45,6 +45,19 @@ def shown():
         yield client, world
 
 
+@pytest.fixture
+def anna():
+    """A client whose person, at x = -2 m, moves as a page says, and the world of that page."""
+    with MemoryHub().bus("anna") as bus:
+        scene = load_scene("demo")
+        start = frames.pose(np.array([-2.0, 0.0, 0.0]))
+        person = TrackedHuman(start)
+        client = Client(scene, generate(scene), None, bus, name="anna", pose=start, source=person)
+        world = PageWorld(client, person)
+        client.post_step.append(lambda _: world.collect(OnePage()))
+        yield client, world
+
+
 def swing(client, tree):
     """Let one tree move."""
     client.physics.plants.wake(np.array([tree]))
@@ -153,60 +166,48 @@ def test_the_pages_of_a_spectator_move_its_eyes_and_nothing_else(shown):
     assert client.physics.state.bunch_attached.all()
 
 
-def test_only_the_first_page_moves_the_person():
-    with MemoryHub().bus("anna") as bus:
-        scene = load_scene("demo")
-        start = frames.pose(np.array([-2.0, 0.0, 0.0]))
-        person = TrackedHuman(start)
-        client = Client(scene, generate(scene), None, bus, name="anna", pose=start, source=person)
-        world = PageWorld(client, person)
-        client.post_step.append(lambda _: world.collect(OnePage()))
-        mine, other = ((-2.0, y, 1.6, 0.0, 0.0, 0.0, 1.0) for y in (0.1, 0.5))
-        world.take(0, PageInput(1, mine, TrackedPerson(mine)))
-        world.take(1, PageInput(1, other, TrackedPerson(other, intention=INTENTIONS[1])))
-        for _ in range(30):
+def test_only_the_first_page_moves_the_person(anna):
+    client, world = anna
+    mine, other = ((-2.0, y, 1.6, 0.0, 0.0, 0.0, 1.0) for y in (0.1, 0.5))
+    world.take(0, PageInput(1, mine, TrackedPerson(mine)))
+    world.take(1, PageInput(1, other, TrackedPerson(other, intention=INTENTIONS[1])))
+    for _ in range(30):
+        client.tick()
+    np.testing.assert_allclose(client.humans["anna"].pose.head[:3], mine[:3], atol=1e-9)
+    assert client.humans["anna"].intention == ""
+
+
+def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(anna):
+    client, world = anna
+    world.scene()
+    head, palm = (-2.0, 0.0, 1.6, 0.0, 0.0, 0.0, 1.0), (-1.5, -0.2, 1.2, 0.0, 0.0, 0.0, 1.0)
+
+    def shown(*, shears, closed):
+        """What a page is told after some steps, with the names of what it draws."""
+        hand = TrackedHand(palm, closed)
+        world.take(0, PageInput(1, head, TrackedPerson(head, right=hand, shears=(False, shears))))
+        for _ in range(5):
             client.tick()
-        np.testing.assert_allclose(client.humans["anna"].pose.head[:3], mine[:3], atol=1e-9)
-        assert client.humans["anna"].intention == ""
+        told, arrays = decode(world.state(-1)[1])
+        names = decode(world.rigid())[0]["names"]
+        return told, names, arrays["rigid_place"].reshape(-1, 3)
 
-
-def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut():
-    with MemoryHub().bus("anna") as bus:
-        scene = load_scene("demo")
-        start = frames.pose(np.array([-2.0, 0.0, 0.0]))
-        person = TrackedHuman(start)
-        client = Client(scene, generate(scene), None, bus, name="anna", pose=start, source=person)
-        world = PageWorld(client, person)
-        client.post_step.append(lambda _: world.collect(OnePage()))
-        world.scene()
-        head, palm = (-2.0, 0.0, 1.6, 0.0, 0.0, 0.0, 1.0), (-1.5, -0.2, 1.2, 0.0, 0.0, 0.0, 1.0)
-
-        def shown(*, shears, closed):
-            """What a page is told after some steps, with the names of what it draws."""
-            hand = TrackedHand(palm, closed)
-            world.take(0, PageInput(1, head, TrackedPerson(head, right=hand, shears=(False, shears))))
-            for _ in range(5):
-                client.tick()
-            told, arrays = decode(world.state(-1)[1])
-            names = decode(world.rigid())[0]["names"]
-            return told, names, arrays["rigid_place"].reshape(-1, 3)
-
-        parts = ["anna/right_shears_blade", "anna/right_shears_hook"]
-        told, names, _ = shown(shears=False, closed=False)
-        assert told["shears"] == {"closures": 0, "said": ""}
-        assert not set(parts) & set(names)
-        told, names, places = shown(shears=True, closed=False)
-        assert set(parts) <= set(names)
-        assert len(names) == len(places)
-        away = places[[names.index(part) for part in parts]] - places[names.index("anna/right_hand")]
-        np.testing.assert_allclose(np.linalg.norm(away, axis=1), np.hypot(0.1, 0.026), atol=1e-3)
-        told, _, _ = shown(shears=True, closed=True)
-        assert told["shears"]["closures"] == 1
-        assert "missed" in told["shears"]["said"]
-        assert "right" in told["haptics"]
-        told, names, _ = shown(shears=False, closed=False)
-        assert told["shears"]["closures"] == 1
-        assert not set(parts) & set(names)
+    parts = ["anna/right_shears_blade", "anna/right_shears_hook"]
+    told, names, _ = shown(shears=False, closed=False)
+    assert told["shears"] == {"closures": 0, "said": ""}
+    assert not set(parts) & set(names)
+    told, names, places = shown(shears=True, closed=False)
+    assert set(parts) <= set(names)
+    assert len(names) == len(places)
+    away = places[[names.index(part) for part in parts]] - places[names.index("anna/right_hand")]
+    np.testing.assert_allclose(np.linalg.norm(away, axis=1), np.hypot(0.1, 0.026), atol=1e-3)
+    told, _, _ = shown(shears=True, closed=True)
+    assert told["shears"]["closures"] == 1
+    assert "missed" in told["shears"]["said"]
+    assert "right" in told["haptics"]
+    told, names, _ = shown(shears=False, closed=False)
+    assert told["shears"]["closures"] == 1
+    assert not set(parts) & set(names)
 
 
 def test_a_flash_of_a_light_reloads_no_body_of_a_page():
