@@ -103,6 +103,7 @@ def test_a_part_of_a_recording_is_replayed(original):
     for _ in range(100):
         bus.play(TICK)
     assert bus.ended
+    assert bus.time == pytest.approx(original.start + start + 0.5, abs=1e-6)  # no later than the end
     times = [messages.time_of(payload) - original.start for _, payload in bus.poll()]
     assert start - 0.1 < min(times) < max(times) < start + 0.5
 

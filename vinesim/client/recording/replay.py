@@ -70,11 +70,10 @@ class Playhead:
         return self.time >= self.end
 
     def play(self, until: float) -> list[RecordedMessage]:
-        """All messages up to network time ``until`` [s] since the last call, in order."""
+        """All messages up to network time ``until`` [s], at most the end, since the last call, in order."""
         first = self._next
-        self.time = max(self.time, until)
-        last = min(self.time, self.end)
-        while self._next < len(self.recording.messages) and self.recording.messages[self._next].time <= last:
+        self.time = max(self.time, min(until, self.end))
+        while self._next < len(self.recording.messages) and self.recording.messages[self._next].time <= self.time:
             self._apply(self.recording.messages[self._next])
             self._next += 1
         return self.recording.messages[first : self._next]
