@@ -10,7 +10,10 @@ from vinesim.client.recording.bunch_trace import Rows
 
 
 def touch(path: pathlib.Path, traces: dict[str, Rows], title: str) -> None:
-    """Draw force [N] above and displacement [mm] below against the host's clock; one line a client. Writes a PNG."""
+    """Draw force [N] above and displacement [mm] below against the host's clock; one line a client. Writes a PNG.
+
+    Shaded is the time from when a client received the bunch from its owner until it did so for the last time.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -22,11 +25,15 @@ def touch(path: pathlib.Path, traces: dict[str, Rows], title: str) -> None:
         t = rows.clock - start
         force.plot(t, np.linalg.norm(rows.force, axis=1), style, label=name, linewidth=1.1)
         shift.plot(t, 1e3 * np.linalg.norm(rows.displacement, axis=1), style, label=name, linewidth=1.4)
+        followed = t[rows.is_remote]
+        if len(followed):
+            force.axvspan(followed[0], followed[-1], color="0.94", zorder=0, label=f"{name} is near: it is sent the bunch")
+            shift.axvspan(followed[0], followed[-1], color="0.94", zorder=0)
     force.set_ylabel("contact force [N]")
     shift.set_ylabel("bunch moved from rest [mm]")
     shift.set_xlabel("time [s]")
     force.set_title(title, fontsize=10)
-    force.legend(frameon=False)
+    force.legend(frameon=False, loc="upper left")
     for axes in (force, shift):
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
