@@ -34,7 +34,7 @@ class StepRecords:
         joints, transforms = len(self.joints), len(self.transforms)
         self.dtype = np.dtype(
             [
-                ("time", "f8"), ("has_state", "?"), ("contact_count", "i4"),
+                ("time", "f8"), ("has_state", "?"), ("has_body_sensors", "?"), ("contact_count", "i4"),
                 *((name, "f8", (joints,)) for name in (*_JOINT_ROWS, "desired", "desired_velocity")),
                 ("imu", "f8", (len(self._imus), 10)), ("wrench", "f8", (len(self._wrenches), 6)),
                 ("base_q", "f8", (7,)), ("base_qd", "f8", (6,)), ("odom_q", "f8", (7,)),
@@ -58,6 +58,7 @@ class StepRecords:
             record["desired"], record["desired_velocity"] = reference.position, reference.velocity
         else:
             record["desired"], record["desired_velocity"] = joints.position, joints.velocity
+        record["has_body_sensors"] = bool(sample.imus or sample.wrenches)  # they are read when they have subscribers
         for row, imu in zip(record["imu"], sample.imus, strict=False):
             row[:4], row[4:7], row[7:] = imu.orientation, imu.angular_velocity, imu.linear_acceleration
         for row, wrench in zip(record["wrench"], sample.wrenches, strict=False):
@@ -84,6 +85,7 @@ class StepRecords:
                     row["force"], float(row["distance"]))
             for row in rows
         )  # fmt: skip
+        read = slice(None if record["has_body_sensors"] else 0)
         now, deflection = joints.time, joints.effort / self.series_stiffness
         return RobotSample(
             self.actor, joints, record["base_q"], record["base_qd"], record["odom_q"], record["odom_qd"],
@@ -93,11 +95,11 @@ class StepRecords:
             ),
             wrenches=tuple(
                 Wrench(now, name, frame, row[:3], row[3:])
-                for (name, frame), row in zip(self._wrenches, record["wrench"], strict=True)
+                for (name, frame), row in zip(self._wrenches[read], record["wrench"][read], strict=True)
             ),
             imus=tuple(
                 Imu(now, name, frame, row[:4], row[4:7], row[7:])
-                for (name, frame), row in zip(self._imus, record["imu"], strict=True)
+                for (name, frame), row in zip(self._imus[read], record["imu"][read], strict=True)
             ),
             reference=JointReference(record["desired"], record["desired_velocity"]),
         )  # fmt: skip
