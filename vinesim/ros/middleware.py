@@ -88,8 +88,8 @@ def configure(*, large_messages: bool | None = None) -> None:
     if large_messages is not None:
         large = large_messages
     if discovers_this_machine_only() and not os.environ.get("ROS_STATIC_PEERS"):
-        # With LOCALHOST, rmw_fastrtps adds transports of its own to the profile's, shared memory among them. The profile
-        # limits discovery to this machine instead.
+        # With LOCALHOST, rmw_fastrtps adds transports of its own to the profile's, shared memory among them. The
+        # profile limits discovery to this machine instead.
         os.environ[RANGE_VARIABLE] = "SYSTEM_DEFAULT"
         os.environ.pop(LOCALHOST_VARIABLE, None)
         local = True
