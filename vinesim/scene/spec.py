@@ -144,6 +144,10 @@ class Imported(_Part, frozen=True, kw_only=True):
     z: float = 0.0
     """[m] Of its base above the ground."""
     yaw: float = 0.0
+    leaves: bool = True
+    """Whether its shoots carry leaves as the season says."""
+    tie_gap: Annotated[float, msgspec.Meta(ge=0.0)] = 0.02
+    """[m] Where a shoot passes a wire with at most this gap, it is tied to it; 0: nowhere."""
 
 
 class Scene(_Part, frozen=True, kw_only=True):
