@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import concurrent.futures
+import threading
 
 import psutil
 import pytest
 
 import vinesim
 from tests.support.sweep_tasks import die_at_three, die_once, fail_at_three, square, swing
-from tests.support.waiting import wait
+from tests.support.waiting import TIMEOUT, wait
 from vinesim.api.sweep import WorkerLost
 
 
@@ -21,6 +22,22 @@ def test_results_come_in_the_order_of_the_parameters():
 def test_another_executor_takes_the_tasks():
     with concurrent.futures.ThreadPoolExecutor(2) as pool:
         assert vinesim.sweep(square, range(4), executor=pool) == [0, 1, 4, 9]
+
+
+def test_an_error_on_an_executor_cancels_what_has_not_begun():
+    begun, ended = [], threading.Event()
+
+    def task(number):
+        begun.append(number)
+        if number == 0:
+            raise ValueError("zero is not taken")
+        ended.wait(TIMEOUT)
+
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        with pytest.raises(ValueError, match="zero is not taken"):
+            vinesim.sweep(task, range(5), executor=pool)
+        ended.set()
+    assert begun in ([0], [0, 1])  # its thread may have taken the next one
 
 
 def test_a_killed_process_loses_nothing(tmp_path, caplog):
