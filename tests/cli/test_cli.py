@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import pathlib
 import signal
 import socket
 import subprocess
@@ -17,6 +18,7 @@ from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
+CANE = str(pathlib.Path(__file__).parents[2] / "examples/cane.toml")
 TIMEOUT = 300.0
 """Limit for a command [s]; reached only by a failure."""
 
@@ -79,6 +81,20 @@ def test_an_invalid_scene_is_refused_with_file_field_and_remedy(tmp_path):
     done = vinesim("scene", "show", "bad.toml", cwd=tmp_path)
     assert_refused(done, 2, "bad.toml", "row_spacing")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.toml"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "option", "value", "said"),
+    [
+        ("push", "--amplitude", "0.005", "amplitude is 0.005, but belongs to shake, not to push; leave it out"),
+        ("pull-release", "--to", "4", "to_frequency is 4.0, but belongs to shake, not to pull-release; leave it out"),
+        ("shake", "--displacement", "0.2", "displacement is 0.2, but belongs to pull-release or push, not to shake"),
+        ("shake", "--force-noise", "0.01", "force_noise is 0.01; nothing pulls at a shaken plant, leave it out"),
+    ],
+)
+def test_an_option_of_another_kind_of_experiment_is_refused(kind, option, value, said, tmp_path):
+    assert_refused(vinesim("experiment", kind, "--model", CANE, option, value, cwd=tmp_path), 2, said)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_invalid_urdf_is_refused(tmp_path):

@@ -12,6 +12,7 @@ import pytest
 import typer.main
 
 from tests.client.test_recorder import World
+from tests.support.recorded_pick import record_a_pick
 from vinesim.cli import app
 from vinesim.cli.bench import BENCHES
 from vinesim.tune import Experiment, load_specimen, measure
@@ -19,7 +20,7 @@ from vinesim.tune import Experiment, load_specimen, measure
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.S | re.M)
-RUNS = ("certs ", "experiment ", "render ", "scene ", "tune ")
+RUNS = ("certs ", "experiment ", "render ", "replay run.mcap --out ", "replay run.mcap --ros", "scene ", "tune ")
 """How commands begin that end by themselves, in seconds."""
 ELSEWHERE = {"docs/gradients.md", "docs/sensors.md", "README.md"}
 """Pages whose Python other tests run: test_gradients, test_reconstruction, test_docs."""
@@ -103,12 +104,19 @@ def test_no_command_of_a_page_is_overlooked():
             assert not re.search(r"(^|[\s;&|/])vinesim\s", rest), f"{page.name}: {line}"
 
 
-def pages_that_run() -> list[pathlib.Path]:
-    return [page for page in PAGES if any(line.startswith(RUNS) for line in commands_of(page))]
+def pages_that_run() -> list:
+    """Parameters of a test: pages with short commands; those that publish topics need ROS."""
+    found = []
+    for page in PAGES:
+        lines = [line for line in commands_of(page) if line.startswith(RUNS)]
+        marks = [pytest.mark.ros] if any("--ros" in line for line in lines) else []
+        if lines:
+            found.append(pytest.param(page, id=str(page.relative_to(ROOT)), marks=marks))
+    return found
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", pages_that_run(), ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", pages_that_run())
 def test_the_short_commands_of_a_page_run(page, tmp_path):
     """In their order, in a folder that has the examples and the files that a reader brings along."""
     (tmp_path / "examples").symlink_to(ROOT / "examples")
@@ -116,6 +124,8 @@ def test_the_short_commands_of_a_page_run(page, tmp_path):
     lines = [line for line in commands_of(page) if line.startswith(RUNS)]
     if any("pull.csv" in line for line in lines):
         measure(load_specimen(ROOT / "examples/cane.toml"), Experiment(duration=2.0)).write(tmp_path / "pull.csv")
+    if any("run.mcap" in line for line in lines):
+        record_a_pick(tmp_path / "run.mcap")
     for line in lines:
         done = subprocess.run(
             [sys.executable, "-m", "vinesim", *shlex.split(line)], cwd=tmp_path, check=False,

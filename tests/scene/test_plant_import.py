@@ -82,7 +82,10 @@ def test_a_scene_with_an_imported_plant_is_in_equilibrium_as_drawn():
     ours = np.isin(model.body_tree, trees)
     assert len(trees) == 3
     assert np.isin(model.body_tree[model.bunch_body], trees).sum() == 3
-    assert model.body_mass[ours].sum() == pytest.approx(
+    assert np.isin(model.leaf_body, np.flatnonzero(ours)).sum() > 50
+    assert np.isin(model.tie_body, np.flatnonzero(ours)).sum() == 2
+    bare = msgspec.structs.replace(scene, imported=(msgspec.structs.replace(scene.imported[0], leaves=False),))
+    assert vinesim.generate(bare).body_mass[ours].sum() == pytest.approx(
         grown(load_imported_plant(scene.imported[0].file)).body_mass.sum()
     )
     simulation.wake()

@@ -21,8 +21,8 @@ PICKED_AT, LENGTH = 1.5, 2.5
 """[s] of the recording."""
 
 
-def replay_of_a_pick(path: pathlib.Path) -> tuple[PageReplay, int]:
-    """Write a recording and open it for pages; the bunch that is picked."""
+def record_a_pick(path: pathlib.Path) -> int:
+    """Write a recording of the scene ``demo``; the bunch that is picked."""
     hub, scene = MemoryHub(delay=0.004), load_scene("demo")
     clock = hub.bus("server", live=False)
     clock.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e6 + hub.time))
@@ -41,4 +41,10 @@ def replay_of_a_pick(path: pathlib.Path) -> tuple[PageReplay, int]:
             hub.advance(client.physics.dt)
             client.tick()
             recorder.step()
+    return bunch
+
+
+def replay_of_a_pick(path: pathlib.Path) -> tuple[PageReplay, int]:
+    """Write a recording and open it for pages; the bunch that is picked."""
+    bunch = record_a_pick(path)
     return make_page_replay(read_recording(path)), bunch

@@ -6,6 +6,8 @@ import os
 import pathlib
 import signal
 
+import vinesim
+
 
 def square(number: int) -> int:
     return number * number
@@ -25,6 +27,21 @@ def die_once(task: tuple[str, int]) -> int:
     if number == 3 and runs == 0:
         os.kill(os.getpid(), signal.SIGKILL)
     return number * number
+
+
+def swing(task: tuple[str, int]) -> bytes:
+    """The state of a cane after 100 steps, whose tip mass is the task's number. The first process that runs the third
+    task dies half-way. Every run notes its process in a folder."""
+    folder, number = pathlib.Path(task[0]), task[1]
+    runs = len(list(folder.glob(f"{number}-*")))
+    (folder / f"{number}-{runs}").write_text(str(os.getpid()))
+    simulation = vinesim.Simulation(vinesim.CaneBuilder(tip_mass=0.01 * (1 + number), damping_ratio=0.1))
+    simulation.step(50)
+    if number == 3 and runs == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    simulation.step(50)
+    state = simulation.state
+    return b"".join(getattr(state, name).tobytes() for name in state.array_fields())
 
 
 def die_at_three(number: int) -> int:

@@ -47,14 +47,19 @@ def sweep(
         parameters: seeds, or anything that can be pickled.
         workers: processes on this machine; one for each core unless given.
         executor: takes the tasks instead: anything with ``submit`` as :class:`concurrent.futures.Executor` has it, a
-            cluster's for example. Whether it repeats what a killed worker had is its own matter.
+            cluster's for example. Whether it repeats what a killed worker had is its own matter; Dask's does.
 
     Raises:
         WorkerLost: a worker died :data:`MAX_LOSSES` times with the same parameter.
     """
     tasks = list(parameters)
     if executor is not None:
-        return [future.result() for future in [executor.submit(function, task) for task in tasks]]
+        futures = [executor.submit(function, task) for task in tasks]
+        try:
+            return [future.result() for future in futures]
+        finally:
+            for future in futures:  # if one has raised, the others need not begin
+                future.cancel()
     if workers is not None and workers < 1:
         raise UsageError(f"workers is {workers}; give 1 or more")
     number = workers or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)

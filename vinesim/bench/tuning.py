@@ -86,7 +86,7 @@ def mujoco_track(case: Case, dt: float = 5e-4) -> Trajectory:
     e = case.experiment
     candidates = Candidates(specimen, dt=dt)
     row = np.zeros((1, len(COLUMNS)))
-    row[0, 5:] = pull_for(candidates, e.displacement, math.radians(e.angle))
+    row[0, 5:] = pull_for(candidates, e.number("displacement"), math.radians(e.angle))
     pose = candidates.held_pose(row)[0]
     model = assemble([build_tree(specimen)])
     # the ball joint takes the bending stiffness for all axes; the cane bends in one plane and does not twist
@@ -101,8 +101,8 @@ def mujoco_track(case: Case, dt: float = 5e-4) -> Trajectory:
         body = data.body(f"plant/{len(model.body_mass) - 1}")
         return body.xpos + body.xmat.reshape(3, 3) @ tip
 
-    clock = np.arange(math.ceil((e.hold + e.seconds) * e.rate)) / e.rate
-    ticks = int(e.seconds / dt) + 2
+    clock = np.arange(math.ceil((e.hold + e.number("duration")) * e.rate)) / e.rate
+    ticks = int(e.number("duration") / dt) + 2
     path = np.empty((ticks, 3))
     for tick in range(ticks):
         path[tick] = position()

@@ -47,6 +47,8 @@ class Layout(_Part, frozen=True, kw_only=True):
     vine_spacing: Length
     height: Length
     """Of the wire net (tendone) or of the fruiting wire (vsp)."""
+    missing: tuple[tuple[int, int], ...] = ()
+    """Row and place in the row, from 0, of vines that are not there: room for imported ones. Their poles stand."""
 
 
 class Season(_Part, frozen=True, kw_only=True):
@@ -142,6 +144,10 @@ class Imported(_Part, frozen=True, kw_only=True):
     z: float = 0.0
     """[m] Of its base above the ground."""
     yaw: float = 0.0
+    leaves: bool = True
+    """Whether its shoots carry leaves as the season says."""
+    tie_gap: Annotated[float, msgspec.Meta(ge=0.0)] = 0.02
+    """[m] Where a shoot passes a wire with at most this gap, it is tied to it; 0: nowhere."""
 
 
 class Scene(_Part, frozen=True, kw_only=True):
@@ -193,6 +199,12 @@ def _find_error(scene: Scene) -> str:
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
         return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
+    rows, vines = scene.layout.rows, scene.layout.vines
+    for i, (row, place) in enumerate(scene.layout.missing):
+        if not (0 <= row < rows and 0 <= place < vines):
+            return f"layout.missing[{i}] is [{row}, {place}]; give [0 to {rows - 1}, 0 to {vines - 1}]: row, place"
+    if len(set(scene.layout.missing)) == rows * vines:
+        return f"layout.missing names all {rows * vines} vines; leave one"
     known = [v.name for v in VARIETIES]
     for i, name in enumerate(scene.fruit.varieties):
         if name not in known:

@@ -13,8 +13,9 @@ from vinesim.scene.spec import Scene
 def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
     """Rows of (quantity, value, unit)."""
     counts, layout = model.counts(), scene.layout
-    grown = layout.rows * layout.vines
-    ground, vines = grown * layout.row_spacing * layout.vine_spacing, grown + len(scene.imported)
+    places = layout.rows * layout.vines
+    ground = places * layout.row_spacing * layout.vine_spacing
+    vines = places - len(set(layout.missing)) + len(scene.imported)
     bent = np.linalg.norm(frames.log(model.joint_settled.astype(float)), axis=1)
     memory = sum(getattr(model, name).nbytes for name in model.array_fields())
     fruit = model.body_mass[model.bunch_body].sum()

@@ -23,29 +23,33 @@ TRUTH_SEGMENTS = 64
 """Its segments, at least."""
 MAX_SHARE = 0.3
 """[1] Fastest shaking over the pictures a second: samples of a faster one do not tell the acceleration between them."""
-KINDS = {"pull-release": 3.0, "push": 3.0, "shake": 10.0}
-"""The kinds of experiments, and how long one is unless said otherwise [s]."""
+KINDS = {
+    "pull-release": {"displacement": 0.1, "duration": 3.0},
+    "push": {"displacement": 0.1, "duration": 3.0},
+    "shake": {"amplitude": 0.005, "from_frequency": 1.0, "to_frequency": 8.0, "duration": 10.0},
+}
+"""The kinds of experiments; the numbers in which they differ, and what these are unless given (m, Hz, s)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """How a plant is moved and watched."""
+    """How a plant is moved and watched; a number that is None is as :data:`KINDS` says, see :meth:`number`."""
 
     kind: str = "pull-release"
     """``pull-release``: held aside, then let go at :attr:`hold`. ``push``: at rest, then a steady force on its tip.
     ``shake``: at rest, then its base is moved to and fro in a sine sweep."""
-    displacement: float = 0.1
+    displacement: float | None = None
     """[m] Of the tip, by the pull; by the push, once it has come to rest."""
     angle: float = 90.0
     """[deg] Direction of the force or of the shaking about the base's x axis: 0 along its y, 90 along its z axis."""
-    amplitude: float = 0.005
+    amplitude: float | None = None
     """[m] Of the base that is shaken."""
-    from_frequency: float = 1.0
+    from_frequency: float | None = None
     """[Hz] At the start of the sweep."""
-    to_frequency: float = 8.0
+    to_frequency: float | None = None
     """[Hz] At its end."""
     duration: float | None = None
-    """[s] After the force begins or ends; of the sweep. None: as :data:`KINDS` says."""
+    """[s] After the force begins or ends; of the sweep."""
     hold: float = 0.2
     """[s] Before that."""
     rate: float = 30.0
@@ -59,21 +63,27 @@ class Experiment:
     """Which axes of the world are tracked."""
     seed: int = 0
 
-    @property
-    def seconds(self) -> float:
-        """[s] The duration, given or not."""
-        return KINDS[self.kind] if self.duration is None else self.duration
+    def number(self, name: str) -> float:
+        """One of the numbers that its kind has, given or not."""
+        given = getattr(self, name)
+        return KINDS[self.kind][name] if given is None else given
 
     def check(self) -> None:
-        """:class:`UsageError` naming the first number that is out of range."""
+        """:class:`UsageError` naming the first number that is out of range, or that another kind has."""
         if self.kind not in KINDS:
             raise UsageError(f"no experiment {self.kind!r}; there are: {', '.join(KINDS)}")
+        for name in sorted({name for numbers in KINDS.values() for name in numbers} - KINDS[self.kind].keys()):
+            if (value := getattr(self, name)) is not None:
+                others = " or ".join(kind for kind, numbers in KINDS.items() if name in numbers)
+                raise UsageError(
+                    f"{name} is {value}, but belongs to {others}, not to {self.kind}; leave it out, or take {others}"
+                )
         for name in ("displacement", "amplitude", "from_frequency", "to_frequency", "duration", "rate"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
                 raise UsageError(f"{name} is {value}; give a finite number above 0")
         if self.kind == "shake":
-            fastest = max(self.from_frequency, self.to_frequency)
+            fastest = max(self.number("from_frequency"), self.number("to_frequency"))
             if fastest > MAX_SHARE * self.rate:
                 raise UsageError(
                     f"the sweep reaches {fastest:g} Hz, of which {self.rate:g} pictures a second see too little; give "
@@ -99,8 +109,8 @@ def measure(specimen: Specimen, experiment: Experiment = Experiment(), *, exact:
     row[0, 3:5] = specimen.bow
     shaking = _sweep(candidates, e) if e.kind == "shake" else None
     if shaking is None:
-        row[0, 5:] = pull_for(candidates, e.displacement, math.radians(e.angle))
-    time = np.arange(math.ceil((e.hold + e.seconds) * e.rate - 1e-9)) / e.rate
+        row[0, 5:] = pull_for(candidates, e.number("displacement"), math.radians(e.angle))
+    time = np.arange(math.ceil((e.hold + e.number("duration")) * e.rate - 1e-9)) / e.rate
     after = time if shaking else np.maximum(time - e.hold, 0.0)
     tick = np.floor(after / TRUTH_STEP + 1e-6).astype(int)
     ticks, index = np.unique(tick, return_inverse=True)
@@ -129,7 +139,8 @@ def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:
     e, angle = experiment, math.radians(experiment.angle)
     direction = np.array([math.cos(angle), math.sin(angle)]) @ candidates.pull_axes()
     direction[np.abs(direction) < 1e-12] = 0.0  # no column of rounding errors
-    return Sweep(direction, e.amplitude, (e.from_frequency, e.to_frequency), e.hold, e.seconds)
+    frequencies = e.number("from_frequency"), e.number("to_frequency")
+    return Sweep(direction, e.number("amplitude"), frequencies, e.hold, e.number("duration"))
 
 
 def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.ndarray:

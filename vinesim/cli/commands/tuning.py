@@ -67,13 +67,19 @@ def experiment(
     ],
     model: Model,
     out: Annotated[pathlib.Path | None, typer.Option(help="Write the track as CSV; KIND.csv unless given.")] = None,
-    displacement: Annotated[float, typer.Option(help="Of the tip, by the pull or the push [m].")] = 0.1,
+    displacement: Annotated[
+        float | None, typer.Option(help="Of the tip, by the pull or the push [m]; 0.1 unless given.")
+    ] = None,
     angle: Annotated[
         float, typer.Option(help="Of force or shaking about the base's x axis, from its y axis [deg].")
     ] = 90.0,
-    amplitude: Annotated[float, typer.Option(help="Of the base that is shaken [m].")] = 0.005,
-    from_frequency: Annotated[float, typer.Option("--from", help="Of the sweep, at its start [Hz].")] = 1.0,
-    to_frequency: Annotated[float, typer.Option("--to", help="Of the sweep, at its end [Hz].")] = 8.0,
+    amplitude: Annotated[float | None, typer.Option(help="Of the base that is shaken [m]; 0.005 unless given.")] = None,
+    from_frequency: Annotated[
+        float | None, typer.Option("--from", help="Of the sweep, at its start [Hz]; 1 unless given.")
+    ] = None,
+    to_frequency: Annotated[
+        float | None, typer.Option("--to", help="Of the sweep, at its end [Hz]; 8 unless given.")
+    ] = None,
     duration: Annotated[
         float | None, typer.Option(help="Of the track after the release, or of the sweep [s]; 3, or 10 of a sweep.")
     ] = None,

@@ -32,7 +32,9 @@ class FixedStructure:
 def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStructure:
     layout, tendone = scene.layout, scene.training == "tendone"
     row, place = (a.ravel() for a in np.mgrid[0 : layout.rows, 0 : layout.vines])
-    foot = np.stack([place * layout.vine_spacing, row * layout.row_spacing, 0.0 * row], -1)
+    pole = np.stack([place * layout.vine_spacing, row * layout.row_spacing, 0.0 * row], -1)
+    there = [one not in layout.missing for one in zip(row.tolist(), place.tolist(), strict=True)]
+    row, place, foot = row[there], place[there], pole[there]
     rngs = [
         np.random.default_rng(np.random.SeedSequence(scene.seed, spawn_key=(int(r), int(p))))
         for r, p in zip(row, place, strict=True)
@@ -69,8 +71,8 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
             shear_modulus=builder.shear_modulus(parameters.cane.woody_modulus.value),
         ),
         _cone_chains(
-            foot[:, None] + np.array([[0, 0, -0.3], [0, 0, layout.height + (0.1 if tendone else 1.15)]]),
-            np.array([radius, radius]), Organ.POLE, np.arange(count),
+            pole[:, None] + np.array([[0, 0, -0.3], [0, 0, layout.height + (0.1 if tendone else 1.15)]]),
+            np.array([radius, radius]), Organ.POLE, np.arange(len(pole)),
         ),
         *_wires(scene, parameters),
     ]  # fmt: skip

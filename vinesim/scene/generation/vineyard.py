@@ -26,6 +26,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
+from vinesim.scene.plant_import.ties import tie_to_wires
 from vinesim.scene.plant_import.wood import build_model, join_models
 from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Scene, Sun, Wind
@@ -74,10 +75,15 @@ def _generate(scene: Scene, parameters: VineParameters) -> Model:
     model = _assemble_model(scene, parameters, structure, shoots, bodies, leaf, ties)
     model = builder.solve_rest_pose(model).check()
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
-    for number, one in enumerate(scene.imported, len(structure.foot)):
+    for number, one in enumerate(scene.imported):
         pose = frames.pose(np.array([one.x, one.y, one.z]), frames.from_yaw(one.yaw))
-        plant = build_model(load_imported_plant(one.file), pose, number, parameters, variety)
-        model = join_models(model, plant)
+        # vines have streams of two numbers
+        rng = np.random.default_rng(np.random.SeedSequence(scene.seed, spawn_key=(0, 0, number)))
+        plant = build_model(
+            load_imported_plant(one.file), pose, len(structure.foot) + number, parameters, variety,
+            (scene, rng) if one.leaves else None,
+        )  # fmt: skip
+        model = join_models(model, tie_to_wires(plant, model, one.tie_gap, parameters.trellis))
     return model
 
 

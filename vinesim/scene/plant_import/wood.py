@@ -11,15 +11,17 @@ from vinesim.scene import berries, builder
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.plant_import.foliage import add_leaves, find_nodes
 from vinesim.scene.plant_import.imported_plant import ImportedPlant, Wood
 from vinesim.scene.plant_parameters import VineParameters
+from vinesim.scene.spec import Scene
 
 _SHORT = 0.3
 """[piece] Wood between two forks that is shorter than this becomes part of the fork."""
 _PEDUNCLE_SEGMENTS = 2
 _OFFSETS = {
     "tree_first": "body", "tree_piece": "fixed", "body_tree": "tree", "body_parent": "body", "bunch_body": "body",
-    "bunch_cluster": "body", "tie_body": "body", "tie_wire": "fixed", "leaf_body": "body",
+    "bunch_cluster": "body", "tie_body": "body", "leaf_body": "body",
 }  # fmt: skip
 """Fields of a model that count something, and what; negative ones mean none."""
 
@@ -36,17 +38,21 @@ class _Points:
     """[node] m, length of the wood from the base."""
 
 
-def build_model(plant: ImportedPlant, pose: np.ndarray, vine: int, parameters: VineParameters, variety: int) -> Model:
+def build_model(
+    plant: ImportedPlant, pose: np.ndarray, vine: int, parameters: VineParameters, variety: int,
+    leaves: tuple[Scene, np.random.Generator] | None = None,
+) -> Model:  # fmt: skip
     """The plant at a pose [7]: its trees, and the old wood that they stand on.
 
-    ``parameters`` give peduncles and bunches, which are of ``variety``.
+    ``parameters`` give peduncles and bunches, which are of ``variety``; bare unless ``leaves`` gives the scene whose
+    season and training its leaves have, and their random numbers.
     """
     points = _cut(plant)
     old = _old_wood(points, plant.wood)
     place = frames.pose(pose[:3] + frames.rotate(pose[3:], points.position))[:, :3]
     trees = []
     for root in np.flatnonzero((points.parent >= 0) & ~old & _on(old, points.parent)):
-        trees.append(_tree(plant.wood, points, place, int(root), vine, parameters, variety))
+        trees.append(_tree(plant.wood, points, place, int(root), vine, parameters, variety, leaves))
     wood = np.flatnonzero(old & (points.parent >= 0))
     trunk = _main_axis(points, old)
     model = builder.assemble(
@@ -59,7 +65,8 @@ def build_model(plant: ImportedPlant, pose: np.ndarray, vine: int, parameters: V
 
 
 def join_models(first: Model, second: Model) -> Model:
-    """Both vineyards as one; trees, bodies and bunches of the second are numbered behind those of the first."""
+    """Both as one; trees, bodies and bunches of the second are numbered behind those of the first, to whose wires its
+    ties are bound."""
     counts, joined = first.counts(), {}
     for name in Model.array_fields():
         a, b = getattr(first, name), getattr(second, name)
@@ -136,8 +143,9 @@ def _cut(plant: ImportedPlant) -> _Points:
 
 
 def _tree(
-    wood: Wood, points: _Points, place: np.ndarray, root: int, vine: int, parameters: VineParameters, variety: int
-) -> TreeBuilder:
+    wood: Wood, points: _Points, place: np.ndarray, root: int, vine: int, parameters: VineParameters, variety: int,
+    leaves: tuple[Scene, np.random.Generator] | None,
+) -> TreeBuilder:  # fmt: skip
     """The tree whose first piece ends at ``root``."""
     below = int(points.parent[root])
     turns = {below: frames.from_x_axis(place[root] - place[below])}
@@ -168,6 +176,11 @@ def _tree(
         tree.bodies[body]["drag"] = wood.drag.value * sum(radius) * float(np.linalg.norm(along))
         if points.bunch[node] > 0.0:
             _hang(tree, body, turn, float(points.bunch[node]), parameters, variety)
+    if leaves is not None:
+        nodes = find_nodes(points.parent, points.radius, way, inside, parameters.cane)
+        body = np.array([bodies[piece] for piece in nodes.piece.tolist()], int)
+        turn = np.array([turns[piece] for piece in nodes.piece.tolist()], float).reshape(-1, 4)
+        add_leaves(tree, nodes, body, turn, leaves[0], parameters.leaf, leaves[1])
     return tree
 
 

@@ -1,0 +1,87 @@
+"""Ties of imported shoots: where one passes a wire closely, a spring binds it to the wire."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.plant_parameters import Trellis
+
+TIE_SPACING = 0.2
+"""[m] Ties of one tree to one wire are at least this far apart. GUESSED: as a cane is bound along its wire."""
+
+
+def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) -> Model:
+    """The plant, which has no ties yet, with ties to wires of the vineyard that its shoots pass as drawn.
+
+    A piece that grows on old wood is not tied: it hardly moves there.
+
+    Args:
+        plant: in the world.
+        vineyard: :attr:`Model.tie_wire` counts its pieces.
+        gap: largest gap between the surfaces of shoot and wire [m].
+        trellis: stiffness and damping of a tie.
+    """
+    canes = np.flatnonzero((plant.body_organ == int(Organ.CANE)) & (plant.body_parent >= 0))
+    if not len(canes) or gap <= 0.0:
+        return plant
+    pose = plant.forward_kinematics(plant.joint_settled)[canes]
+    start, length = pose[:, :3], plant.body_length[canes].astype(float)
+    way = frames.rotate(pose[:, 3:], length[:, None] * [1.0, 0.0, 0.0])
+    radius = plant.body_radius[canes].astype(float)
+    wires = _wires_near(vineyard, np.concatenate([start, start + way]), gap + float(radius.max()))
+    wire_start = vineyard.fixed_start[wires].astype(float)
+    share, distance = _nearest(start, way, wire_start, vineyard.fixed_end[wires] - wire_start)
+    thick = radius[:, :1] + share * (radius[:, 1:] - radius[:, :1])
+    apart = distance - thick - vineyard.fixed_radius[wires].max(1)
+    near, wire = np.nonzero(apart <= gap)
+    tied: dict[tuple[int, int], list[np.ndarray]] = {}
+    rows = []
+    # the closest first; to 0.1 mm, so that no rounding error chooses among pieces that run along a wire
+    for i in np.argsort(apart[near, wire].round(4), kind="stable").tolist():
+        cane, line = near[i], wires[wire[i]]
+        anchor = start[cane] + share[cane, wire[i]] * way[cane]
+        others = tied.setdefault((int(plant.body_tree[canes[cane]]), int(vineyard.fixed_index[line])), [])
+        if all(np.linalg.norm(anchor - other) >= TIE_SPACING for other in others):
+            others.append(anchor)
+            rows.append((int(canes[cane]), int(line), float(share[cane, wire[i]] * length[cane]), *anchor.tolist()))
+    body, line, along, *anchor = np.array(sorted(rows), float).reshape(-1, 6).T
+    ties = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, box=0, tie=len(rows))
+    ties.tie_body[:], ties.tie_wire[:] = body, line
+    ties.tie_point[:, 0], ties.tie_anchor[:] = along, np.stack(anchor, 1)
+    ties.tie_stiffness[:] = trellis.tie_stiffness.value
+    ties.tie_damping[:] = trellis.tie_damping.value * trellis.tie_stiffness.value
+    fields = {name: getattr(ties, name) for name in Model.array_fields() if name.startswith("tie_")}
+    return dataclasses.replace(plant, **fields).check()
+
+
+def _wires_near(vineyard: Model, points: np.ndarray, reach: float) -> np.ndarray:
+    """Pieces of wire [k] whose box is within ``reach`` [m] of the box around ``points`` [p, 3]."""
+    ends = np.stack([vineyard.fixed_start, vineyard.fixed_end]).astype(float)
+    thick = reach + vineyard.fixed_radius.max(1, initial=0.0)[:, None]
+    near = (ends.min(0) <= points.max(0) + thick) & (ends.max(0) >= points.min(0) - thick)
+    return np.flatnonzero((vineyard.fixed_organ == int(Organ.WIRE)) & near.all(1))
+
+
+def _nearest(
+    start: np.ndarray, way: np.ndarray, wire_start: np.ndarray, wire_way: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where pieces [k] are nearest to wires [w]: share of the piece [k, w], and the distance there [k, w] m.
+
+    Segments from ``start`` [k, 3] along ``way`` [k, 3], and from ``wire_start`` [w, 3] along ``wire_way`` [w, 3]
+    (Ericson 2005, Real-Time Collision Detection, 5.1.9).
+    """
+    a, e = (way * way).sum(1)[:, None], (wire_way * wire_way).sum(1)
+    off = start[:, None] - wire_start
+    b, c, f = way @ wire_way.T, (way[:, None] * off).sum(-1), (wire_way * off).sum(-1)
+    cross = a * e - b * b
+    parallel = cross <= 1e-9 * a * e
+    share = np.where(parallel, 0.5, np.clip((b * f - c * e) / np.where(parallel, 1.0, cross), 0.0, 1.0))
+    along = np.clip((b * share + f) / e, 0.0, 1.0)
+    share = np.clip((b * along - c) / a, 0.0, 1.0)
+    apart = off + share[..., None] * way[:, None] - along[..., None] * wire_way
+    return share, np.linalg.norm(apart, axis=-1)
