@@ -20,13 +20,15 @@ AHEAD = frames.from_yaw(0.5 * np.pi)
 
 
 class Person:
-    """Eva, who stands before a point with the mouth of the shears in her right hand there."""
+    """Eva, who stands before a point with the mouth of the shears in her right hand there; the left one elsewhere."""
 
-    def __init__(self, physics: Physics, point: np.ndarray, **hand: bool) -> None:
+    def __init__(self, physics: Physics, point: np.ndarray, left: np.ndarray | None = None, **hand: bool) -> None:
         root = frames.pose(np.array([point[0] + 0.2, point[1] - 0.6, 0.0]), AHEAD)
-        palm = point - frames.rotate(AHEAD, appearance.load_shears().mouth[:3])
+        points = {"right": point} | ({} if left is None else {"left": left})
+        mouth = frames.rotate(AHEAD, appearance.load_shears().mouth[:3])
+        palms = {side: frames.pose(there - mouth, AHEAD) for side, there in points.items()}
         self.physics = physics
-        self.pose = dataclasses.replace(standing_pose(root), right=frames.pose(palm, AHEAD), **hand)
+        self.pose = dataclasses.replace(standing_pose(root), **palms, **hand)
         self.human = LocalHuman(physics, HumanSpec("eva", 1, self.pose), lambda _: self.pose)
 
     def run(self, steps: int, **hand: bool) -> list:
@@ -58,7 +60,7 @@ def test_shears_cut_the_peduncle_between_their_blades_when_the_hand_closes():
     assert (detachment.bunch, detachment.body, detachment.cause, detachment.actor) == (0, body, "blade", "eva")
     (closure,) = eva.human.closures
     assert (closure.side, closure.bunches, closure.canes) == ("right", 1, 0)
-    assert closure.sentence == "The shears cut 1 bunch."
+    assert closure.sentence == "The shears in the right hand cut 1 bunch."
     assert ("right", *CUT_PULSE) in [(one.hand, one.amplitude, one.duration) for one in eva.human.haptics]
     assert eva.run(20) == [], "a hand that stays closed has closed once"
     assert physics.hand("eva", "right").held is None, "a hand with shears holds nothing"
@@ -73,6 +75,31 @@ def test_shears_beside_the_wood_miss_and_may_close_again():
     assert eva.run(5, right_closed=False) == []
     assert len(eva.run(5, right_closed=True)) == 1
     assert physics.state.bunch_attached.all()
+
+
+@pytest.mark.parametrize("bunches", [(1, 1), (1, 0), (0, 1)], ids=["both", "left", "right"])
+def test_two_hands_that_close_in_one_step_report_each_its_own_cut(bunches):
+    """Two peduncles 0.4 m apart; a hand that is to cut nothing closes 5 cm beside its own."""
+    model = assemble([cane((x, 1.0, 2.0), bunch=0.5, heading=-0.5 * np.pi) for x in (0.0, 0.4)])
+    physics = Physics(model)
+    stalks = physics.snapshot().body_q[model.bunch_body - 1, :3].astype(float) - np.array([0.0, 0.0, 0.02])
+    stalks[:, 0] += [0.0 if cuts else 0.05 for cuts in bunches]
+    eva = Person(physics, stalks[1], stalks[0], left_shears=True, right_shears=True)
+    assert eva.run(5) == []
+    closures = eva.run(1, left_closed=True, right_closed=True)
+    assert [(one.side, one.bunches, one.canes) for one in closures] == [
+        ("left", bunches[0], 0), ("right", bunches[1], 0)
+    ]  # fmt: skip
+    assert physics.state.bunch_attached.tolist() == [not cuts for cuts in bunches]
+
+
+def test_shears_that_close_on_a_peduncle_without_its_bunch_say_so():
+    physics, _, eva = at_peduncle()
+    physics.pick(0)
+    (closure,) = eva.run(1, right_closed=True)
+    assert not closure.has_cut
+    assert 0.0 < closure.resistance < closure.force
+    assert "was picked before" in closure.sentence
 
 
 def test_a_hand_that_closes_without_shears_cuts_nothing():

@@ -182,10 +182,10 @@ def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(a
     world.scene()
     head, palm = (-2.0, 0.0, 1.6, 0.0, 0.0, 0.0, 1.0), (-1.5, -0.2, 1.2, 0.0, 0.0, 0.0, 1.0)
 
-    def shown(*, shears, closed):
+    def shown(*, shears, closed, left=False):
         """What a page is told after some steps, with the names of what it draws."""
-        hand = TrackedHand(palm, closed)
-        world.take(0, PageInput(1, head, TrackedPerson(head, right=hand, shears=(False, shears))))
+        hand, other = TrackedHand(palm, closed), TrackedHand((-1.5, 0.2, *palm[2:]), closed) if left else None
+        world.take(0, PageInput(1, head, TrackedPerson(head, other, hand, shears=(left, shears))))
         for _ in range(5):
             client.tick()
         told, arrays = decode(world.state(-1)[1])
@@ -194,7 +194,7 @@ def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(a
 
     parts = ["anna/right_shears_blade", "anna/right_shears_hook"]
     told, names, _ = shown(shears=False, closed=False)
-    assert told["shears"] == {"closures": 0, "said": ""}
+    assert told["shears"] == {"closures": 0, "said": []}
     assert not set(parts) & set(names)
     told, names, places = shown(shears=True, closed=False)
     assert set(parts) <= set(names)
@@ -203,10 +203,15 @@ def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(a
     np.testing.assert_allclose(np.linalg.norm(away, axis=1), np.hypot(0.1, 0.026), atol=1e-3)
     told, _, _ = shown(shears=True, closed=True)
     assert told["shears"]["closures"] == 1
-    assert "missed" in told["shears"]["said"]
+    (said,) = told["shears"]["said"]
+    assert "right hand missed" in said
     assert "right" in told["haptics"]
+    shown(shears=True, closed=False, left=True)
+    told, _, _ = shown(shears=True, closed=True, left=True)
+    assert told["shears"]["closures"] == 3
+    assert [said.split()[4] for said in told["shears"]["said"]] == ["right", "left", "right"], "both at once: both told"
     told, names, _ = shown(shears=False, closed=False)
-    assert told["shears"]["closures"] == 1
+    assert told["shears"]["closures"] == 3
     assert not set(parts) & set(names)
 
 

@@ -33,14 +33,17 @@ class Closure:
     @property
     def sentence(self) -> str:
         """What a user is told."""
+        shears = f"The shears in the {self.side} hand"
         if self.has_cut:
             pieces = (("bunch", "bunches", self.bunches), ("cane", "canes", self.canes))
             cut = [f"{count} {one if count == 1 else several}" for one, several, count in pieces if count]
-            return f"The shears cut {' and '.join(cut)}."
-        if self.resistance > 0.0:
+            return f"{shears} cut {' and '.join(cut)}."
+        if self.resistance > self.force:
             takes, gives = f"{self.resistance:,.0f} N", f"{self.force:,.0f} N"
-            return f"The shears are too weak: this wood takes {takes}, they close with {gives}."
-        return "The shears missed: there was no wood between the blades."
+            return f"{shears} are too weak: this wood takes {takes}, they close with {gives}."
+        if self.resistance > 0.0:
+            return f"{shears} cut nothing: the bunch of this peduncle was picked before."
+        return f"{shears} missed: there was no wood between the blades."
 
     def haptic(self, actor: str) -> Haptic:
         """The vibration by which the person feels it."""
@@ -53,7 +56,7 @@ class Shears:
     def __init__(self, physics: Physics, name: str, side: str) -> None:
         """``name`` of a person in ``physics``, ``side`` of the hand."""
         model = appearance.load_shears()
-        self.physics, self.name, self.side = physics, name, side
+        self.side = side
         self._force = model.force
         self._blade = physics.add_blade(name, f"{side}_hand", model.mouth, model.mouth_half)
         self._closures = 0
@@ -72,6 +75,5 @@ class Shears:
         if blade.closures == self._closures:
             return None
         self._closures = blade.closures
-        cut = [one for one in self.physics.detachments if (one.cause, one.actor) == ("blade", self.name)]
-        bunches = sum(one.bunch >= 0 for one in cut) if blade.cut else 0
-        return Closure(self.side, bunches, len(cut) - bunches if blade.cut else 0, blade.resistance, self._force)
+        bunches = sum(one.bunch >= 0 for one in blade.detachments)
+        return Closure(self.side, bunches, len(blade.detachments) - bunches, blade.resistance, self._force)

@@ -31,6 +31,8 @@ NEAR = 3.0
 """An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
 MAX_PRIMITIVES = 400_000
 """Of plants and ground that a page loads: 32 MB."""
+MAX_SENTENCES = 4
+"""Closures of shears that a state tells of: pages learn of both hands, and of those between two states."""
 _TURN_STEPS = 32767
 """Steps of a component of a quaternion from 0 to 1."""
 
@@ -92,8 +94,8 @@ class PageWorld:
         """Of the person's left and right hand [2, 7]: as simulated, and the controllers that they followed."""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
-        self._closures, self._closure_sentence = 0, ""
-        """How often the person's shears have closed, and what they cut when they closed last."""
+        self._shears: dict[str, Any] = {"closures": 0, "said": []}
+        """How often the person's shears have closed, and what they cut the last times; replaced, never changed."""
 
     # ------------------------------------------------------------------ in the client's loop
 
@@ -128,8 +130,10 @@ class PageWorld:
             for haptic in human.haptics:
                 if (before := self._haptics.get(haptic.hand)) is None or before.amplitude < haptic.amplitude:
                     self._haptics[haptic.hand] = haptic
-            for closure in human.closures:
-                self._closures, self._closure_sentence = self._closures + 1, closure.sentence
+            if human.closures:
+                said = [*self._shears["said"], *(closure.sentence for closure in human.closures)]
+                closures = self._shears["closures"] + len(human.closures)
+                self._shears = {"closures": closures, "said": said[-MAX_SENTENCES:]}
         if self._sway is None or not server.has_viewers:
             return
         self._contacts = physics.contacts if self._overlay_pages else ()
@@ -206,7 +210,7 @@ class PageWorld:
         if self._replay is not None:
             shown["replay"] = self._replay.status()
         if self._person is not None:
-            shown["shears"] = {"closures": self._closures, "said": self._closure_sentence}
+            shown["shears"] = self._shears
         state = array_message.encode(
             {
                 **shown, "tick": tick, "time": snapshot.time, "rigid": self._rigid_version,

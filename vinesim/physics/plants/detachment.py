@@ -41,8 +41,8 @@ class Blade:
     closing: bool = False
     closures: int = 0
     """How often it has closed so far."""
-    cut: int = 0
-    """Pieces that it cut when it closed last."""
+    detachments: tuple[Detachment, ...] = ()
+    """What it cut off its plant when it closed last."""
     resistance: float = 0.0
     """[N] Cutting force of the strongest piece that was in its mouth then, cut or not; 0 if there was none."""
 
@@ -133,19 +133,19 @@ class DetachmentMonitor:
         self.plants.forward_kinematics()
         for blade in self.blades:
             if blade.closing:
-                blade.closing, blade.cut, blade.resistance = False, 0, 0.0
+                blade.closing, blade.resistance, before = False, 0.0, len(self._detachments)
                 blade.closures += 1
                 for body in self._bodies_in_mouth(blade).tolist():
                     resistance = self.cutting_force(body)
                     blade.resistance = max(blade.resistance, resistance)
                     if resistance > blade.force:
                         continue
-                    blade.cut += 1
                     bunch = int(self._bunch_of[body])
                     if bunch < 0:
                         self.cut(body, "blade", blade.actor)
                     elif self.plants.state.bunch_attached[bunch]:
                         self.pick(bunch, "blade", blade.actor)
+                blade.detachments = tuple(self._detachments[before:])
 
     def cutting_force(self, body: int) -> float:
         """[N] that it takes to cut a piece of wood across: its cross-section at the root end times its strength."""

@@ -3,12 +3,15 @@
 const SHOWN_FOR = 12_000; // ms
 const FIRST = 5; // pictures in which a browser compiles shaders, however long that takes
 const TIMES = 5; // an absence is so many times the usual time between two pictures, for slow machines
-/** Show a sentence for a while, or until it is clicked. */
+
+/** Show a sentence for a while, or until it is clicked; one that is shown already comes once more. */
 export function say(text, { stays = false } = {}) {
+  const notices = document.getElementById("notices");
+  for (const shown of [...notices.children]) if (shown.textContent === text) shown.remove();
   const notice = document.createElement("div");
   notice.className = "panel";
   notice.textContent = text;
-  document.getElementById("notices").append(notice);
+  notices.append(notice);
   notice.addEventListener("click", () => notice.remove());
   if (!stays) setTimeout(() => notice.remove(), SHOWN_FOR);
 }

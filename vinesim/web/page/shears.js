@@ -21,19 +21,19 @@ export class Shears {
   toggle(side) {
     if (!this.isOffered || !(side in this.taken)) return;
     this.taken[side] = !this.taken[side];
-    this.button.classList.toggle("on", this.taken.right);
     this.button.setAttribute("aria-pressed", String(this.taken.right));
   }
 
   /** Whether the left and the right hand have them, for the page's message. */
   get inHands() { return SIDES.map((side) => this.taken[side]); }
 
-  /** A state has come: say what the shears have cut if they have closed since the last one. */
+  /** A state has come: say what the shears have cut each time that they have closed since the last one. */
   take({ shears }) {
     if (!shears) return;
-    if (this.closures !== null && shears.closures > this.closures) {
-      this.told.push(shears.said);
-      say(shears.said);
+    const since = this.closures === null ? 0 : Math.max(shears.closures - this.closures, 0);
+    for (const said of since ? shears.said.slice(-since) : []) {
+      this.told.push(said);
+      say(said);
     }
     this.closures = shears.closures;
   }
