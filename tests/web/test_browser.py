@@ -248,6 +248,14 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
         assert page.errors == []
 
 
+def pinch(page, place):
+    """Open the emulated right hand, move it to a place [3] m above the floor, and pinch there."""
+    for script in ("updatePinchValue(0)", f"position.set{place}", "updatePinchValue(1)"):
+        page.run(f"device.hands.right.{script}, 0")
+        drawn = page.run("vinesim.frames")
+        wait(lambda drawn=drawn: page.run("vinesim.frames") > drawn + 1, "two pictures later")
+
+
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
 def test_a_headset_moves_head_and_hands(page):
@@ -301,6 +309,13 @@ def test_a_headset_moves_head_and_hands(page):
         wait(lambda: not human.pose.right_closed and max(human.pose.right_fingers) < 0.6, "it is open")
         page.run("device.hands.right.updatePinchValue(1), 0")
         wait(lambda: human.pose.right_closed, "a pinch takes hold")
+        hip, ahead_of_her = (0.25, 0.85, -0.2), (0.2, 1.3, -0.5)
+        pinch(page, hip)
+        wait(lambda: human.pose.right_shears, "a pinch at the hip takes the shears into that hand")
+        pinch(page, ahead_of_her)
+        wait(lambda: page.run("vinesim.viewer.shears.told.length") == 1, "a pinch elsewhere closes them, the first not")
+        pinch(page, hip)
+        wait(lambda: not human.pose.right_shears, "a pinch at the hip puts them away")
         page.run("device.primaryInputMode = 'controller', 0")
         page.run("device.controllers.left.updateAxes('thumbstick', 0, -1), 0")
         wait(lambda: np.dot(human.pose.head[:2] - head[:2], ahead) > 0.5, "the stick walks ahead")

@@ -14,11 +14,13 @@ const FINGERS = ["thumb", "index-finger", "middle-finger", "ring-finger", "pinky
 const FULL_BEND = [1.6, 3.8, 3.8, 3.8, 3.8];
 const STICK = 3; // number of the button under a stick, by the standard mapping of WebXR
 const PINCH = 0.025, CLOSED = 0.5; // m between the tips, mean bend of the fingers
+/** A palm is at the hip so far below the eyes and so far beside them [m]. GUESSED. */
+const HIP = { above: 0.45, below: 0.9, beside: 0.3 };
 
 export class Headset {
   /**
    * `rig` carries camera and controllers: the floor that the person stands on. `poses`: finger poses of the buttons a
-   * and b; `press(side)` is called when a stick is pressed.
+   * and b; `press(side)` is called when a stick is pressed, or a hand without a controller closes at the hip.
    */
   constructor(renderer, rig, camera, poses, press) {
     this.poses = poses;
@@ -34,6 +36,8 @@ export class Headset {
     this.rays = [0, 1].map((k) => rig.add(renderer.xr.getController(k)) && renderer.xr.getController(k));
     this.sources = [null, null];
     this.tracked = [null, null]; // hands without a controller, on the rig
+    this.closed = [false, false]; // as last seen
+    this.closedAtHip = [false, false]; // and not opened since
     this.rays.forEach((ray, k) => {
       ray.addEventListener("connected", (event) => { this.sources[k] = event.data; });
       ray.addEventListener("disconnected", () => { this.sources[k] = null; });
@@ -56,6 +60,7 @@ export class Headset {
     const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
     if (viewer) this.viewer.fromArray(viewer.transform.matrix);
     this.tracked = this.sources.map((source) => this.trackHand(frame, source?.hand));
+    this.tracked.forEach((seen, k) => { if (seen !== null) this.takeFromHip(seen, k); });
     this.sources.forEach((source, k) => {
       const pressed = source?.gamepad?.buttons?.[STICK]?.pressed ?? false;
       if (pressed && !this.pressed[k]) this.press(source.handedness);
@@ -97,6 +102,18 @@ export class Headset {
     const matrix = new THREE.Matrix4().fromArray(palm.matrix);
     matrix.setPosition(new THREE.Vector3().setFromMatrixPosition(matrix).lerp(knuckle, 0.5));
     return { matrix, fingers, closed };
+  }
+
+  /** A hand without a controller that closes at the hip presses; until it opens again it holds nothing. */
+  takeFromHip(seen, k) {
+    const way = new THREE.Vector3().setFromMatrixPosition(seen.matrix)
+      .sub(new THREE.Vector3().setFromMatrixPosition(this.viewer));
+    const isAtHip = -way.y > HIP.above && -way.y < HIP.below && Math.hypot(way.x, way.z) < HIP.beside;
+    const closes = seen.closed && !this.closed[k];
+    this.closed[k] = seen.closed;
+    if (closes && isAtHip) this.press(this.sources[k].handedness);
+    this.closedAtHip[k] = seen.closed && (this.closedAtHip[k] || (closes && isAtHip));
+    if (this.closedAtHip[k]) seen.closed = false;
   }
 
   /** Cosine and sine of where the head looks, about the world's z. */
