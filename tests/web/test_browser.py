@@ -277,7 +277,7 @@ def test_a_headset_moves_head_and_hands(page):
         ahead, right = np.array([np.cos(0.5), np.sin(0.5)]), np.array([np.sin(0.5), -np.cos(0.5)])
         head = np.array([*(start[:2] + 0.2 * ahead + 0.1 * right), 1.5])
         wait(lambda: np.linalg.norm(human.pose.head[:3] - head) < 5e-3, "the head is where the headset is")
-        assert frames.to_yaw(human.pose.head[3:]) == pytest.approx(0.5, abs=1e-3)
+        wait(lambda: frames.to_yaw(human.pose.head[3:]) == pytest.approx(0.5, abs=1e-3), "it looks where that looks")
         palm = np.array([*(start[:2] + 0.6 * ahead + 0.3 * right), 1.2])
         wait(lambda: np.linalg.norm(human.pose.right[:3] - palm) < 0.1, "the hand is where its controller is")
         fingers = frames.rotate(human.pose.right[3:], np.array([1.0, 0.0, 0.0]))
