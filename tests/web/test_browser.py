@@ -282,6 +282,12 @@ def test_a_headset_moves_head_and_hands(page):
         wait(lambda: np.linalg.norm(human.pose.right[:3] - palm) < 0.1, "the hand is where its controller is")
         fingers = frames.rotate(human.pose.right[3:], np.array([1.0, 0.0, 0.0]))
         assert np.dot(fingers[:2], ahead) > 0.7, "it points ahead"
+        for button, fingers in (
+            ("Value('trigger', 1)", (0.0, 1.0, 0.0, 0.0, 0.0)), ("Touch('a-button', true)", (1.0, 1.0, 0.0, 0.0, 0.0)),
+            ("Value('trigger', 0)", (1.0, 0.0, 0.0, 0.0, 0.0)), ("Touch('a-button', false)", (0.0,) * 5),
+        ):  # fmt: skip
+            page.run(f"device.controllers.right.updateButton{button}, 0")
+            wait(lambda fingers=fingers: human.pose.right_fingers == fingers, f"fingers {fingers} by {button}")
         page.run("device.controllers.right.updateButtonValue('squeeze', 1), 0")
         wait(lambda: human.pose.right_closed, "the hand closes")
         assert human.pose.right_fingers[2:] == (1.0, 1.0, 1.0)
