@@ -223,9 +223,18 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
         page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
         page.run(f"vinesim.viewer.hand.distance = {ahead - shears.mouth[0]}, 0")
         drawn = "vinesim.viewer.world.names.includes('viewer/right_shears_blade')"
+        page.run("window.load = fetch, window.fetch = (path) => new Promise((go) => { goOn = () => go(load(path)); }), 0")
         press(page, "KeyT")
-        wait(lambda: live.client.humans["viewer"].pose.right_shears, "the hand has the shears")
+        wait(lambda: page.run("'goOn' in window"), "the page asks for the shapes of the shears")
+        states = page.run("vinesim.states")
+        wait(lambda: page.run("vinesim.states") > states + 2, "states with other rows come before the shapes")
+        names, places = page.run("""(({ world }) => [world.names, world.names.map((_, k) =>
+          world.place(world.bodies + 1 + k).toArray())])(vinesim.viewer)""")
+        there = dict(zip([one.name for one in physics.rigid.visuals()], physics.rigid.visual_q(), strict=True))
+        np.testing.assert_allclose(places, [there[name][:3] for name in names], atol=0.15, err_msg="fingers close")
+        page.run("goOn(), window.fetch = load, 0")
         wait(lambda: page.run(drawn), "the page draws them")
+        assert live.client.humans["viewer"].pose.right_shears
         assert page.run("document.querySelector('#tools button').getAttribute('aria-pressed')") == "true"
         press(page, "KeyR")
 

@@ -52,6 +52,7 @@ class Viewer {
     const { replay } = world.header;
     this.timeline = replay === null ? null : new Timeline(replay, (wish) => this.ask(wish));
     this.newest = null;
+    this.shapes = null; // of the rigid bodies as loaded, until a state comes that has the same ones
     this.heardAt = performance.now();
     this.pace = new Pace(LONGEST);
     this.followed = -1;
@@ -108,6 +109,7 @@ class Viewer {
       if (header.scene !== scene || header.seed !== seed || header.person !== person) location.reload();
       this.world.rest(header.arrays.poses);
       this.world.rigidVersion = 0;
+      this.shapes = null;
       this.connect();
     } catch (failure) {
       if (failure.status === 403) fail("This address is no longer valid: open the one that the client has printed now.");
@@ -120,19 +122,31 @@ class Viewer {
     this.world.apply(state);
     this.newest = state;
     if (this.timeline?.show(state.replay)) this.absence.expect();
-    this.lateHands.take(state);
+    this.takeRigid(state);
     this.overlays.take(state);
     this.pace.earn(state.time);
     this.heardAt = performance.now();
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
     this.headset.pulse(state.haptics);
     this.shears.take(state);
-    if (state.rigid !== this.world.rigidVersion && !this.loading) {
+    if (state.rigid > Math.max(this.world.rigidVersion, this.shapes?.version ?? 0) && !this.loading) {
       this.loading = true;
-      const header = await load("rigid").catch(() => null); // a client that goes meanwhile is waited for by the socket
+      this.shapes = await load("rigid").catch(() => null); // a client that goes meanwhile is waited for by the socket
       this.loading = false;
-      if (header !== null) this.world.setRigid(header);
+      this.takeRigid(this.latest);
     }
+  }
+
+  /** Rigid bodies by a state: shapes and poses change together, for the same row may be another body's before. */
+  takeRigid(state) {
+    this.latest = state;
+    if (this.shapes !== null && this.shapes.version === state.rigid) {
+      this.world.setRigid(this.shapes);
+      this.shapes = null;
+    }
+    if (state.rigid !== this.world.rigidVersion) return;
+    this.world.applyRigid(state.arrays);
+    this.lateHands.take(state);
   }
 
   /** What the user wants of the recording, at once: none of its states may follow while it pauses. */

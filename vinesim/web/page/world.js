@@ -155,17 +155,22 @@ export class World {
     this.listedAt = null;
   }
 
-  /** Poses of what has moved, and what was picked. */
+  /** Poses of the trees that have moved, and what was picked. */
   apply(state) {
-    const { body, place, turn, rigid_place, rigid_turn, picked } = state.arrays;
+    const { body, place, turn, picked } = state.arrays;
     for (let k = 0; k < body.length; ++k) this.pose(body[k], place, turn, k);
-    for (let k = 0; k < rigid_place.length / 3; ++k) this.pose(this.bodies + 1 + k, rigid_place, rigid_turn, k);
     this.poses.needsUpdate = true;
-    if (state.rigid === this.rigidVersion) this.light(state.arrays);
     if (picked.length !== this.picked.size || picked.some((bunch) => !this.picked.has(bunch))) {
       this.picked = new Set(picked);
       this.listedAt = null;
     }
+  }
+
+  /** Poses and lights of robots, people, boxes and picked bunches, numbered as in `setRigid`. */
+  applyRigid({ rigid_place, rigid_turn, ...arrays }) {
+    for (let k = 0; k < rigid_place.length / 3; ++k) this.pose(this.bodies + 1 + k, rigid_place, rigid_turn, k);
+    this.poses.needsUpdate = true;
+    this.light(arrays);
   }
 
   /** Colours of indicator lights; only rows that have changed go to the graphics card. */
