@@ -250,13 +250,15 @@ class Viewer {
     this.rig.updateMatrixWorld();
   }
 
-  /** Names above the actors. */
+  /** Names above the other actors. */
   label(actors) {
     const names = element("names"), there = new Set();
     if (!names.hidden)
       for (const { name, carrier } of actors) {
-        const point = this.world.place(carrier);
-        point.z = Math.max(point.z, 0) + 1.9;
+        if (name === this.world.header.person) continue;
+        const head = this.world.names.indexOf(`${name}/head`), isPerson = head >= 0;
+        const point = this.world.place(isPerson ? this.world.bodies + 1 + head : carrier);
+        point.z = isPerson ? point.z + 0.35 : Math.max(point.z, 0) + 1.9;
         point.applyEuler(this.world.group.rotation).project(this.camera);
         if (point.z > 1) continue;
         there.add(name);
