@@ -31,6 +31,22 @@ VICTORY = (1.0, 0.0, 0.0, 1.0, 1.0)
 HEADSET = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
 """Put there by tools/build_page."""
 
+MISPLACED = """
+(() => {
+  const shown = [...document.querySelectorAll(".panel, #enter")].filter((one) => one.getClientRects().length);
+  const boxes = shown.map((one) => [one.id || one.className, one.getBoundingClientRect()]);
+  const wrong = boxes.filter(([, { left, top, right, bottom }]) =>
+    left < 0 || top < 0 || right > innerWidth || bottom > innerHeight).map(([name]) => `${name} is cut off`);
+  boxes.forEach(([name, a], k) => {
+    for (const [other, b] of boxes.slice(k + 1))
+      if (a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom)
+        wrong.push(`${name} is over ${other}`);
+  });
+  return wrong;
+})()
+"""
+CONTROLS = "[...document.querySelectorAll('button, input, select')].filter((one) => one.getClientRects().length)"
+
 
 class LiveVineyard:
     """A client that steps in a thread of its own, as in its process: a spectator or a person before a bunch."""
@@ -223,7 +239,9 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
         page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
         page.run(f"vinesim.viewer.hand.distance = {ahead - shears.mouth[0]}, 0")
         drawn = "vinesim.viewer.world.names.includes('viewer/right_shears_blade')"
-        page.run("window.load = fetch, window.fetch = (path) => new Promise((go) => { goOn = () => go(load(path)); }), 0")
+        page.run(
+            "window.load = fetch, window.fetch = (path) => new Promise((go) => { goOn = () => go(load(path)); }), 0"
+        )
         press(page, "KeyT")
         wait(lambda: page.run("'goOn' in window"), "the page asks for the shapes of the shears")
         states = page.run("vinesim.states")
@@ -393,6 +411,28 @@ def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile(page):
         ):
             page.open(live.server.address, before=lacks)
             wait(lambda said=said: said in (page.run(missing) or ""), said)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+@pytest.mark.parametrize("is_person", [False, True], ids=["spectator", "person"])
+def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_person):
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=is_person) as live:
+        open_page(page, live)
+        told = {"closures": 2, "said": ["The shears in the left hand missed: there was no wood.", "They cut 1 bunch."]}
+        page.run(f"(({{ shears }}) => {{ shears.closures = 0; shears.take({{ shears: {told} }}); }})(vinesim.viewer)")
+        page.run("document.getElementById('timeline').hidden = false")
+        for width, height in ((1280, 720), (1024, 600), (844, 390), (390, 844)):
+            page.resize(width, height)
+            wait(lambda width=width: page.run("innerWidth") == width, "the page has this size")
+            assert page.run(MISPLACED) == [], (width, height)
+        controls = page.run(f"{CONTROLS}.length")
+        assert controls == 8 + is_person * len(INTENTIONS), "hear, speak, overlays, timeline; shears and intentions"
+        for _ in range(controls):
+            page.call("Input.dispatchKeyEvent", type="keyDown", key="Tab", code="Tab", windowsVirtualKeyCode=9)
+            page.run("document.activeElement.isReached = true")
+        assert page.run(f"{CONTROLS}.filter((one) => !one.isReached).map((one) => one.outerHTML)") == []
+        assert page.errors == []
 
 
 @pytest.mark.slow

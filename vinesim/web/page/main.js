@@ -75,10 +75,11 @@ class Viewer {
     for (const intention of intentions) {
       const button = panel.appendChild(document.createElement("button"));
       button.textContent = intention;
+      button.setAttribute("aria-pressed", "false");
       button.addEventListener("click", () => {
         this.intention = this.intention === intention ? "" : intention;
         for (const other of panel.querySelectorAll("button"))
-          other.classList.toggle("on", other.textContent === this.intention);
+          other.setAttribute("aria-pressed", String(other.textContent === this.intention));
         button.blur(); // keys go on to move
       });
     }

@@ -29,7 +29,6 @@ export class Overlays {
 
   toggle(name) {
     if (!this.shown.delete(name)) this.shown.add(name);
-    this.buttons[name].classList.toggle("on", this.shown.has(name));
     this.buttons[name].setAttribute("aria-pressed", String(this.shown.has(name)));
   }
 

@@ -36,7 +36,6 @@ export class Timeline {
     const jumped = this.status !== undefined && status.jumps !== this.status.jumps;
     this.status = status;
     this.button.textContent = status.paused ? "play" : "pause";
-    this.button.setAttribute("aria-pressed", String(status.paused));
     this.slider.max = status.length;
     if (!this.isHeld) {
       this.slider.value = status.position;

@@ -139,31 +139,15 @@ export class Voice {
     this.counts = { sent: 0, received: 0 };
     this.context = this.socket = this.microphone = null;
     this.opus = false;
-    this.panel = document.body.appendChild(document.createElement("div"));
-    this.panel.className = "panel";
-    this.panel.id = "sound";
-    Object.assign(this.panel.style, { top: "10px", left: "50%", transform: "translateX(-50%)", maxWidth: "60vw" });
-    this.hearing = this.button("hear", () => this.toggleHearing());
-    this.speaking = this.button("speak (M)", () => this.toggleSpeaking());
-    this.text = this.panel.appendChild(document.createElement("span"));
-    this.text.setAttribute("role", "status");
+    const panel = document.getElementById("sound");
+    [this.hearing, this.speaking] = panel.querySelectorAll("button");
+    this.text = panel.querySelector("span");
+    this.hearing.addEventListener("click", () => { this.toggleHearing(); this.hearing.blur(); });
+    this.speaking.addEventListener("click", () => { this.toggleSpeaking(); this.speaking.blur(); });
     addEventListener("keydown", (event) => { if (event.code === "KeyM" && !event.repeat) this.toggleSpeaking(); });
   }
 
-  button(text, act) {
-    const button = this.panel.appendChild(document.createElement("button"));
-    button.textContent = text;
-    Object.assign(button.style, { marginRight: "6px", border: "0", borderRadius: "3px", padding: "2px 8px",
-      background: "#fff3", color: "#fff", font: "inherit", cursor: "pointer" });
-    button.setAttribute("aria-pressed", "false");
-    button.addEventListener("click", () => { act(); button.blur(); });
-    return button;
-  }
-
-  press(button, isOn) {
-    button.setAttribute("aria-pressed", String(isOn));
-    button.style.background = isOn ? "#2f7d4f" : "#fff3";
-  }
+  press(button, isOn) { button.setAttribute("aria-pressed", String(isOn)); }
 
   say(text) { this.text.textContent = text; }
 
