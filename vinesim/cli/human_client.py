@@ -85,7 +85,7 @@ def pull_repeatedly(
 def pick_and_give(
     human: ScriptedHuman, physics: Physics, bunch: int, box: int, indicate: Callable[[str], None] = lambda _: None
 ) -> Iterator[None]:
-    """Pick a bunch in reach, wait until a box was lifted and holds still, lay the bunch into it, and step back.
+    """Pick a bunch in reach, lower it, wait until a box was lifted and holds still, lay the bunch into it, step back.
 
     ``indicate`` is told what the person intends.
     """
@@ -104,6 +104,7 @@ def pick_and_give(
     yield from human.wait(0.5)
     yield from human.back(lambda: not physics.state.bunch_attached[bunch])
     yield from human.back(lambda: False, 0.3)
+    yield from human.withdraw("right")  # else it hits the bunches that hang on the way, and tears them off
     indicate("hand over")
     low, before, still = box_place()[2], box_place(), 0.0
     while still < HOLDS_STILL:
