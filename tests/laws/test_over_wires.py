@@ -88,6 +88,16 @@ def test_a_cut_cane_that_falls_on_wires_lies_on_them_and_sleeps(drop: float) -> 
     assert abs(height - places[0][1]).max() < 0.05
 
 
+@pytest.mark.parametrize("above", [5e-3, 2e-3, 1e-3])
+def test_a_cane_that_grew_about_a_wire_hangs_on_it_when_it_is_cut(above: float) -> None:
+    """Drawn with its axis just above those of two wires, to which it is not tied: they bear it all the same."""
+    places = [(0.2, 1.0 - above), (0.8, 1.0 - above)]
+    physics = Physics(assemble([cane((0.0, 0.0, 1.0))], **wires(places)))
+    physics.cut(0)
+    force = force_at_rest(physics, places)
+    np.testing.assert_allclose(force, [0.0, 0.0, weight(physics)], atol=0.01 * weight(physics))
+
+
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.7, 0.0, -0.7)])
 @pytest.mark.parametrize("held", [0, 15])
 def test_a_cut_cane_that_a_hand_drags_over_a_wire_does_not_pass_it(direction: tuple, held: int) -> None:

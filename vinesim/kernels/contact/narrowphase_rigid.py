@@ -1,6 +1,7 @@
 """Narrowphase of plants and rigid geoms: where a tree's capsules touch them, or may touch them before the step ends.
 
-Two shapes that overlap while all plants rest as generated, or are that near, are in contact only from there on.
+Two shapes that overlap while all plants rest as generated, or are that near, are in contact only from there on. What was
+cut off may overlap less by as much as it has moved since: what grew about a wire does not fall through it.
 """
 
 import warp as wp
@@ -11,6 +12,7 @@ from vinesim.kernels.contact.body_motion import (
     to_double,
     velocity_at,
     velocity_product_acceleration,
+    was_cut_off,
 )
 from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
@@ -227,7 +229,13 @@ def rigid_candidate(
             to_double(capsules.rest_start[s]),
             to_double(capsules.rest_end[s]),
         )
-        candidate.gap = candidate.gap - wp.min(at_rest[3] - radius - parameters.margin, zero)
+        overlap = -wp.min(at_rest[3] - radius - parameters.margin, zero)
+        if overlap > zero and was_cut_off(body, bodies.parent, bodies.is_cut):
+            moved = wp.max(
+                wp.length(a - to_double(capsules.rest_start[s])), wp.length(b - to_double(capsules.rest_end[s]))
+            )
+            overlap = wp.max(radius - at_rest[3] - moved, zero)
+        candidate.gap = candidate.gap + overlap
         free = velocity_at(bodies.q[body], bodies.qd_free[body], candidate.point)
         soonest = wp.min(wp.min(approach, dt * wp.dot(candidate.normal, free)), zero)
         candidate.exists = candidate.gap + soonest < parameters.static_margin
