@@ -98,6 +98,23 @@ def test_a_cane_that_grew_about_a_wire_hangs_on_it_when_it_is_cut(above: float) 
     np.testing.assert_allclose(force, [0.0, 0.0, weight(physics)], atol=0.01 * weight(physics))
 
 
+def test_what_was_cut_off_above_its_tie_bears_on_the_wire() -> None:
+    """Tied to a wire by the end of its eighth piece and cut behind it: the ninth no longer passes through the wire."""
+    place = (0.53, 0.99)
+    model = assemble(
+        [cane((0.0, 0.0, 1.0))], tie_body=[7], tie_point=[[0.0625, 0.0, 0.0]], tie_anchor=[[0.5, 0.0, 1.0]],
+        tie_stiffness=[2000.0], tie_damping=[20.0], tie_wire=[0], fixed_tension=[900.0], **wires([place]),
+    )  # fmt: skip
+    physics = Physics(model)
+    physics.cut(8)
+    crossings, touched = Crossings(physics, place, first=8), set()
+    for _ in range(60):
+        physics.step()
+        assert crossings.count == 0
+        touched |= {c.body for c in physics.contacts if c.link == "fixed/0"}
+    assert touched == {8}
+
+
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.7, 0.0, -0.7)])
 @pytest.mark.parametrize("held", [0, 15])
 def test_a_cut_cane_that_a_hand_drags_over_a_wire_does_not_pass_it(direction: tuple, held: int) -> None:

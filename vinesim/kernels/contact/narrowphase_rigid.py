@@ -277,11 +277,17 @@ def contact_ends(
 
 
 @wp.func
-def is_tied(capsule: int, geom: int, capsules: Capsules):
-    """Whether a tie holds a capsule at a geom, by MuJoCo's number: then they do not collide."""
+def is_tied(capsule: int, geom: int, capsules: Capsules, is_cut: wp.array(dtype=wp.bool)):
+    """Whether a tie holds a capsule, or a neighbour that it was not cut off, at a geom, by MuJoCo's number: then they
+    do not collide."""
     tied = bool(False)
     for k in range(capsules.tied_geom.shape[1]):
-        tied = tied or capsules.tied_geom[capsule, k] == geom
+        if capsules.tied_geom[capsule, k] == geom:
+            joint = capsules.tied_joint[capsule, k]
+            if joint < 0:
+                tied = True
+            elif not is_cut[joint]:
+                tied = True
     return tied
 
 
@@ -326,7 +332,7 @@ def add_pair(
     if wp.dot(between, between) < limit * limit:
         rotation = rigid.xmat[geoms.id[g]]
         nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
-        if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules):
+        if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules, bodies.is_cut):
             ends = contact_ends(is_round, parameters, geoms, hulls, g, rotation, center, a, b, nearest)
             pair = Pair()
             pair.capsule = s
