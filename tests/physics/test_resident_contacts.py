@@ -1,5 +1,8 @@
 """Contacts of a batch of trees that stay on a device: as those of a whole scene, step by step."""
 
+from typing import Any
+
+import mujoco
 import numpy as np
 import pytest
 
@@ -8,8 +11,10 @@ from vinesim.physics.contact.resident_contacts import ResidentContacts
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.device_buffers import DeviceBuffers
+from vinesim.physics.rigid import static_world
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.materials import Material
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
@@ -46,16 +51,15 @@ def resident(model: Model, interleave: int = 0, **options: int) -> tuple[Articul
     return plants, ResidentContacts(plants, PARAMETERS, **options)
 
 
-@pytest.mark.parametrize("interleave", [0, 2])
-def test_trees_move_and_press_as_in_a_scene(interleave: int) -> None:
-    model = canes(3)
+def assert_as_in_a_scene(model: Model, interleave: int) -> set[str]:
+    """Three trees move and press as in :class:`Physics`, for 60 steps; returns the geoms that they pressed on."""
     scene = Physics(model, parameters=PARAMETERS)
     scene.contact_solver.plant_plant_contacts = False
     scene.state.joint_qd[:] = moving(model).joint_qd
     scene.wake(np.arange(3))
     plants, contacts = resident(model, interleave)
     plants.upload()
-    most, sweeps = 0, []
+    most, sweeps, pressed = 0, [], set()
     for _ in range(4):
         for _ in range(15):
             scene.step()
@@ -70,10 +74,51 @@ def test_trees_move_and_press_as_in_a_scene(interleave: int) -> None:
         force = np.zeros((3, 3))
         for contact in scene.contacts:
             force[model.body_tree[contact.body]] -= contact.force
+            pressed.add(contact.link)
         np.testing.assert_allclose(contacts.force, force, atol=0.02 * np.abs(force).max() + 1e-3)
     assert most >= 3
     assert np.mean(sweeps) < 6.0, "canes slide along the bars: Newton steps find where to"
     assert contacts.dropped == 0
+    return pressed
+
+
+@pytest.mark.parametrize("interleave", [0, 2])
+def test_trees_move_and_press_as_in_a_scene(interleave: int) -> None:
+    assert assert_as_in_a_scene(canes(3), interleave) == {"fixed/0", "fixed/1"}
+
+
+WEDGE = [
+    (x, y, z) for y in (-0.5, 0.5) for x, z in ((-0.04, -0.03), (0.04, -0.03), (-0.04, 0.0), (0.04, 0.0), (0.0, 0.03))
+]
+ANGULAR_GEOMS = {
+    "box": {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.03, 0.5, 0.02], "euler": [0.0, 0.3, 0.0]},
+    "cylinder": {"type": mujoco.mjtGeom.mjGEOM_CYLINDER, "size": [0.02, 0.5, 0.0], "euler": [1.5, 0.0, 0.0]},
+    "ellipsoid": {"type": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "size": [0.05, 0.5, 0.02]},
+    "wedge": {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": "wedge"},
+}
+
+
+@pytest.mark.parametrize("interleave", [0, 2])
+@pytest.mark.parametrize("name", ANGULAR_GEOMS)
+def test_trees_press_on_a_geom_that_is_not_round_as_in_a_scene(
+    name: str, interleave: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Round geoms have a kernel of their own, any other takes the general one. No scene file has such a static geom: it
+    is added to MuJoCo's world, for both."""
+    build = static_world.build_static_world
+
+    def build_with_angular_geom(*args: Any) -> mujoco.MjSpec:
+        spec = build(*args)
+        if name == "wedge":
+            spec.add_mesh(name=name, uservert=np.array(WEDGE, float).ravel().tolist())
+        spec.worldbody.add_geom(
+            name=name, pos=[0.45, 0.0, 1.96], contype=static_world.FIXED, conaffinity=0,
+            userdata=static_world.geom_user(Material.BARK), **ANGULAR_GEOMS[name],
+        )  # fmt: skip
+        return spec
+
+    monkeypatch.setattr(static_world, "build_static_world", build_with_angular_geom)
+    assert name in assert_as_in_a_scene(canes(3), interleave)
 
 
 def test_contacts_beyond_the_slots_are_counted() -> None:

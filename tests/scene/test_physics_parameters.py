@@ -1,5 +1,6 @@
 """Parameters of the physics: each documented, each in its range, read from a scene file and used."""
 
+import collections
 import inspect
 import pathlib
 import re
@@ -14,19 +15,48 @@ from vinesim.physics.parameters import ParameterError, PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene import physics_parameters
 from vinesim.scene.data_files import data_dir
+from vinesim.scene.materials import pair_numbers
 from vinesim.scene.spec import SceneError, load_scene
 
 FIELDS = [field.name for field in msgspec.structs.fields(PhysicsParameters)]
 
 
-@pytest.mark.parametrize("name", FIELDS)
-def test_every_parameter_has_a_unit_and_a_source(name):
+def annotation_and_description(name):
     text = inspect.getsource(physics_parameters)
     ((annotation, description),) = re.findall(rf'^    {name}: (.*) = .*\n    """((?:.|\n)*?)"""', text, re.MULTILINE)
+    return annotation, description
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_every_parameter_has_a_unit_and_a_source(name):
+    annotation, description = annotation_and_description(name)
     if annotation.startswith(("Count", "Capacity")) or "int" in annotation or annotation == "bool":
         return
     assert re.match(r"\[[^]]+\] ", description), f"{name}: give its unit first"
     assert re.search(r"\b(READ|DERIVED|TUNED|GUESSED)\b", description), f"{name}: give its source"
+
+
+def test_the_page_counts_the_guesses_among_them_and_among_pairs_of_materials():
+    grades = collections.Counter()
+    for name in FIELDS:
+        given = re.search(r"\b(READ|DERIVED|TUNED|GUESSED)\b", annotation_and_description(name)[1])
+        grades[given[0] if given else ""] += 1
+    text = " ".join((pathlib.Path(__file__).parents[2] / "docs/validation.md").read_text().split())
+    counted = re.search(
+        r"(\d+) of (\d+) physics parameters are guesses\*\* \((\d+) tuned with this solver, (\d+) derived, (\d+) read, "
+        r"(\d+) switches and sizes\)", text,
+    )  # fmt: skip
+    assert counted, "no count of physics parameters"
+    kinds = (grades[kind] for kind in ("TUNED", "DERIVED", "READ", ""))
+    assert tuple(map(int, counted.groups())) == (grades["GUESSED"], len(FIELDS), *kinds)
+    pairs = pair_numbers()
+    listed = collections.Counter(number.grade for number in pairs["friction"].values())
+    of_pairs = r"(\d+) coefficients of friction by pair of materials (\d+) are derived, (\d+) read, (\d+) guessed"
+    counted = re.search(of_pairs, text)
+    assert counted, "no count of pairs of materials"
+    expected = (len(pairs["friction"]), listed["DERIVED"], listed["READ"], listed["GUESSED"])
+    assert tuple(map(int, counted.groups())) == expected
+    assert ("no stiffness of a pair is listed" in text) is (len(pairs["stiffness"]) == 0)
 
 
 @pytest.mark.parametrize(

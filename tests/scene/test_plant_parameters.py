@@ -39,13 +39,17 @@ def test_every_number_is_graded_and_explained():
             assert re.search(r"\d", number.source), number
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/validation.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/limits.md", "docs/validation.md"])
 def test_the_pages_state_the_number_of_guesses(page):
     grades = collections.Counter(number.grade for number in numbers(plant_parameters.load_plant("vine")))
     text = (pathlib.Path(__file__).parents[2] / page).read_text()
     counted = re.search(r"(\d+) of (\d+) plant parameters are guesses", text)
     assert counted, f"{page} counts no guesses"
     assert tuple(map(int, counted.groups())) == (grades["GUESSED"], sum(grades.values()))
+    if page == "docs/validation.md":
+        others = re.search(r"plant parameters are guesses\*\* \((\d+) read in publications, (\d+) derived\)", text)
+        assert others, f"{page} does not count the others"
+        assert tuple(map(int, others.groups())) == (grades["READ"], grades["DERIVED"])
 
 
 def test_a_wrong_unit_is_refused(tmp_path):

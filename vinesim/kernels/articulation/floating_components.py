@@ -2,6 +2,10 @@
 
 The integration of joints errs in the momentum of a free tree by some dt^2; here root pose and rate are corrected after
 it, so that linear and angular momentum and the centre of mass come out exact.
+
+Its centre of mass moves, and its root turns, at the mean of the rates before and after the step. What hits something is the
+exception: the contact solve lets it come as near as its rate after the step allows, and by the mean of both it would
+go half of what it did before into what it hits: through a wire, from 1.5 m/s on.
 """
 
 import warp as wp
@@ -48,7 +52,7 @@ def component_before(
     """Sums over a component at the start of the step, about its root and against it.
 
     Returns mass [kg], mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, force [N], moment
-    [N m] of everything but gravity over the step.
+    [N m] of everything but gravity over the step, and whether contacts are part of it.
     """
     tree = model.body_tree[root]
     mass = float(0.0)
@@ -57,8 +61,10 @@ def component_before(
     angular = wp.vec3()
     force = wp.vec3()
     moment = wp.vec3()
+    is_pressed = bool(False)
     for k in range(root, last, model.pitch):
         if model.body_root[k] == root:
+            is_pressed = is_pressed or wp.length_sq(forces.body_wrench[k]) > 0.0
             arm = wp.vec3()
             velocity = wp.vec3()
             if k > root:  # not from world positions and velocities, whose digits go into the fall
@@ -83,7 +89,7 @@ def component_before(
             angular += wp.cross(arm + com, momentum) + inertia * omega
             force += wp.spatial_top(given)
             moment += wp.cross(arm, wp.spatial_top(given)) + wp.spatial_bottom(given)
-    return mass, mass_com, linear, angular, force, moment
+    return mass, mass_com, linear, angular, force, moment, is_pressed
 
 
 @wp.func
@@ -179,13 +185,17 @@ def correct_floating_momentum(
     # what momentum and path must be
     place = wp.transform_get_translation(bodies.body_q[root])
     velocity = wp.spatial_top(bodies.body_qd[root])
-    mass, mass_com, linear, angular, force, moment = component_before(
+    mass, mass_com, linear, angular, force, moment, is_pressed = component_before(
         step, model, forces, bodies, body_acceleration, lever, root, last, tree_phi[tree], scratch_out
     )
     com = mass_com / mass
     goal_linear = linear + dt * (force + mass * p.gravity)
     goal_angular = angular - wp.cross(com, linear) + dt * (moment - wp.cross(com, force))
     path = com + dt * (velocity + 0.5 / mass * (linear + goal_linear))
+    if is_pressed and tree_phi[tree] == 1.0:
+        path = com + dt * (velocity + goal_linear / mass)
+        turned = exponential(dt * joints_out.joint_qd[root]) * wp.transform_get_rotation(bodies.body_q[root])
+        joints_out.joint_q[root] = wp.normalize(turned)
 
     # what they are, and the difference
     moved = joints_out.joint_x[root] - place

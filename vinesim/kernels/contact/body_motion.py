@@ -70,3 +70,14 @@ def velocity_product_acceleration(
             linear += wp.cross(omega, wp.cross(omega, joint - wp.transform_get_translation(body_q[parent])))
         k = parent
     return wp.spatial_vector(linear, angular)
+
+
+@wp.func
+def was_cut_off(body: int, body_parent: wp.array(dtype=wp.int32), body_cut: wp.array(dtype=wp.bool)):
+    """Whether a joint between a body and the root of its tree was cut."""
+    is_off = bool(False)
+    k = int(body)
+    while k >= 0 and not is_off:
+        is_off = body_cut[k]
+        k = body_parent[k]
+    return is_off

@@ -1,6 +1,7 @@
 """Narrowphase of plants and rigid geoms: where a tree's capsules touch them, or may touch them before the step ends.
 
-Two shapes that overlap while all plants rest as generated, or are that near, are in contact only from there on.
+Two shapes that overlap while all plants rest as generated, or are that near, are in contact only from there on. What was
+cut off may overlap less by as much as it has moved since: what grew about a wire does not fall through it.
 """
 
 import warp as wp
@@ -11,6 +12,7 @@ from vinesim.kernels.contact.body_motion import (
     to_double,
     velocity_at,
     velocity_product_acceleration,
+    was_cut_off,
 )
 from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
@@ -227,7 +229,13 @@ def rigid_candidate(
             to_double(capsules.rest_start[s]),
             to_double(capsules.rest_end[s]),
         )
-        candidate.gap = candidate.gap - wp.min(at_rest[3] - radius - parameters.margin, zero)
+        overlap = -wp.min(at_rest[3] - radius - parameters.margin, zero)
+        if overlap > zero and was_cut_off(body, bodies.parent, bodies.is_cut):
+            moved = wp.max(
+                wp.length(a - to_double(capsules.rest_start[s])), wp.length(b - to_double(capsules.rest_end[s]))
+            )
+            overlap = wp.max(radius - at_rest[3] - moved, zero)
+        candidate.gap = candidate.gap + overlap
         free = velocity_at(bodies.q[body], bodies.qd_free[body], candidate.point)
         soonest = wp.min(wp.min(approach, dt * wp.dot(candidate.normal, free)), zero)
         candidate.exists = candidate.gap + soonest < parameters.static_margin
@@ -269,11 +277,17 @@ def contact_ends(
 
 
 @wp.func
-def is_tied(capsule: int, geom: int, capsules: Capsules):
-    """Whether a tie holds a capsule at a geom, by MuJoCo's number: then they do not collide."""
+def is_tied(capsule: int, geom: int, capsules: Capsules, is_cut: wp.array(dtype=wp.bool)):
+    """Whether a tie holds a capsule, or a neighbour that it was not cut off, at a geom, by MuJoCo's number: then they
+    do not collide."""
     tied = bool(False)
     for k in range(capsules.tied_geom.shape[1]):
-        tied = tied or capsules.tied_geom[capsule, k] == geom
+        if capsules.tied_geom[capsule, k] == geom:
+            joint = capsules.tied_joint[capsule, k]
+            if joint < 0:
+                tied = True
+            elif not is_cut[joint]:
+                tied = True
     return tied
 
 
@@ -318,7 +332,7 @@ def add_pair(
     if wp.dot(between, between) < limit * limit:
         rotation = rigid.xmat[geoms.id[g]]
         nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
-        if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules):
+        if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules, bodies.is_cut):
             ends = contact_ends(is_round, parameters, geoms, hulls, g, rotation, center, a, b, nearest)
             pair = Pair()
             pair.capsule = s

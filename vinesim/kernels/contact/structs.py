@@ -131,6 +131,8 @@ class Capsules:
     rest_end: wp.array(dtype=wp.vec3)
     tied_geom: wp.array2d(dtype=wp.int32)
     """[capsule, k] MuJoCo's numbers of wires that it does not collide with, being tied to them; -1 for none."""
+    tied_joint: wp.array2d(dtype=wp.int32)
+    """[capsule, k] body whose joint connects it with the neighbour that is tied there; -1: it is tied itself."""
 
 
 @wp.struct

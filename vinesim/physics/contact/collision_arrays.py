@@ -73,6 +73,7 @@ class PlantArrays:
             (rest[:, :3] + frames.rotate(rest[:, 3:], end.astype(float))).astype(np.float32)
             for end in (capsules.start, capsules.end)
         )
+        tied_geom, tied_joint = _tied_geoms(model)
         self.capsules = SharedArrays(
             structs.Capsules,
             tree_start=capsules.tree_start,
@@ -87,14 +88,17 @@ class PlantArrays:
             extent=(ends + capsules.radius).astype(np.float32),
             rest_start=rest_start,
             rest_end=rest_end,
-            tied_geom=_tied_geoms(model)[capsules.body],
+            tied_geom=tied_geom[capsules.body],
+            tied_joint=tied_joint[capsules.body],
         )
         self.capsule_states = SharedArrays.zeros(structs.CapsuleStates, len(capsules.body))
 
 
-def _tied_geoms(model: Model) -> np.ndarray:
+def _tied_geoms(model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Wires that each body does not collide with [body, k], MuJoCo's numbers or -1: those to which it, its parent or a
     child of it is tied. Such a tie is a spring both ways; the geom of the wire stands where the wire is when straight.
+
+    Also returns the body [body, k] whose joint connects it with that parent or child, -1 where it is tied itself.
     """
     bound = model.tie_wire >= 0
     body, geom = model.tie_body[bound], model.tie_wire[bound] + FIRST_FIXED_GEOM
@@ -103,12 +107,15 @@ def _tied_geoms(model: Model) -> np.ndarray:
     count = np.where(parent >= 0, end - first, 0)
     of_parent = spans(first, count)
     above = parent[body] >= 0
-    bodies = np.concatenate([body, parent[body][above], np.repeat(np.arange(len(parent)), count)])
-    pairs = np.unique(np.stack([bodies, np.concatenate([geom, geom[above], geom[of_parent]])], -1), axis=0)
-    place = np.arange(len(pairs)) - np.searchsorted(pairs[:, 0], pairs[:, 0])
-    table = np.full((len(parent), place.max(initial=-1) + 1), -1, np.int32)
-    table[pairs[:, 0], place] = pairs[:, 1]
-    return table
+    child = np.repeat(np.arange(len(parent)), count)
+    bodies = np.concatenate([body, parent[body][above], child])
+    joints = np.concatenate([np.full(len(body), -1), body[above], child])
+    rows = np.stack([bodies, np.concatenate([geom, geom[above], geom[of_parent]]), joints], -1)
+    rows = np.unique(rows, axis=0)
+    place = np.arange(len(rows)) - np.searchsorted(rows[:, 0], rows[:, 0])
+    tables = np.full((2, len(parent), place.max(initial=-1) + 1), -1, np.int32)
+    tables[:, rows[:, 0], place] = rows[:, 1:].T
+    return tables[0], tables[1]
 
 
 _GEOM_FIELDS = tuple(field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link"))
