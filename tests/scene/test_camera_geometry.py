@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from vinesim.scene.camera_geometry import (
+    back_project,
     depth_millimetres,
     distortion_model,
     intrinsic_matrix,
@@ -78,6 +79,7 @@ def test_points_project_as_by_opencv_and_rays_lead_back(distortion: tuple[float,
     matrix = np.array(intrinsic_matrix(info)).reshape(3, 3)
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(coefficients))
     assert project_points(points, info) == pytest.approx(theirs.reshape(-1, 2), abs=1e-9)
+    assert back_project(project_points(points, info), points[:, 2], info) == pytest.approx(points, abs=1e-6)
     across, down = pixel_rays(info)
     rays = np.stack(np.broadcast_arrays(across, down, np.ones((48, 64))), -1)
     rows, columns = np.mgrid[:48, :64]

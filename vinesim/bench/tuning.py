@@ -1,7 +1,8 @@
 """``vinesim bench tune``: how near fits of synthetic tracks come, how honest their intervals are, what they cost.
 
 The truth is stepped at 1 ms by vinesim, or at 0.5 ms by MuJoCo, whose scheme then has less damping of its own than the
-canes have; beside peers in :mod:`vinesim.bench.tuning_peers`.
+canes have, or by PyElastica (:mod:`vinesim.bench.tuning_rods`); or the tracks come from pictures
+(:mod:`vinesim.bench.tuning_pictures`). Beside peers in :mod:`vinesim.bench.tuning_peers`.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import msgspec
 import mujoco
@@ -19,6 +20,8 @@ from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
 from vinesim.bench.tuning_cases import DAMPING_BAR, MODULUS_BAR, Case, draw_case
 from vinesim.bench.tuning_peers import peer_rows, stein_rows
+from vinesim.bench.tuning_pictures import film
+from vinesim.bench.tuning_rods import is_installed, rod_track
 from vinesim.scene.builder import assemble
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.scene.values import Measurement
@@ -32,6 +35,10 @@ SPEED_SEEDS = 3
 """Tracks on which peers are timed."""
 STEIN_SEEDS = 4
 """Tracks of which Stein particles give the posterior."""
+PICTURE_SEEDS = 5
+"""Swings that are filmed."""
+ROD_SEEDS = 5
+"""Tracks from PyElastica, each of some 700,000 steps: 20 s of CPU."""
 MUJOCO_SEEDS = 6
 MUJOCO_SEGMENTS = 32
 
@@ -126,12 +133,35 @@ def recovery_rows(name: str, found: Recovery) -> Iterator[Measurement]:
     yield Measurement("tune", f"{name}: wall time of a fit, median", float(np.median(found.seconds)), "s")
 
 
-def tuning(seeds: int = SEEDS) -> Iterator[Measurement]:
-    """Recovery over seeds, from vinesim's and from MuJoCo's tracks; CPU time and calibration beside peers."""
+def picture_rows(cases: list[Case]) -> Iterator[Measurement]:
+    """Recovery from pictures, and how far the tracks are off."""
+    swings = [film(case) for case in cases]
+    name = f"{len(cases)} swings filmed by a D435"
+    off = np.concatenate([swing.error for swing in swings])
+    seen = np.isfinite(off).all(1)
+    across, ahead = (1e3 * np.sqrt(np.mean(off[seen][:, axes] ** 2)) for axes in ([0, 1], [2]))
+    yield Measurement("tune", f"{name}: pictures in which the marker was found", 100.0 * float(seen.mean()), "%")
+    yield Measurement("tune", f"{name}: error of a position across the view, RMS of an axis", float(across), "mm")
+    yield Measurement("tune", f"{name}: error of a position along the view, RMS", float(ahead), "mm")
+    yield from recovery_rows(name, recover(cases, [swing.track for swing in swings]))
+
+
+def tuning(announce: Callable[[str], None], seeds: int = SEEDS) -> Iterator[Measurement]:
+    """Recovery over seeds from tracks of vinesim, of pictures, of MuJoCo and of PyElastica; CPU time and calibration
+    beside peers.
+
+    ``announce`` takes a line about what is left out.
+    """
     cases = [draw_case(seed) for seed in range(seeds)]
     tracks = [measure(case.truth, case.experiment) for case in cases]
     yield from recovery_rows(f"{seeds} seeds", recover(cases, tracks))
-    few = cases[: min(MUJOCO_SEEDS, seeds)]
+    yield from picture_rows(cases[:PICTURE_SEEDS])
+    few = cases[:MUJOCO_SEEDS]
     yield from recovery_rows(f"{len(few)} tracks of MuJoCo", recover(few, [mujoco_track(case) for case in few]))
+    if is_installed():
+        few = cases[:ROD_SEEDS]
+        yield from recovery_rows(f"{len(few)} tracks of PyElastica", recover(few, [rod_track(case) for case in few]))
+    else:
+        announce("tune: no tracks of PyElastica, which is not installed; run: pip install 'vinesim[bench]'")
     yield from peer_rows(cases[:SPEED_SEEDS], tracks[:SPEED_SEEDS])
     yield from stein_rows(cases[:STEIN_SEEDS], tracks[:STEIN_SEEDS])

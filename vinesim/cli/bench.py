@@ -158,7 +158,7 @@ def _kill(times: int = 50, seed: int = 1) -> Iterator[Measurement]:
 def _tune() -> Iterator[Measurement]:
     from vinesim.bench.tuning import tuning
 
-    return tuning()
+    return tuning(_announce)
 
 
 def _announce(line: str) -> None:

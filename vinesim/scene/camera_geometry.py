@@ -1,4 +1,4 @@
-"""Geometry of pictures: intrinsic matrix, rays of pixels, projection, depth in millimetres, coloured points."""
+"""Geometry of pictures: intrinsic matrix, rays, projection and its inverse, depth in millimetres, coloured points."""
 
 from __future__ import annotations
 
@@ -49,6 +49,18 @@ def project_points(points: np.ndarray, info: CameraInfo) -> np.ndarray:
         bent = lens_distortion.distort(np.stack([across, down], -1), info.distortion)
         across, down = bent[..., 0], bent[..., 1]
     return np.stack([across * info.fx + info.cx, down * info.fy + info.cy], -1)
+
+
+def back_project(pixels: np.ndarray, depth: np.ndarray, info: CameraInfo) -> np.ndarray:
+    """Points [..., 3] m in the optical frame that appear at pixels [..., 2] (column, row) at depths [...] m.
+
+    The inverse of :func:`project_points`; pixels need not be whole. NaN where the lens shows nothing.
+    """
+    rays = (np.asarray(pixels, float) - [info.cx, info.cy]) / [info.fx, info.fy]
+    if info.distortion:
+        rays = lens_distortion.undistort(rays, info.distortion)
+    depth = np.asarray(depth, float)[..., None]
+    return np.concatenate([rays * depth, np.broadcast_to(depth, (*rays.shape[:-1], 1))], -1)
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:

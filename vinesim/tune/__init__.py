@@ -15,11 +15,12 @@ from vinesim.scene.plant_parameters import Specimen, load_specimen
 from vinesim.tune.experiment import Experiment, measure
 from vinesim.tune.features import Features, extract_features
 from vinesim.tune.fit import Fit
+from vinesim.tune.marker_track import track_marker
 from vinesim.tune.specimen import with_values
 from vinesim.tune.trajectory import Trajectory, TrajectoryError, read_trajectory
 from vinesim.tune.tuning import tune
 
 __all__ = [
     "Experiment", "Features", "Fit", "Specimen", "Trajectory", "TrajectoryError", "extract_features",
-    "load_specimen", "measure", "read_trajectory", "tune", "with_values",
+    "load_specimen", "measure", "read_trajectory", "track_marker", "tune", "with_values",
 ]  # fmt: skip

@@ -163,7 +163,7 @@ class Problem:
         self.priors = [dataclasses.replace(p, mean=float(m)) for p, m in zip(priors, theta, strict=True)]
         if force is not None:
             self.force = (force[1] * float(self._extra(theta)[0][-1]) + force[0], force[1])
-        biased, _ = self.minimise(theta, noise, most=8, tolerance=1e-4)
+        biased, _ = self.minimise(theta, noise)
         self.observed, self.priors, self.force = observed, priors, force
         self.shift = (biased - theta) * FINER**2 / (FINER**2 - 1.0)
         return theta - self.shift

@@ -1,0 +1,109 @@
+"""Tracks of ``vinesim bench tune`` from pictures: the true swing as an RGB-D camera sees it, a marker found in each.
+
+The camera is the D435 of ``data/cameras`` with its errors, 0.8 m beside the tip, and looks across the plane of the
+swing. The marker is a ball of 24 mm without mass. Pictures are sharp: no motion blur, no rolling shutter. Its colour is
+picked in the first picture.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+
+from vinesim import frames
+from vinesim.bench.tuning_cases import Case
+from vinesim.scene.builder import assemble
+from vinesim.scene.camera_geometry import project_points
+from vinesim.scene.ids import Organ
+from vinesim.scene.plant_parameters import Specimen
+from vinesim.scene.values import CameraFrame, CameraOutput, RigidVisual, Shape, Snapshot
+from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.export.images import look_at
+from vinesim.sensors.scene.primitives import Primitives
+from vinesim.tune import Trajectory, measure
+from vinesim.tune.marker_track import track_marker
+from vinesim.tune.specimen import TIP, build_tree
+
+SEGMENTS = 192
+"""Of the chain that is filmed: one of 64 swings 0.01 % slowly, which tracks as exact as these show."""
+PIECES = 16
+"""Straight pieces of which the cane is drawn."""
+HEIGHT = 1.2
+"""[m] Of the base above the ground."""
+AWAY = 0.8
+"""[m] Of the camera from the plane of the swing."""
+RADIUS = 0.012
+"""[m] Of the marker."""
+PAINT = (0.85, 0.05, 0.35)
+"""sRGB of the marker: a pink that no vineyard has."""
+
+
+def with_nodes(specimen: Specimen, pieces: int) -> tuple[Specimen, tuple[str, ...]]:
+    """The specimen with markers at the ends of so many equal pieces, and their names from the base to the tip."""
+    names = tuple(f"node {i}" for i in range(1, pieces))
+    along = {name: specimen.length.value * (i + 1) / pieces for i, name in enumerate(names)}
+    return msgspec.structs.replace(specimen, markers=along), (*names, TIP)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class FilmedSwing:
+    """A track from pictures, and what it should be."""
+
+    track: Trajectory
+    error: np.ndarray
+    """[sample, 3] m: of the marker's place along the camera's axes, right, down, ahead; NaN where it was not found."""
+
+
+def film(case: Case) -> FilmedSwing:
+    """The case's swing, filmed and tracked."""
+    specimen, names = with_nodes(case.truth, PIECES)
+    fine = msgspec.structs.replace(specimen, segments=SEGMENTS)
+    true = measure(fine, dataclasses.replace(case.experiment, markers=names), exact=True)
+    tip = true.position[:, -1] + [0.0, 0.0, HEIGHT]
+    middle = 0.5 * (tip.min(0) + tip.max(0))
+    pose = look_at(middle - [0.0, AWAY, 0.0], middle)
+    pictures = _pictures(specimen, true, pose, case.experiment.seed)
+    first = next(pictures)
+    colour = _pick_colour(first, tip[0])
+    track = track_marker(
+        itertools.chain([first], pictures), colour, radius=RADIUS, source=f"seed {case.experiment.seed}"
+    )
+    off = frames.rotate(frames.conjugate(pose[3:]), track.position[:, 0] - tip)
+    return FilmedSwing(track, off)
+
+
+def _pick_colour(picture: CameraFrame, point: np.ndarray) -> tuple[int, int, int]:
+    """What a user would pick in the first picture: the colour where the marker is."""
+    local = frames.rotate(frames.conjugate(picture.pose[3:]), point - picture.pose[:3])
+    column, row = np.round(project_points(local, picture.info)).astype(int)
+    red, green, blue = np.median(picture.rgb[row - 2 : row + 3, column - 2 : column + 3], (0, 1)).astype(int).tolist()
+    return red, green, blue
+
+
+def _pictures(specimen: Specimen, true: Trajectory, pose: np.ndarray, seed: int) -> Iterator[CameraFrame]:
+    """The pictures that the camera takes at the track's times."""
+    model = assemble([build_tree(msgspec.structs.replace(specimen, segments=PIECES))])
+    spec = CameraSpec.load("d435")
+    camera = Camera(spec, spec.info("optical"), seed=seed)
+    ball = Shape("sphere", (RADIUS,), frames.pose(np.zeros(3)), (*PAINT, 1.0), surface="cloth")
+    marker = (RigidVisual("marker", Organ.ROBOT, 0, (ball,)),)
+    primitives, length = Primitives(model, grass=0.0), specimen.length.value / PIECES
+    for tick, (time, nodes) in enumerate(zip(true.time, true.position, strict=True)):
+        nodes = np.vstack([np.zeros(3), nodes]) + np.array([0.0, 0.0, HEIGHT])
+        turns = frames.from_x_axis(np.diff(nodes, axis=0) / length)
+        primitives.update(
+            Snapshot(
+                time=float(time),
+                tick=tick,
+                body_q=np.concatenate([nodes[:-1], turns], -1),
+                bunch_attached=np.ones(0, bool),
+                visuals=marker,
+                visual_q=frames.pose(nodes[-1])[None],
+                moved_trees=np.zeros(1, np.int64),
+            )
+        )
+        yield camera.render(primitives, pose, float(time), outputs=CameraOutput.RGB | CameraOutput.DEPTH)
