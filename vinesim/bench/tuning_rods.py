@@ -6,6 +6,9 @@ it; the second one then decays no faster than the first, in vinesim's cane some 
 E / 16, as along the grain of wood; PyElastica's own E / 3 asks for steps half as long.
 """
 
+# PyElastica names what it exports only at run time, and takes arrays where it asks for a float.
+# pyright: reportPrivateImportUsage=false, reportArgumentType=false
+
 from __future__ import annotations
 
 import importlib.util
@@ -43,8 +46,8 @@ def is_installed() -> bool:
 def rod_track(case: Case) -> Trajectory:
     """The case's track from a Cosserat rod of PyElastica."""
     e = case.experiment
-    path = _swing(case.truth, *_held_shape(case), damping_rate(case.truth), e.seconds + 2.0 * PICTURE_STEP)
-    clock = np.arange(math.ceil((e.hold + e.seconds) * e.rate)) / e.rate
+    path = _swing(case.truth, *_held_shape(case), damping_rate(case.truth), e.number("duration") + 2.0 * PICTURE_STEP)
+    clock = np.arange(math.ceil((e.hold + e.number("duration")) * e.rate)) / e.rate
     after = np.maximum(clock - e.hold, 0.0)
     seen = np.stack([np.interp(after, PICTURE_STEP * np.arange(len(path)), axis) for axis in path.T], -1)
     noise = np.random.default_rng(e.seed).normal(0.0, e.noise, (len(clock), 1, 3))
@@ -69,7 +72,7 @@ def _held_shape(case: Case) -> tuple[np.ndarray, np.ndarray]:
     specimen, names = with_nodes(msgspec.structs.replace(case.truth, segments=FINE), FINE)
     candidates = Candidates(specimen, names, dt=1e-3)
     row = np.zeros((1, len(COLUMNS)))
-    row[0, 5:] = pull_for(candidates, case.experiment.displacement, math.radians(case.experiment.angle))
+    row[0, 5:] = pull_for(candidates, case.experiment.number("displacement"), math.radians(case.experiment.angle))
     nodes = np.concatenate([np.zeros((1, 3)), candidates.shape(row)[0]])
     chords = np.diff(nodes, axis=0)
     # the tangent of a chain of segments at their middles, at the clamp that of the clamp
