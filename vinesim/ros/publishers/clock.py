@@ -27,8 +27,8 @@ process without a processor discovers nothing meanwhile."""
 CLAIM_LOOKS = 3
 """Looks in a row that find no other publisher before a node that has become it sends its first message."""
 FIRST_LOOKS = 13
-"""Looks of a new node before it sends. Discovery of a node on the same machine takes 0.3 s as a rule, but where that
-fails, until Fast DDS announces it again after 3 s."""
+"""Looks of a new node before it becomes the publisher, or it might displace one that it does not know yet. Discovery of a
+node on the same machine takes 0.3 s as a rule, but where that fails, until Fast DDS announces it again after 3 s."""
 
 
 class ClockPublisher:
@@ -64,12 +64,12 @@ class ClockPublisher:
         self._looks += 1
         self._lone_looks = 0 if others else self._lone_looks + 1
         if self._topic is None:
-            if self._lone_looks >= FREE_LOOKS:
+            if self._lone_looks >= FREE_LOOKS and self._looks >= FIRST_LOOKS:
                 self._topic, self._lone_looks = self._advertise(ClockMessage, CLOCK, RELIABLE), 0
         elif own and any(other < own[0] for other in others):
             topic, self._topic, self._sends = self._topic, None, False
             self._withdraw(topic)
-        elif self._lone_looks >= CLAIM_LOOKS and self._looks >= FIRST_LOOKS:
+        elif self._lone_looks >= CLAIM_LOOKS:
             self._sends = True
 
     def pending(self, time: float) -> Iterator[PendingMessage]:
