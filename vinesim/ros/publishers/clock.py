@@ -27,8 +27,8 @@ process without a processor discovers nothing meanwhile."""
 CLAIM_LOOKS = 3
 """Looks in a row that find no other publisher before a node that has become it sends its first message."""
 FIRST_LOOKS = 13
-"""Looks of a new node before it becomes the publisher, or it might displace one that it does not know yet. Discovery of a
-node on the same machine takes 0.3 s as a rule, but where that fails, until Fast DDS announces it again after 3 s."""
+"""Looks of a new node before it becomes the publisher, or it might displace one that it does not know yet. Discovery of
+a node on the same machine takes 0.3 s as a rule, but where that fails, until Fast DDS announces it again after 3 s."""
 
 
 class ClockPublisher:
