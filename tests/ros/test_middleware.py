@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
@@ -54,10 +57,16 @@ def test_without_ros_the_extra_is_named(monkeypatch):
 @wheels_only
 def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
     monkeypatch.delenv(middleware.PROFILE_VARIABLE, raising=False)
+    monkeypatch.setenv(middleware.RANGE_VARIABLE, "SUBNET")
     middleware.configure()
-    assert os.environ[middleware.PROFILE_VARIABLE] == str(middleware.PROFILE_FILE)
+    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/shared_memory.xml")
+    assert os.environ[middleware.RANGE_VARIABLE] == "SUBNET"
+    middleware.configure(large_messages=False)
+    middleware.configure()  # as every node does
+    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/udp.xml")
     middleware.clear_profile()
     assert middleware.PROFILE_VARIABLE not in os.environ
+    assert os.environ[middleware.RANGE_VARIABLE] == "SUBNET"
 
     monkeypatch.setenv(middleware.PROFILE_VARIABLE, "/srv/own.xml")
     middleware.configure()
@@ -65,9 +74,65 @@ def test_the_profile_is_set_unless_the_user_has_chosen(monkeypatch):
     assert os.environ[middleware.PROFILE_VARIABLE] == "/srv/own.xml"
 
 
-def test_the_segment_holds_several_of_the_largest_messages():
+@pytest.mark.ros
+@wheels_only
+@pytest.mark.parametrize(
+    ("variable", "value"), [(middleware.RANGE_VARIABLE, "LOCALHOST"), (middleware.LOCALHOST_VARIABLE, "1")]
+)
+def test_discovery_on_this_machine_is_the_profiles(monkeypatch, variable, value):
+    monkeypatch.delenv(middleware.PROFILE_VARIABLE, raising=False)
+    monkeypatch.setenv(middleware.RANGE_VARIABLE, "SUBNET")
+    monkeypatch.setenv(middleware.LOCALHOST_VARIABLE, "0")
+    monkeypatch.setenv(variable, value)
+    middleware.configure()
+    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/shared_memory_loopback.xml")
+    assert not middleware.discovers_this_machine_only()
+    middleware.configure(large_messages=False)  # as in a process that was started by this one
+    assert os.environ[middleware.PROFILE_VARIABLE].endswith("/udp_loopback.xml")
+    middleware.clear_profile()
+    assert os.environ[middleware.RANGE_VARIABLE] == "LOCALHOST"
+
+    monkeypatch.setenv("ROS_STATIC_PEERS", "192.0.2.7")  # which only the range LOCALHOST itself reaches
+    middleware.configure()
+    assert middleware.discovers_this_machine_only()
+
+
+NODE = """
+import os, pathlib, sys
+from vinesim.ros import middleware
+middleware.configure(large_messages=sys.argv[1] == "large")
+import rclpy
+rclpy.init()
+node = rclpy.create_node("some_node")
+maps = pathlib.Path("/proc/self/maps").read_text().split()
+segments = {path for path in maps if path.startswith("/dev/shm/fastrtps_") and "port" not in path}
+print(sorted(os.path.getsize(path) for path in segments))
+"""
+
+
+@pytest.mark.ros
+@wheels_only
+@pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST"])
+def test_only_nodes_with_pictures_use_shared_memory(reach):
+    """A stopped subscriber holds up whoever writes into its queue in shared memory, so the small topics go by UDP."""
+    environ = {name: value for name, value in os.environ.items() if name != middleware.PROFILE_VARIABLE}
+    environ |= {middleware.RANGE_VARIABLE: reach, "ROS_DOMAIN_ID": str(101 + os.getpid() % 100)}  # without peers
+
+    def segments(kind: str) -> list[int]:
+        command = [sys.executable, "-c", NODE, kind]
+        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True, timeout=60.0)
+        return json.loads(done.stdout)
+
+    assert segments("small") == []
+    (size,) = segments("large")
+    assert size >= 32 * 1024**2
+
+
+@pytest.mark.parametrize("local", [False, True])
+def test_the_segment_holds_several_of_the_largest_messages(local):
+    path = middleware.profile_file(large_messages=True, local=local)
     space = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
-    root = ElementTree.parse(middleware.PROFILE_FILE).getroot()
+    root = ElementTree.parse(path).getroot()
     segment = int(root.findtext(f".//{space}segment_size") or 0)
     message = int(root.findtext(f".//{space}maxMessageSize") or 0)
     organised_cloud = 640 * 480 * 16

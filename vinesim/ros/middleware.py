@@ -15,13 +15,12 @@ import sys
 
 from vinesim.ros.dead_segments import remove_dead_segments
 
-PROFILE_FILE = pathlib.Path(__file__).resolve().parent / "shared_memory.xml"
-"""Fast DDS profile with a shared-memory segment that large messages fit into."""
-
-SMALL_PROFILE_FILE = PROFILE_FILE.with_name("small_messages.xml")
-"""The same with an eighth of the memory, for processes that send no pictures or clouds."""
+FOLDER = pathlib.Path(__file__).resolve().parent
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"
+"""The older name of LOCALHOST as the range; it comes first where it is 1."""
 WHEEL_MIDDLEWARE = "rmw_fastrtps_cpp"
 """The only middleware among the wheels."""
 
@@ -57,20 +56,62 @@ def unavailable_reason() -> str | None:
     return None
 
 
-def configure(*, large_messages: bool = True) -> None:
+def profile_file(*, large_messages: bool, local: bool) -> pathlib.Path:
+    """Fast DDS profile of a process: with a shared-memory segment that large messages fit into, or with UDP alone, as
+    that does not wait for subscribers that are stopped. ``local``: peers are on this machine only."""
+    return FOLDER / f"{'shared_memory' if large_messages else 'udp'}{'_loopback' if local else ''}.xml"
+
+
+OWN_PROFILES = {
+    str(profile_file(large_messages=large, local=local)): (large, local)
+    for large in (False, True)
+    for local in (False, True)
+}
+"""What each is for."""
+
+
+def configure(*, large_messages: bool | None = None) -> None:
     """Set the environment for the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
 
     Shared memory that killed processes left is removed.
-    ``large_messages``: whether the process sends pictures or clouds. A profile that the user has chosen stays.
+    ``large_messages``: whether the process sends pictures or clouds; unless given as in the call before, at first True.
+    A profile that the user has chosen stays.
     """
     reason = unavailable_reason()
     if reason is not None:
         raise RosUnavailableError(reason)
     remove_dead_segments()
-    os.environ.setdefault(PROFILE_VARIABLE, str(PROFILE_FILE if large_messages else SMALL_PROFILE_FILE))
+    chosen = os.environ.get(PROFILE_VARIABLE, "")
+    if not uses_fast_dds() or (chosen and chosen not in OWN_PROFILES):
+        return
+    large, local = OWN_PROFILES.get(chosen, (True, False))
+    if large_messages is not None:
+        large = large_messages
+    if discovers_this_machine_only() and not os.environ.get("ROS_STATIC_PEERS"):
+        # With LOCALHOST, rmw_fastrtps adds transports of its own to the profile's, shared memory among them. The
+        # profile limits discovery to this machine instead.
+        os.environ[RANGE_VARIABLE] = "SYSTEM_DEFAULT"
+        os.environ.pop(LOCALHOST_VARIABLE, None)
+        local = True
+    os.environ[PROFILE_VARIABLE] = str(profile_file(large_messages=large, local=local))
+
+
+def uses_fast_dds() -> bool:
+    """Whether Fast DDS is the middleware here."""
+    from rclpy.utilities import get_rmw_implementation_identifier
+
+    return get_rmw_implementation_identifier().startswith("rmw_fastrtps")
+
+
+def discovers_this_machine_only() -> bool:
+    """Whether the environment asks for peers on this machine only."""
+    return os.environ.get(LOCALHOST_VARIABLE) == "1" or os.environ.get(RANGE_VARIABLE, "").upper() == "LOCALHOST"
 
 
 def clear_profile() -> None:
     """Remove vinesim's own profile again, to run as a program that knows nothing of vinesim."""
-    if os.environ.get(PROFILE_VARIABLE) in (str(PROFILE_FILE), str(SMALL_PROFILE_FILE)):
+    profile = os.environ.get(PROFILE_VARIABLE, "")
+    if profile in OWN_PROFILES:
         del os.environ[PROFILE_VARIABLE]
+        if OWN_PROFILES[profile][1]:
+            os.environ[RANGE_VARIABLE] = "LOCALHOST"
