@@ -28,6 +28,8 @@ outweighs them.
 A body with parent -1 is a root: it hangs on its tree's pose, or *floats* if it has been cut off (``body_root`` names the
 cut body that everything on it moves with, -1 for what still stands). A floating root has no spring and no lever; what is
 left of its inertia after its rotation is eliminated gives its linear acceleration, ``root_inverse_mass`` times the force left over.
+Where no tie holds it, it *falls* (``body_falls``): weight draws nothing out, and its momentum is corrected after the step
+(``floating_components``). What hangs from a tie is stepped as what stands.
 
 Ties and air drag are forces at a point c of a body that grow against its velocity. Taken implicitly they look like a
 mass W at c: W = phi dt (phi dt k + c) for a spring and damper, dt c for drag.

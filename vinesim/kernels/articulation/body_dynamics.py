@@ -44,8 +44,8 @@ def own_terms(
     """Implicit inertia J, H, M of one body, its bias and its tension; ties and drag come on top.
 
     com: [m] centre of mass from the origin, world axes. inertia: [kg m^2] about it. load, contact: what is applied
-    from outside, and the force [N] of the last contacts. falls: 1 for a body of a floating component, whose root
-    moves at ``fall`` [m/s], else 0: weight does not draw out what falls, and drag does not hold back its fall. Also
+    from outside, and the force [N] of the last contacts. falls: 1 for a body of a floating component that no tie
+    holds, whose root moves at ``fall`` [m/s], else 0: weight does not draw out what falls, and drag does not hold back its fall. Also
     returns the steady force [N] that draws out levers.
     """
     ahead = p.geometric_stiffness * (1.0 - phi) * p.dt

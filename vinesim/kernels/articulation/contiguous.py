@@ -51,6 +51,10 @@ def dense_spatial(a: wp.array(dtype=wp.spatial_vector)) -> wp.array(dtype=wp.spa
 
 
 @wp.func_native(SNIPPET, adj_snippet="")
+def dense_bool(a: wp.array(dtype=wp.bool)) -> wp.array(dtype=wp.bool): ...
+
+
+@wp.func_native(SNIPPET, adj_snippet="")
 def dense_mat33(a: wp.array(dtype=wp.mat33)) -> wp.array(dtype=wp.mat33): ...
 
 
@@ -66,6 +70,7 @@ def contiguous_model(s: ArticulationModel):
         dense_int32(s.body_tree),
         dense_int32(s.body_parent),
         dense_int32(s.body_root),
+        dense_bool(s.body_falls),
         dense_vec3(s.body_offset),
         dense_quat(s.body_rest),
         dense_float(s.body_mass),

@@ -1,4 +1,4 @@
-"""Floating components: what has been cut off keeps the momentum and the path that outer forces leave it.
+"""Floating components: what has been cut off and falls keeps the momentum and the path that outer forces leave it.
 
 The integration of joints errs in the momentum of a free tree by some dt^2; here root pose and rate are corrected after
 it, so that linear and angular momentum and the centre of mass come out exact.
@@ -6,6 +6,9 @@ it, so that linear and angular momentum and the centre of mass come out exact.
 Its centre of mass moves, and its root turns, at the mean of the rates before and after the step. What hits something is the
 exception: the contact solve lets it come as near as its rate after the step allows, and by the mean of both it would
 go half of what it did before into what it hits: through a wire, from 1.5 m/s on.
+
+What a tie holds is left out. The force of a stiff tie turns with what hangs from it; momentum would take it as it is at
+the start of the step, which is Euler's explicit method for a pendulum: (w dt)^2 of its kinetic energy are gained a step.
 """
 
 import warp as wp
@@ -169,7 +172,7 @@ def correct_floating_momentum(
 ):
     """One thread gives one floating component the momentum and the path of its centre of mass that outer forces leave it.
 
-    roots: [thread] the cut body; nothing happens in a tree with tree_rate [tree] above ``p.fault_rate``. tree_steps:
+    roots: [thread] the cut body, of a component that no tie holds; nothing happens in a tree with tree_rate [tree] above ``p.fault_rate``. tree_steps:
     [tree] substeps that the step is divided into; this corrects one of them. bodies: at the
     start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it; lever: [body] m. joints_out: joints at the end
     of the step; rotation, rates and place of the root are corrected.

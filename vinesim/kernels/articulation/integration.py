@@ -76,10 +76,11 @@ def integrate(
         if sound:
             rate = slower * prediction.joint_qd_free[k]
             share = phi
-            if floats:  # no spring turns it: phi beyond 1/2 would only add error
-                share = 0.5
-                joints_out.joint_x[k] = joints.joint_x[k] + 0.5 * dt * (
-                    joints.joint_xd[k] + prediction.joint_xd_free[k]
+            if floats:
+                if model.body_falls[k]:  # no spring turns it: phi beyond 1/2 would only add error
+                    share = 0.5
+                joints_out.joint_x[k] = joints.joint_x[k] + dt * (
+                    (1.0 - share) * joints.joint_xd[k] + share * prediction.joint_xd_free[k]
                 )
                 joints_out.joint_xd[k] = prediction.joint_xd_free[k]
             mean = (1.0 - share) * joints.joint_qd[k] + share * rate

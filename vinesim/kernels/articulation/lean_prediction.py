@@ -92,10 +92,9 @@ def applied_terms(
     inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
     falls = float(0.0)
     fall = wp.vec3()
-    root = model.body_root[k]
-    if root >= 0:
+    if model.body_falls[k]:
         falls = 1.0
-        fall = joints.joint_xd[root]
+        fall = joints.joint_xd[model.body_root[k]]
     load = forces.body_load[k]
     if model.body_parent[k] < 0:
         load = load + wp.spatial_vector(

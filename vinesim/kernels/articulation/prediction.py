@@ -91,7 +91,7 @@ def assemble_bodies(
         inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
         falls = float(0.0)
         fall = wp.vec3()
-        if model.body_root[k] >= 0:
+        if model.body_falls[k]:
             falls = 1.0
             fall = joints.joint_xd[model.body_root[k]]
         contact = wp.spatial_top(forces.body_wrench[k])

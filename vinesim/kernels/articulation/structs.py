@@ -55,6 +55,7 @@ class ArticulationModel:
     body_tree: wp.array(dtype=wp.int32)
     body_parent: wp.array(dtype=wp.int32)  # -1: none
     body_root: wp.array(dtype=wp.int32)  # the floating root that a body moves with, -1 for what stands
+    body_falls: wp.array(dtype=wp.bool)  # whether it moves with a floating root and no tie holds what does
     body_offset: wp.array(dtype=wp.vec3)  # [m] of the origin in the parent
     body_rest: wp.array(dtype=wp.quat)  # joint frame in the parent
     body_mass: wp.array(dtype=float)  # [kg]

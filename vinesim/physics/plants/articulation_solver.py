@@ -32,7 +32,7 @@ from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
 from vinesim.physics.plants.remote_pose import blend_towards
 from vinesim.physics.plants.step_runner import StepRunner
-from vinesim.physics.plants.ties import RootRests, TieTable
+from vinesim.physics.plants.ties import RootRests, TieTable, turning_damping
 from vinesim.physics.plants.topology import Topologies
 from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
@@ -89,7 +89,7 @@ class ArticulationSolver:
         if not 0.0 < dt < math.inf or not 0.5 <= phi <= 1.0:
             raise ValueError(f"dt {dt} s, phi {phi}: need a finite dt above 0 and phi from 0.5 to 1")
         validate(model, state)
-        self.model, self.state, self._dt = model, state, dt
+        self.model, self.state, self._dt, self._gravity = model, state, dt, p.gravity
         self.fast_rate = p.fast_joint_rate if fast_rate is None else fast_rate
         self.max_rate = p.max_joint_rate if max_rate is None else max_rate
         self.fault_rate = p.fault_joint_rate if fault_rate is None else fault_rate
@@ -153,7 +153,8 @@ class ArticulationSolver:
         self.body_product = np.zeros((bodies, 3), np.float32)
         """Entries yz, zx, xy of the inertia in the body's axes [body, 3] kg m^2: a compound is not symmetric."""
         self.joint_stiffness, self.joint_damping = model.joint_stiffness.copy(), model.joint_damping.copy()
-        """The model's, but none where a body has been cut off."""
+        """The model's, but none where a body has been cut off; if ties hold that, the damping is how they resist that
+        it turns."""
         self.tree_moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
         """Bodies of each tree that move [tree]: all, or all but the clusters."""
         self.body_impulse = np.zeros((bodies, 6), np.float32)
@@ -163,7 +164,8 @@ class ArticulationSolver:
         # as the kernels see the trees: a cut body has no parent and no lever
         self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
-        self._floating, self._roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
+        self._falls = np.zeros(bodies, np.bool_)  # of a floating component that no tie holds
+        self._floating, self._falling_roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
         self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
         self._last_contact = np.full(trees, -2, np.int64)  # tick of the last contact
@@ -190,7 +192,7 @@ class ArticulationSolver:
                     "tie_damping": ties.damping, "tie_softening": ties.softening, "tree_phi": self.phi,
                     "phi_used": self.phi_used, "tree_rate": self.tree_rate},
             wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
-            wp.bool: {"tree_awake": state.tree_awake},
+            wp.bool: {"tree_awake": state.tree_awake, "body_falls": self._falls},
             wp.vec3: {"body_offset": self._offset, "body_com": self.body_com, "body_inertia": self.body_inertia,
                       "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
                       "joint_damping": self.joint_damping, "tie_point": ties.point, "tie_anchor": ties.anchor,
@@ -292,7 +294,17 @@ class ArticulationSolver:
         while ((above := self._parent[up]) >= 0).any():
             up = np.where(above >= 0, above, up)
         self._root[bodies] = np.where(self.state.body_cut[up], up, -1)
-        self._roots = np.flatnonzero(self.state.body_cut).astype(np.int32)
+        self._find_falling(bodies)
+
+    def _find_falling(self, bodies: np.ndarray) -> None:
+        """Note which floating components of some whole trees no tie holds; ties resist that the others turn."""
+        root, is_cut = self._root[bodies], self.state.body_cut[bodies]
+        tied = np.isin(bodies, self.ties.tied_bodies)
+        self._falls[bodies] = (root >= 0) & ~np.isin(root, root[tied])
+        if is_cut.any():
+            damping = turning_damping(self.model, bodies, root, tied, self._gravity)
+            self.joint_damping[bodies[is_cut]] = damping[is_cut, None]
+        self._falling_roots = np.flatnonzero(self.state.body_cut & self._falls).astype(np.int32)
         self.launches.changed = True
 
     def set_mass(self, body: int, mass: float) -> None:
@@ -361,10 +373,10 @@ class ArticulationSolver:
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
-        if len(self._roots) == 0:
+        if len(self._falling_roots) == 0:
             return _NO_TREES, _NO_TREES
-        tree = self.model.body_tree[self._roots]
-        roots = self._roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
+        tree = self.model.body_tree[self._falling_roots]
+        roots = self._falling_roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
         return self.buffers.slots[roots], self.model.body_tree[roots]
 
     def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
@@ -474,13 +486,13 @@ class ArticulationSolver:
             raise ValueError(f"body {body} is a berry cluster, which cannot be held; hold its bunch")
         self.forward_kinematics(np.array([tree]))
         tie = self.ties.add(body, point, self.state.body_q[body].astype(float), stiffness, damping)
-        self.launches.changed = True
+        self._find_falling(self.bodies_of(np.array([tree])))
         return tie
 
     def remove_tie(self, body: int, tie: int) -> None:
         """Undo a tie of :meth:`add_tie`."""
         self.ties.remove(body, tie)
-        self.launches.changed = True
+        self._find_falling(self.bodies_of(self.model.body_tree[[body]]))
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
         """Force [N] and moment [N m, about the body's origin, world axes] on bodies from their parents [n, 6].

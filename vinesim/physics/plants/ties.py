@@ -14,6 +14,10 @@ import numpy as np
 from vinesim import frames
 from vinesim.scene.model import Model
 
+TURNING_TIME = 0.05
+"""[s] A tie grips what hangs from it: it resists that it turns, by so much damping for the stiffness that weight gives
+to its swing. GUESSED: a damping ratio of 0.1 where that swings in 1.5 s."""
+
 
 class TieLimitError(ValueError):
     """Too many bodies are held, or one of them in too many places."""
@@ -30,6 +34,7 @@ class TieTable:
 
     def __init__(self, model: Model, max_bodies: int, max_hands: int) -> None:
         self._max_bodies, self._max_hands, self._model_ties = max_bodies, max_hands, len(model.tie_body)
+        self._model_body = np.unique(model.tie_body)
         bodies = len(model.body_mass)
         self._max_model_ties = int(np.bincount(model.tie_body, minlength=bodies).max(initial=0))
         self._span_size = self._max_model_ties + max_hands
@@ -62,6 +67,11 @@ class TieTable:
     def held_bodies(self) -> list[int]:
         """Bodies with ties of :meth:`add`."""
         return list(self._slot_of)
+
+    @property
+    def tied_bodies(self) -> np.ndarray:
+        """Bodies with ties [k]."""
+        return np.append(self._model_body, np.array(self.held_bodies, np.int32))
 
     def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
         """Tie a body with world pose [7] at a point [3] m of its frame, where that is now; returns the tie.
@@ -125,3 +135,32 @@ class RootRests:
         """The outer product of this [tree, 3] (N m/rad)^(1/2), joint axes, with itself is by what spring and arm are
         less stiff than the spring alone, when all awake trees of the arm move as one. Only the sleep of trees asks for
         it."""
+
+
+def turning_damping(model: Model, bodies: np.ndarray, root: np.ndarray, tied: np.ndarray, gravity: float) -> np.ndarray:
+    """How much ties resist that floating components turn [k] N m s/rad: of each component at its root, 0 elsewhere.
+
+    :data:`TURNING_TIME` times the stiffness that weight gives to its swing if it hangs straight down: masses times
+    lengths along the wood to the nearest tie. It depends on the model, the cuts and the ties alone, so it is the same
+    for a client that joins later.
+
+    Args:
+        model: of the trees.
+        bodies: of some whole trees [k].
+        root: [k] the floating root that each moves with, -1 for none.
+        tied: [k] bool, whether it has ties.
+        gravity: [m/s^2]
+    """
+    damping = np.zeros(len(bodies), np.float32)
+    along, up = np.zeros(len(bodies)), bodies
+    while (up >= 0).any():
+        along += np.where(up >= 0, np.linalg.norm(model.body_offset[up], axis=1), 0.0)
+        up = np.where(up >= 0, model.body_parent[up], -1)
+    tree = model.body_tree[bodies]
+    core = bodies - model.tree_first[tree] < model.tree_core[tree]  # a bunch's mass has its clusters in it
+    middle = along + model.body_com[bodies, 0]
+    for cut in np.unique(root[tied & (root >= 0)]):
+        own = (root == cut) & core
+        arm = np.abs(middle[own, None] - along[own & tied]).min(1)
+        damping[bodies == cut] = TURNING_TIME * gravity * float(model.body_mass[bodies[own]] @ arm)
+    return damping
