@@ -53,6 +53,19 @@ def test_an_exact_track_tells_the_modulus_exactly(seed: int) -> None:
     assert fit.estimate("damping").value == pytest.approx(case.truth.damping.value, rel=5e-3)
 
 
+def test_each_axis_weighs_by_its_own_noise() -> None:
+    """A camera measures distances less exactly than directions; across the plane of the swing they tell nothing."""
+    exact = measure(cane(), dataclasses.replace(SHORT, noise=0.0))
+    noise = np.random.default_rng(5).normal(size=exact.position.shape)
+    both = tune(cane(3e9), dataclasses.replace(exact, position=exact.position + noise * [1e-4, 2e-3, 1e-4]))
+    across = exact.position + noise * [1e-4, np.nan, 1e-4]
+    alone = tune(cane(3e9), dataclasses.replace(exact, position=across))
+    np.testing.assert_allclose(both.column_noise, [1e-4, 2e-3, 1e-4], rtol=0.25)
+    np.testing.assert_allclose(both.posterior.deviation[:2], alone.posterior.deviation[:2], rtol=0.1)
+    np.testing.assert_allclose(both.posterior.mean[:2], alone.posterior.mean[:2], atol=2e-4)
+    assert any("2.0" in line and "in tip y" in line for line in both.lines())
+
+
 def test_a_free_swing_tells_modulus_over_mass_and_the_fit_says_so(track: Trajectory) -> None:
     fit = tune(cane(3e9), track, ("modulus", "damping", "mass"))
     (ridge,) = fit.posterior.ridges

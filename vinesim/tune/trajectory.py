@@ -76,6 +76,11 @@ class Trajectory:
         return np.any(np.isfinite(self.position), axis=0)
 
     @property
+    def column_names(self) -> list[str]:
+        """Names of the tracked columns: marker and axis."""
+        return [f"{self.markers[marker]} {'xyz'[axis]}" for marker, axis in np.argwhere(self.tracked)]
+
+    @property
     def rate(self) -> float:
         """[1/s] Samples a second, by the median."""
         return float(1.0 / np.median(np.diff(self.time)))
