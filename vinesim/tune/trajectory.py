@@ -106,7 +106,8 @@ class Trajectory:
             out = csv.writer(file, lineterminator="\n")
             out.writerow([name for name, _ in columns])
             for row in zip(*(values.tolist() for _, values in columns), strict=True):
-                out.writerow(["" if math.isnan(value) else f"{value:.6g}" for value in row])
+                clock, *values = row  # in microseconds: a time since 1970 keeps its thirtieths of a second
+                out.writerow([f"{round(clock, 6):.16g}", *("" if math.isnan(x) else f"{x:.6g}" for x in values)])
 
 
 def _moved_axes(base: np.ndarray) -> list[int]:
@@ -205,6 +206,11 @@ def _read_name(place: str, text: str) -> _Column:
     else:
         raise TrajectoryError(
             f"{place} is not known; name it time, x, y, z, 'MARKER x', 'base x' or force, with its unit"
+        )
+    if kind == "position" and unit.lower() in ("px", "pixel", "pixels"):
+        raise TrajectoryError(
+            f"{place}: a position in pixels; multiply it by the mm of a pixel in the plane of the swing (a ruler held "
+            "there, over its pixels), let z point up, and name it [mm]"
         )
     if unit not in _UNITS[kind]:
         raise TrajectoryError(f"{place}: unit {unit!r} of a {kind}; give {' or '.join(_UNITS[kind])}")
