@@ -227,3 +227,20 @@ def test_a_plant_is_tested_on_another_release(track: Trajectory) -> None:
     wrong = tune(cane(5.5e9), track, ())
     assert not wrong.ok
     assert wrong.noise > 1.3 * right.noise
+
+
+def test_a_force_that_contradicts_the_fit_is_a_fault(track: Trajectory) -> None:
+    """A gauge that was read in the wrong unit made a modulus three times too high, or a mass."""
+    held = np.where(track.time < 0.2, 1.2, np.nan)
+    wrong = dataclasses.replace(track, force=held)
+    assert any("the gauge showed 1.2 N" in fault for fault in tune(cane(3e9), wrong).faults)
+    heavy = tune(cane(3e9), wrong, ("modulus", "damping", "mass"))
+    assert any("times that of the specimen" in fault for fault in heavy.faults)
+    nothing = dataclasses.replace(track, force=np.zeros(len(track.time)))
+    with pytest.raises(TrajectoryError, match=r"no reading above 0 before the release at 0\.2"):
+        tune(cane(3e9), nothing, ("modulus", "damping", "mass"))
+
+
+def test_centimetres_for_millimetres_are_asked_for(track: Trajectory) -> None:
+    fit = tune(cane(3e9), dataclasses.replace(track, position=10.0 * track.position))
+    assert any("is the unit right" in fault for fault in fit.faults)

@@ -19,7 +19,7 @@ from vinesim.tune.base_motion import SampledMotion
 from vinesim.tune.candidates import COLUMNS, Candidates
 from vinesim.tune.features import Features, columns_of
 from vinesim.tune.priors import Prior
-from vinesim.tune.trajectory import Trajectory
+from vinesim.tune.trajectory import Trajectory, TrajectoryError
 
 PHYSICAL = COLUMNS[:5]
 SOFT = 3.0
@@ -87,6 +87,12 @@ class Problem:
         known = priors | {"release": Prior(features.release, turn, "onset of the motion")}
         self.priors = [known.get(name, flat) for name in self.names]
         self.force = _force_reading(track, features.release, pushed)
+        if track.force is not None and self.force is None and "mass" in fitted:
+            when = "after the push" if pushed else f"before the release at {features.release:.2f} s"
+            raise TrajectoryError(
+                f"{track.source}: 'force' has no reading above 0 {when}; give the pull that held the tip, "
+                "or do not fit the mass"
+            )
         self.pull_scale = 1.0
         """[N] Size of the pull, for the step of its derivative."""
         self.evaluations = 0

@@ -191,7 +191,11 @@ def _read_header(path: pathlib.Path, line: int, names: list[str]) -> list[_Colum
 
 def _read_name(place: str, text: str) -> _Column:
     found = _HEADER.fullmatch(text.strip())
-    if not found:
+    if not found and text.strip().lower() in ("frame", "frames", "picture"):
+        raise TrajectoryError(f"{place} numbers pictures; divide it by the pictures a second and name it 'time [s]'")
+    if not found or ";" in text or "\t" in text:
+        if ";" in text or "\t" in text:
+            raise TrajectoryError(f"{place} holds several names; separate the columns by commas, decimals by points")
         raise TrajectoryError(f"{place} has no unit; name it with its unit, e.g. 'time [s]', 'x [mm]', 'force [N]'")
     name, unit = found["name"].strip(), found["unit"].strip()
     words = name.replace(".", " ").replace("_", " ").split()
@@ -213,7 +217,8 @@ def _read_name(place: str, text: str) -> _Column:
             "there, over its pixels), let z point up, and name it [mm]"
         )
     if unit not in _UNITS[kind]:
-        raise TrajectoryError(f"{place}: unit {unit!r} of a {kind}; give {' or '.join(_UNITS[kind])}")
+        hint = "; a balance that shows 1 kg is pulled by 9.81 N" if unit in ("kg", "g") and kind == "force" else ""
+        raise TrajectoryError(f"{place}: unit {unit!r} of a {kind}; give {' or '.join(_UNITS[kind])}{hint}")
     return _Column(kind, _SCALE[unit], marker, axis)
 
 

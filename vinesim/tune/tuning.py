@@ -24,6 +24,10 @@ STEP_PHASE = 0.1
 """[rad] By which the first mode turns in a step of the simulation: errs by 0.2 % in modulus before it is corrected."""
 PARAMETERS = {"modulus": ("modulus",), "damping": ("damping",), "mass": ("mass",), "rest": ("bow_y", "bow_z")}
 """What can be fitted, and which columns of a candidate that are."""
+CONTRADICTS = 4.0
+"""[1] Standard deviations of its prior by which a fitted mass is no mass of wood."""
+WIDE = 0.5
+"""[1] A swing over the plant's length that is rather a wrong unit."""
 UNEXPLAINED = 1.3
 """A fit that leaves so many times more than a damped sinusoid does has failed."""
 HORIZONS = (1.0, 2.0, 4.0, 8.0)
@@ -74,6 +78,7 @@ def tune(
         theta = problem.correct_discretisation(theta, noise)
         found = problem.evaluate(theta)
     posterior = laplace(problem, theta, found, noise)
+    faults = (*_faults(problem, posterior, _left(problem, found)), *_contradictions(problem, found, theta))
     sample = importance_sample(problem, posterior, noise, samples, seed) if samples else None
     model = np.full(problem.observed.shape, np.nan)
     model[problem.seen] = found.model
@@ -82,7 +87,7 @@ def tune(
         specimen=specimen, track=track, features=features, posterior=posterior, sample=sample,
         noise=_left(problem, found), column_noise=noise,
         frequency=swing.frequency, damping_ratio=swing.damping_ratio, model=model, jacobian=found.jacobian,
-        minima=minima, faults=_faults(problem, posterior, _left(problem, found)), dt=dt,
+        minima=minima, faults=faults, dt=dt,
         force=problem.force, priors=dict(zip(problem.names, problem.priors, strict=True)),
     )  # fmt: skip
 
@@ -115,7 +120,7 @@ def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> N
             remedy = "sweep through the plant's first mode, or shake further"
         raise TrajectoryError(
             f"{track.source}: no swing stands out: {1e3 * reach:.3g} mm of it, {1e3 * features.noise:.3g} mm of noise; "
-            f"check the unit and the columns, {remedy}"
+            f"check the unit, and that an axis of the swing has a column; {remedy}"
         )
     if reach < 0.002 * length:
         raise TrajectoryError(
@@ -204,3 +209,27 @@ def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, 
             faults.append(f"{name} went {math.exp(posterior.mean[problem.names.index(name)]):.3g} times off its start")
     assert set(problem.fitted) <= set(COLUMNS)
     return tuple(faults)
+
+
+def _contradictions(problem: Problem, found: Evaluation, theta: np.ndarray) -> list[str]:
+    """What the user gave beside the track and the fit denies."""
+    faults = []
+    features, specimen = problem.features, problem.specimen
+    reach, length = float(np.abs(features.displacement).max()), specimen.length.value
+    failed = _left(problem, found) > UNEXPLAINED * features.noise
+    if reach > WIDE * length and failed:
+        faults.append(f"the swing is {reach:.3g} m wide, the plant {length:.3g} m long: is the unit right (m, cm, mm)?")
+    if problem.force is not None and "mass" not in problem.names and failed:
+        faults.append(
+            f"the gauge showed {problem.force[0]:.3g} N, which such a mass may not allow: check unit and zero of the "
+            "gauge, density and diameters; or fit the mass (--fit modulus,damping,mass), or remove the column"
+        )
+    if "mass" in problem.names:
+        at = problem.names.index("mass")
+        prior = problem.priors[at]
+        if abs(theta[at] - prior.mean) > CONTRADICTS * prior.deviation:
+            faults.append(
+                f"the mass is {math.exp(theta[at]):.3g} times that of the specimen, beyond what wood is: check unit "
+                "and zero of the force, and the diameters"
+            )
+    return faults
