@@ -53,6 +53,19 @@ def test_an_exact_track_tells_the_modulus_exactly(seed: int) -> None:
     assert fit.estimate("damping").value == pytest.approx(case.truth.damping.value, rel=5e-3)
 
 
+def test_each_axis_weighs_by_its_own_noise() -> None:
+    """A camera measures distances less exactly than directions; across the plane of the swing they tell nothing."""
+    exact = measure(cane(), dataclasses.replace(SHORT, noise=0.0))
+    noise = np.random.default_rng(5).normal(size=exact.position.shape)
+    both = tune(cane(3e9), dataclasses.replace(exact, position=exact.position + noise * [1e-4, 2e-3, 1e-4]))
+    across = exact.position + noise * [1e-4, np.nan, 1e-4]
+    alone = tune(cane(3e9), dataclasses.replace(exact, position=across))
+    np.testing.assert_allclose(both.column_noise, [1e-4, 2e-3, 1e-4], rtol=0.25)
+    np.testing.assert_allclose(both.posterior.deviation[:2], alone.posterior.deviation[:2], rtol=0.1)
+    np.testing.assert_allclose(both.posterior.mean[:2], alone.posterior.mean[:2], atol=2e-4)
+    assert any("2.0" in line and "in tip y" in line for line in both.lines())
+
+
 def test_a_free_swing_tells_modulus_over_mass_and_the_fit_says_so(track: Trajectory) -> None:
     fit = tune(cane(3e9), track, ("modulus", "damping", "mass"))
     (ridge,) = fit.posterior.ridges
@@ -214,3 +227,20 @@ def test_a_plant_is_tested_on_another_release(track: Trajectory) -> None:
     wrong = tune(cane(5.5e9), track, ())
     assert not wrong.ok
     assert wrong.noise > 1.3 * right.noise
+
+
+def test_a_force_that_contradicts_the_fit_is_a_fault(track: Trajectory) -> None:
+    """A gauge that was read in the wrong unit made a modulus three times too high, or a mass."""
+    held = np.where(track.time < 0.2, 1.2, np.nan)
+    wrong = dataclasses.replace(track, force=held)
+    assert any("the gauge showed 1.2 N" in fault for fault in tune(cane(3e9), wrong).faults)
+    heavy = tune(cane(3e9), wrong, ("modulus", "damping", "mass"))
+    assert any("times that of the specimen" in fault for fault in heavy.faults)
+    nothing = dataclasses.replace(track, force=np.zeros(len(track.time)))
+    with pytest.raises(TrajectoryError, match=r"no reading above 0 before the release at 0\.2"):
+        tune(cane(3e9), nothing, ("modulus", "damping", "mass"))
+
+
+def test_centimetres_for_millimetres_are_asked_for(track: Trajectory) -> None:
+    fit = tune(cane(3e9), dataclasses.replace(track, position=10.0 * track.position))
+    assert any("is the unit right" in fault for fault in fit.faults)

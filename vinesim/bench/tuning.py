@@ -35,7 +35,7 @@ SPEED_SEEDS = 3
 """Tracks on which peers are timed."""
 STEIN_SEEDS = 4
 """Tracks of which Stein particles give the posterior."""
-PICTURE_SEEDS = 5
+PICTURE_SEEDS = 20
 """Swings that are filmed."""
 ROD_SEEDS = 5
 """Tracks from PyElastica, each of some 700,000 steps: 20 s of CPU."""

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 import pathlib
 import sys
 from typing import TYPE_CHECKING
 
+from vinesim.errors import UsageError
+
 if TYPE_CHECKING:
     from vinesim.tune.experiment import Experiment
+
+
+LEAST_CHROMA = 0.2
+"""[1] Of a marker's colour: largest less least of red, green and blue, over the largest."""
 
 
 class ScipyMissing(RuntimeError):
@@ -47,6 +54,54 @@ def run(
     if out is not None:
         found.write_plant(out)
     return 0
+
+
+def track(
+    recording: pathlib.Path, markers: list[str], radius: float, out: pathlib.Path, image: str | None,
+    depth: str | None, pose: tuple[float, ...] | None, rate: float | None,
+) -> int:  # fmt: skip
+    """Write the track of markers in recorded pictures and say how many were found; the exit code."""
+    require_scipy()
+    import numpy as np
+
+    from vinesim.sensors.recorded_pictures import read_pictures
+    from vinesim.tune import track_marker
+
+    if not radius > 0.0:
+        raise UsageError(f"--radius is {radius:g}; give the ball's radius in metres, above 0")
+    if rate is not None and not rate > 0.0:
+        raise UsageError(f"--rate is {rate:g}; give pictures a second, above 0")
+    where = None
+    if pose is not None:
+        where = np.array(pose)
+        size = float(np.linalg.norm(where[3:]))
+        if not abs(size - 1.0) < 0.01:
+            raise UsageError(f"--pose ends with a quaternion of length {size:.3g}; give x y z and qx qy qz qw")
+        where[3:] /= size
+    colours = dict(_read_marker(text) for text in markers)
+    pictures = read_pictures(recording, image=image, depth=depth, pose=where, rate=rate)
+    found = track_marker(pictures, colours, radius=radius, source=recording.name)
+    found = dataclasses.replace(found, time=found.time - found.time[0])
+    found.write(out)
+    print(f"track    {out}: {len(found.time)} pictures in {found.time[-1]:.2f} s")
+    for name, places in zip(found.markers, found.position.swapaxes(0, 1), strict=True):
+        seen = np.isfinite(places).all(1)
+        low, high = 1e3 * np.nanmin(places, 0), 1e3 * np.nanmax(places, 0)
+        spans = ", ".join(f"{axis} {b - a:.0f} mm" for axis, a, b in zip("xyz", low, high, strict=True))
+        print(f"{name:8s} found in {seen.sum()}, the others are gaps; moved over {spans}")
+    return 0
+
+
+def _read_marker(text: str) -> tuple[str, tuple[int, int, int]]:
+    """Name and colour of ``R,G,B`` (the tip's) or ``NAME=R,G,B``."""
+    name, _, colour = text.rpartition("=")
+    parts = colour.split(",")
+    if len(parts) != 3 or not all(part.strip().isdigit() and int(part) < 256 for part in parts):
+        raise UsageError(f"--marker is {text!r}; give its colour in a picture as R,G,B of 0 to 255, e.g. 224,60,130")
+    red, green, blue = (int(part) for part in parts)
+    if max(red, green, blue) - min(red, green, blue) < LEAST_CHROMA * max(red, green, blue):
+        raise UsageError(f"--marker is {text!r}, nearly grey; take a marker of a colour that nothing else has")
+    return name.strip() or "tip", (red, green, blue)
 
 
 def plan(experiment: Experiment, model: pathlib.Path, out: pathlib.Path | None, fit: str, as_json: bool) -> int:

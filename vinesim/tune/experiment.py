@@ -99,12 +99,14 @@ class Experiment:
             raise UsageError(f"axes is {self.axes!r}; give one or more of x, y, z")
 
 
-def measure(specimen: Specimen, experiment: Experiment = Experiment(), *, exact: bool = False) -> Trajectory:
-    """The track of an experiment on a specimen; ``exact``: without noise."""
+def measure(
+    specimen: Specimen, experiment: Experiment = Experiment(), *, exact: bool = False, step: float = TRUTH_STEP
+) -> Trajectory:
+    """The track of an experiment on a specimen, simulated in steps of ``step`` [s]; ``exact``: without noise."""
     experiment.check()
     e, rng = experiment, np.random.default_rng(experiment.seed)
     specimen = msgspec.structs.replace(specimen, segments=max(TRUTH_SEGMENTS, specimen.segments))
-    candidates = Candidates(specimen, e.markers, dt=TRUTH_STEP)
+    candidates = Candidates(specimen, e.markers, dt=step)
     row = np.zeros((1, len(COLUMNS)))
     row[0, 3:5] = specimen.bow
     shaking = _sweep(candidates, e) if e.kind == "shake" else None
@@ -112,11 +114,11 @@ def measure(specimen: Specimen, experiment: Experiment = Experiment(), *, exact:
         row[0, 5:] = pull_for(candidates, e.number("displacement"), math.radians(e.angle))
     time = np.arange(math.ceil((e.hold + e.number("duration")) * e.rate - 1e-9)) / e.rate
     after = time if shaking else np.maximum(time - e.hold, 0.0)
-    tick = np.floor(after / TRUTH_STEP + 1e-6).astype(int)
+    tick = np.floor(after / step + 1e-6).astype(int)
     ticks, index = np.unique(tick, return_inverse=True)
-    moved = shaking.velocity(TRUTH_STEP * np.arange(ticks[-1] + 2)) if shaking else None
+    moved = shaking.velocity(step * np.arange(ticks[-1] + 2)) if shaking else None
     motion = candidates.run(row, ticks, pushed=e.kind == "push", base_velocity=moved)
-    position = motion.at(index, (after - tick * TRUTH_STEP)[None])[0][0].astype(float)
+    position = motion.at(index, (after - tick * step)[None])[0][0].astype(float)
     base = shaking.position(time) if shaking else None
     if base is not None:
         position += base[:, None]

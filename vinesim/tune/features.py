@@ -23,6 +23,11 @@ RELATIVE_STEP = 0.03
 """[1] Between trial frequencies of an oscillator that is shaken, over the frequency."""
 SUBSTEPS = 8
 """Parts of a sample interval in each of which the acceleration of a base is taken for constant."""
+STANDS_OUT = 0.1
+"""[1] Share of the whole range by which a sample must be off the first ones to be motion, not noise. A turning point is
+known to a quarter of a period, so an onset that is noticed a little late does no harm, one in the hold does."""
+CLEARLY = 5.0
+"""[1] Less loss, in squares of standard deviations, that another release must leave."""
 DAMPING_RATIOS = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35])
 """Trial damping ratios."""
 
@@ -87,7 +92,8 @@ def find_onset(track: Trajectory) -> float:
     noise = max(_hold_noise(values), 1e-9)
     start = np.nanmedian(values[: max(3, min(5, len(values) // 8))], axis=0)
     off = np.max(np.abs(np.nan_to_num(values - start)), axis=1)
-    moved = np.flatnonzero(off > 6.0 * noise)
+    span = float(np.nanmax(np.nanquantile(values, 0.98, axis=0) - np.nanquantile(values, 0.02, axis=0)))
+    moved = np.flatnonzero(off > max(6.0 * noise, STANDS_OUT * span))
     return float(time[max(0, int(moved[0]) - 1)]) if len(moved) else float(time[0])
 
 
@@ -144,7 +150,17 @@ def extract_features(track: Trajectory, onset: float | None = None) -> Features:
     """
     if track.base is not None:
         return _shaken_features(track)
-    onset = find_onset(track) if onset is None else onset
+    if onset is None:
+        found = _free_features(track, find_onset(track))
+        release = _find_release(track, found)
+        if release == found.release:
+            return found
+        onset = max(release, float(track.time[0]))
+    return _free_features(track, onset)
+
+
+def _free_features(track: Trajectory, onset: float) -> Features:
+    """Those of the damped sinusoid nearest to the track after ``onset`` [s]."""
     here = track.time >= onset
     time, values = track.time[here] - onset, columns_of(track)[here]
     duration = float(time[-1] - time[0])
@@ -152,6 +168,24 @@ def extract_features(track: Trajectory, onset: float | None = None) -> Features:
     grid = np.arange(0.5 / duration, max(0.45 * track.rate, 1.0 / duration), step)
     best, found, off = _search(functools.partial(_basis, time), values, grid, lambda _: step, 0.05 / duration)
     return _describe(onset, best, found, off, values, 1.0 / track.rate)
+
+
+def _find_release(track: Trajectory, features: Features) -> float:
+    """[s] The turning point of the sinusoid before which the track holds still best: that of ``features``, unless
+    another half period is clearly better."""
+    values, time = columns_of(track), track.time
+    half = 0.5 / features.frequency
+    first = min(features.release, float(time[0]))
+    count = int((0.5 * (time[0] + time[-1]) - first) / half)
+    places = features.release + half * np.arange(-1, max(count, 1) + 1)
+    omega, ratio = 2.0 * np.pi * features.frequency, features.damping_ratio
+    after = np.maximum(time, places[:, None]) - features.release  # [place, sample]
+    wave = np.exp(-ratio / math.sqrt(1.0 - ratio**2) * omega * after) * np.cos(omega * after)
+    off = values - features.rest - wave[..., None] * features.displacement
+    spread = np.array([robust_deviation(column) for column in off[int(np.argmin(np.abs(places - features.release)))].T])
+    loss = np.nansum(np.sqrt(1.0 + (off / np.maximum(spread, 1e-9)) ** 2) - 1.0, (1, 2))
+    best = int(np.argmin(loss))
+    return float(places[best]) if loss[best] < loss[1] - CLEARLY else features.release
 
 
 def _shaken_features(track: Trajectory) -> Features:

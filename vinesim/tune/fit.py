@@ -64,7 +64,9 @@ class Fit:
     sample: Sample | None
     """Draws from the posterior, if they were asked for."""
     noise: float
-    """[m] Robust standard deviation of what the fit leaves."""
+    """[m] Robust standard deviation of what the fit leaves of all columns together."""
+    column_noise: np.ndarray
+    """[column] m, of each: cameras measure distances less exactly than directions."""
     frequency: float
     """[Hz] Of the fitted plant."""
     damping_ratio: float
@@ -115,7 +117,7 @@ class Fit:
     def outliers(self) -> int:
         """Samples that weigh less than half, or were left out as gross errors."""
         data = self.track.position[:, self.track.tracked]
-        off = np.abs(self.model - data) / self.noise
+        off = np.abs(self.model - data) / self.column_noise
         gross = np.isfinite(data) & ~np.isfinite(self.model)
         return int((off > math.sqrt(3.0) * SOFT).sum() + gross.sum())
 
@@ -139,7 +141,7 @@ class Fit:
             f"{f.frequency:.3f} Hz, {f.damping_ratio:.4f} (log decrement {f.log_decrement:.3f})"
         )
         lines.append(
-            f"noise    {1e3 * self.noise:.2f} mm; {self.outliers} outliers weigh less, {self.gaps} positions missing"
+            f"noise    {self._noise_words()}; {self.outliers} outliers weigh less, {self.gaps} positions missing"
         )
         for ridge in self.posterior.ridges:
             way = ", ".join(f"{name} {x:+.2f}" for name, x in ridge.direction.items())
@@ -149,6 +151,17 @@ class Fit:
                 f"minimum  another at {_short(minimum.modulus)} Pa, with {minimum.loss_ratio:.1f} times the loss"
             )
         return lines + [f"fault    {fault}" for fault in self.faults]
+
+    def _noise_words(self) -> str:
+        """The noise of each column, once if all are alike."""
+        low, high = float(self.column_noise.min()), float(self.column_noise.max())
+        if high < 2.0 * low:
+            return f"{1e3 * self.noise:.2f} mm"
+        names = (
+            f"{1e3 * noise:.2f} mm in {name}"
+            for name, noise in zip(self.track.column_names, self.column_noise, strict=True)
+        )
+        return ", ".join(names)
 
     def _remedy(self, direction: dict[str, float]) -> str:
         if "modulus" in direction and "mass" in direction and self.track.base is not None:
@@ -172,6 +185,7 @@ class Fit:
                 "release_s": self.features.release,
             },
             "noise_m": self.noise,
+            "column_noise_m": dict(zip(self.track.column_names, self.column_noise.tolist(), strict=True)),
             "outliers": self.outliers,
             "gaps": self.gaps,
             "ridges": [dataclasses.asdict(ridge) for ridge in self.posterior.ridges],

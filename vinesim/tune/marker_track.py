@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from scipy import ndimage
@@ -10,7 +10,8 @@ from scipy import ndimage
 from vinesim import frames
 from vinesim.scene.camera_geometry import back_project
 from vinesim.scene.values import CameraFrame
-from vinesim.tune.trajectory import Trajectory
+from vinesim.tune.specimen import TIP
+from vinesim.tune.trajectory import MIN_SAMPLES, Trajectory, TrajectoryError
 
 MAX_TURN = np.radians(30.0)
 """[rad] Largest difference in hue between a pixel of the marker and its colour, as the angle between their
@@ -25,10 +26,14 @@ MIDDLE_DEPTH = 0.707
 """[1] Half of a ball's disc is nearer than its centre by more than so many radii: the median of its depth."""
 
 
+Colour = tuple[int, int, int]
+"""[3] red, green and blue, 0..255; only the ratios count."""
+
+
 def track_marker(
-    pictures: Iterable[CameraFrame], colour: tuple[int, int, int], *, radius: float, source: str = "pictures"
+    pictures: Iterable[CameraFrame], colour: Colour | Mapping[str, Colour], *, radius: float, source: str = "pictures"
 ) -> Trajectory:
-    """The track of a ball of one colour at the tip.
+    """The track of a ball of one colour at the tip, or of several, each of its own colour.
 
     In each picture the largest patch of that colour is the ball. Its place is the centroid of the patch, its distance
     the median of the depth there and 0.7 of the radius. A picture in which it is too small, touches the edge or has no
@@ -36,21 +41,33 @@ def track_marker(
 
     Args:
         pictures: in the order of time, with colours and measured depth. One at a time is held.
-        colour: [3] red, green and blue of the ball in the pictures, 0..255; only the ratios count. It should be
-            saturated, and of a hue that nothing else has.
-        radius: [m] of the ball.
+        colour: of the ball in the pictures, or of each marker by its name. It should be saturated, and of a hue that
+            nothing else has.
+        radius: [m] of the balls.
         source: a name for messages.
 
     :class:`~vinesim.tune.trajectory.TrajectoryError` for fewer pictures than a track has samples, or if none shows it.
     """
-    time, position = [], []
+    colours = dict(colour) if isinstance(colour, Mapping) else {TIP: colour}
+    time, position, patches = [], [], np.zeros(len(colours), int)
     for picture in pictures:
         time.append(picture.time)
-        position.append(_centre(picture, colour, radius))
-    return Trajectory(np.array(time), np.array(position).reshape(-1, 1, 3), source=source)
+        found = [find_marker(picture.rgb, one) for one in colours.values()]
+        patches += [patch is not None for patch in found]
+        position.append([_centre(picture, patch, radius) for patch in found])
+    track = np.array(position).reshape(-1, len(colours), 3)
+    for name, count, places in zip(colours, patches, track.swapaxes(0, 1), strict=True):
+        if len(time) < MIN_SAMPLES or np.isfinite(places).any():
+            continue
+        if count:
+            trouble = f"was found in {count} of {len(time)} pictures, but none has depth there; record aligned depth"
+        else:
+            trouble = f"was found in none of {len(time)} pictures; pick its colour in one of them"
+        raise TrajectoryError(f"{source}: the marker {name!r} of colour {','.join(map(str, colours[name]))} {trouble}")
+    return Trajectory(np.array(time), track, tuple(colours), source=source)
 
 
-def find_marker(rgb: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray | None:
+def find_marker(rgb: np.ndarray, colour: Colour) -> np.ndarray | None:
     """The pixels [height, width] bool of the largest patch of a colour in ``rgb`` [height, width, 3], holes filled.
 
     None if it is too small or touches the edge.
@@ -78,9 +95,8 @@ def _off_grey(rgb: np.ndarray) -> np.ndarray:
     return rgb / np.maximum(rgb.sum(-1, dtype=np.int32), 1)[..., None] - 1.0 / 3.0
 
 
-def _centre(picture: CameraFrame, colour: tuple[int, int, int], radius: float) -> np.ndarray:
-    """The ball's centre [3] m in the world; NaN where there is none."""
-    patch = find_marker(picture.rgb, colour)
+def _centre(picture: CameraFrame, patch: np.ndarray | None, radius: float) -> np.ndarray:
+    """The centre [3] m in the world of the ball that shows as a patch [height, width]; NaN where there is none."""
     depth = np.zeros(0) if patch is None else picture.depth[patch]
     depth = depth[np.isfinite(depth)]
     if patch is None or len(depth) < MIN_PIXELS:

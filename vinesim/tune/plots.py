@@ -47,13 +47,13 @@ def draw_track(fit: Fit, axes: Axes, column: int | None = None) -> None:
     seen = np.isfinite(fit.model)
     spread = np.full(fit.model.shape, np.nan)
     spread[seen] = np.einsum("oi,ij,oj->o", fit.jacobian, fit.posterior.covariance, fit.jacobian)
-    half = Z90 * np.sqrt(spread[:, column] + fit.noise**2)
+    half = Z90 * np.sqrt(spread[:, column] + fit.column_noise[column] ** 2)
     data = fit.track.position[:, fit.track.tracked][:, column]
     time, model = fit.track.time, fit.model[:, column]
     axes.fill_between(time, 1e3 * (model - half), 1e3 * (model + half), color="C0", alpha=0.25, lw=0, label="90 %")
     axes.plot(time, 1e3 * model, color="C0", lw=1.0, label="fitted")
     axes.plot(time, 1e3 * data, ".", color="k", ms=3.0, label="track")
-    axes.set_ylabel(f"{column_names(fit)[column]} [mm]")
+    axes.set_ylabel(f"{fit.track.column_names[column]} [mm]")
     axes.set_title(f"{fit.frequency:.2f} Hz, damping ratio {fit.damping_ratio:.3f}", fontsize="medium")
     axes.legend(fontsize="small", loc="upper right")
 
@@ -61,10 +61,10 @@ def draw_track(fit: Fit, axes: Axes, column: int | None = None) -> None:
 def draw_residuals(fit: Fit, axes: Axes) -> None:
     """What the fit leaves in every column, and the noise."""
     off = 1e3 * (fit.track.position[:, fit.track.tracked] - fit.model)
-    for column, name in zip(off.T, column_names(fit), strict=True):
-        axes.plot(fit.track.time, column, ".", ms=3.0, label=name)
-    for sign in (-Z90, Z90):
-        axes.axhline(1e3 * sign * fit.noise, color="k", lw=0.6, ls="--")
+    for column, noise, name in zip(off.T, fit.column_noise, fit.track.column_names, strict=True):
+        (dots,) = axes.plot(fit.track.time, column, ".", ms=3.0, label=name)
+        for sign in (-Z90, Z90):
+            axes.axhline(1e3 * sign * noise, color=dots.get_color(), lw=0.6, ls="--")
     axes.set_ylabel("residual [mm]")
     axes.set_xlabel("time [s]")
     axes.legend(fontsize="small", loc="upper right", ncols=3)
@@ -107,13 +107,8 @@ def draw_held_out(fit: Fit, held_out: Fit, axes: Axes) -> None:
     data = held_out.track.position[:, held_out.track.tracked][:, column]
     axes.plot(held_out.track.time, 1e3 * data, ".", color="k", ms=3.0, label="held out")
     axes.set_xlabel("time [s]")
-    axes.set_ylabel(f"{column_names(fit)[column]} [mm]")
+    axes.set_ylabel(f"{fit.track.column_names[column]} [mm]")
     axes.legend(fontsize="small")
-
-
-def column_names(fit: Fit) -> list[str]:
-    """Names of the tracked columns: marker and axis."""
-    return [f"{fit.track.markers[marker]} {'xyz'[axis]}" for marker, axis in np.argwhere(fit.track.tracked)]
 
 
 def _normal(x: np.ndarray, mean: float, deviation: float) -> np.ndarray:

@@ -51,20 +51,21 @@ class Posterior:
         return float(self.mean[i]) - half, float(self.mean[i]) + half
 
 
-def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: float) -> Posterior:
-    """The posterior around a minimum ``theta`` that was evaluated.
+def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.ndarray) -> Posterior:
+    """The posterior around a minimum ``theta`` that was evaluated, for a ``noise`` [column] m.
 
     The covariance is that of an M-estimator (Huber 1981) with the soft L1 loss, so that outliers and heavy tails widen
     it; residuals that are correlated count as fewer.
     """
-    residual = (found.model - problem.observed[problem.seen]) / noise
+    table = problem.residuals(found.model) / noise
+    residual = table[problem.seen]
     z = residual**2 / SOFT**2
+    weighted = found.jacobian / np.broadcast_to(noise, table.shape)[problem.seen][:, None]
     slope = float(np.mean((1.0 + z) ** -1.5))
     free = max(len(residual) - len(theta), 1)
     spread = float((residual**2 / (1.0 + z)).sum()) / free
-    correlation_time = _correlation_time(problem, residual)
-    weight = slope**2 / (spread * correlation_time)
-    data = weight * (found.jacobian / noise).T @ (found.jacobian / noise)
+    correlation_time = _correlation_time(table)
+    data = slope**2 / (spread * correlation_time) * weighted.T @ weighted
     readings = sum(math.isfinite(prior.deviation) for prior in problem.priors)
     data += found.extra_jacobian[readings:].T @ found.extra_jacobian[readings:]  # the force
     prior = np.array([1.0 / p.deviation**2 for p in problem.priors])  # 0 where nothing is known
@@ -76,10 +77,10 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: float
     )
 
 
-def _correlation_time(problem: Problem, residual: np.ndarray) -> float:
-    """Samples that tell as much as one independent one: 1 unless neighbours are clearly correlated."""
-    table = np.full(problem.observed.shape, np.nan)
-    table[problem.seen] = np.clip(residual, -SOFT, SOFT)
+def _correlation_time(residuals: np.ndarray) -> float:
+    """Samples that tell as much as one independent one, from residuals [sample, column] in standard deviations: 1
+    unless neighbours are clearly correlated."""
+    table = np.clip(residuals, -SOFT, SOFT)
     pairs = table[:-1] * table[1:]
     count = int(np.isfinite(pairs).sum())
     if count < 10:
@@ -119,7 +120,7 @@ class Sample:
 
 
 def importance_sample(
-    problem: Problem, posterior: Posterior, noise: float, count: int, seed: int = 0, batch: int = 64
+    problem: Problem, posterior: Posterior, noise: np.ndarray, count: int, seed: int = 0, batch: int = 64
 ) -> Sample:
     """Draw ``count`` candidates around the minimum, run them as trees of few launches, and weigh them by posterior over
     proposal: a Student t with five degrees of freedom and the covariance of ``posterior``."""

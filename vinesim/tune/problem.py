@@ -19,13 +19,15 @@ from vinesim.tune.base_motion import SampledMotion
 from vinesim.tune.candidates import COLUMNS, Candidates
 from vinesim.tune.features import Features, columns_of
 from vinesim.tune.priors import Prior
-from vinesim.tune.trajectory import Trajectory
+from vinesim.tune.trajectory import Trajectory, TrajectoryError
 
 PHYSICAL = COLUMNS[:5]
 SOFT = 3.0
 """[1] Residuals of so many standard deviations begin to weigh less (soft L1)."""
 FINER = 3
 """So many times more steps and segments does the run have that tells the bias of the others."""
+Noise = float | np.ndarray
+"""[m] Standard deviation of all columns, or of each [column]."""
 PHASE_STEP = 0.05
 """[rad] Change of phase at the end of the track by which derivatives of modulus and mass are taken."""
 
@@ -85,6 +87,12 @@ class Problem:
         known = priors | {"release": Prior(features.release, turn, "onset of the motion")}
         self.priors = [known.get(name, flat) for name in self.names]
         self.force = _force_reading(track, features.release, pushed)
+        if track.force is not None and self.force is None and "mass" in fitted:
+            when = "after the push" if pushed else f"before the release at {features.release:.2f} s"
+            raise TrajectoryError(
+                f"{track.source}: 'force' has no reading above 0 {when}; give the pull that held the tip, "
+                "or do not fit the mass"
+            )
         self.pull_scale = 1.0
         """[N] Size of the pull, for the step of its derivative."""
         self.evaluations = 0
@@ -145,7 +153,7 @@ class Problem:
             return None
         return self.shaking.velocity(self.track.time[0] + self.candidates.dt * np.arange(last + 2))
 
-    def correct_discretisation(self, theta: np.ndarray, noise: float) -> np.ndarray:
+    def correct_discretisation(self, theta: np.ndarray, noise: Noise) -> np.ndarray:
         """Find by how much the coarse chain and step bias a fit near ``theta``; the parameters without that bias.
 
         The coarse candidates are fitted to the track of one candidate with finer segments and steps at ``theta``: what
@@ -221,12 +229,12 @@ class Problem:
     # ------------------------------------------------------------------ minimum
 
     def minimise(
-        self, theta: np.ndarray, noise: float, end: float = math.inf, most: int = 30, tolerance: float = 1e-5
+        self, theta: np.ndarray, noise: Noise, end: float = math.inf, most: int = 30, tolerance: float = 1e-5
     ) -> tuple[np.ndarray, Evaluation]:
         """The parameters of least loss near ``theta``, evaluated, for a noise [m] and samples up to ``end`` [s]."""
         known: dict[bytes, Evaluation] = {}
-        data = self.observed[: int((self.track.time <= end).sum())]
-        data = data[np.isfinite(data)]
+        table = self.observed[: int((self.track.time <= end).sum())]
+        data, noise = table[np.isfinite(table)], np.broadcast_to(noise, table.shape)[np.isfinite(table)]
 
         def at(point: np.ndarray) -> Evaluation:
             key = point.tobytes()
@@ -240,7 +248,7 @@ class Problem:
 
         def jacobian(point: np.ndarray) -> np.ndarray:
             found = at(point)
-            return np.concatenate([found.jacobian / noise, found.extra_jacobian])
+            return np.concatenate([found.jacobian / noise[:, None], found.extra_jacobian])
 
         soft = np.arange(len(data) + len(at(theta).extra)) < len(data)
 
@@ -256,9 +264,15 @@ class Problem:
         )  # fmt: skip
         return found.x, at(found.x)
 
-    def loss(self, theta: np.ndarray, positions: np.ndarray, noise: float) -> float:
+    def residuals(self, model: np.ndarray) -> np.ndarray:
+        """Table [sample, column] m of what a model [observation] m is off; NaN where there are no data."""
+        table = np.full(self.observed.shape, np.nan)
+        table[self.seen] = model - self.observed[self.seen]
+        return table
+
+    def loss(self, theta: np.ndarray, positions: np.ndarray, noise: Noise) -> float:
         """Loss of positions [sample, column], priors and force included: what :meth:`minimise` makes small."""
-        z = ((positions - self.observed)[self.seen] / noise / SOFT) ** 2
+        z = ((positions - self.observed) / noise / SOFT)[self.seen] ** 2
         return float(SOFT**2 * (np.sqrt(1.0 + z) - 1.0).sum() + 0.5 * (self._extra(theta)[0] ** 2).sum())
 
     def _scales(self) -> np.ndarray:

@@ -76,6 +76,11 @@ class Trajectory:
         return np.any(np.isfinite(self.position), axis=0)
 
     @property
+    def column_names(self) -> list[str]:
+        """Names of the tracked columns: marker and axis."""
+        return [f"{self.markers[marker]} {'xyz'[axis]}" for marker, axis in np.argwhere(self.tracked)]
+
+    @property
     def rate(self) -> float:
         """[1/s] Samples a second, by the median."""
         return float(1.0 / np.median(np.diff(self.time)))
@@ -101,7 +106,8 @@ class Trajectory:
             out = csv.writer(file, lineterminator="\n")
             out.writerow([name for name, _ in columns])
             for row in zip(*(values.tolist() for _, values in columns), strict=True):
-                out.writerow(["" if math.isnan(value) else f"{value:.6g}" for value in row])
+                clock, *values = row  # in microseconds: a time since 1970 keeps its thirtieths of a second
+                out.writerow([f"{round(clock, 6):.16g}", *("" if math.isnan(x) else f"{x:.6g}" for x in values)])
 
 
 def _moved_axes(base: np.ndarray) -> list[int]:
@@ -185,7 +191,11 @@ def _read_header(path: pathlib.Path, line: int, names: list[str]) -> list[_Colum
 
 def _read_name(place: str, text: str) -> _Column:
     found = _HEADER.fullmatch(text.strip())
-    if not found:
+    if not found and text.strip().lower() in ("frame", "frames", "picture"):
+        raise TrajectoryError(f"{place} numbers pictures; divide it by the pictures a second and name it 'time [s]'")
+    if not found or ";" in text or "\t" in text:
+        if ";" in text or "\t" in text:
+            raise TrajectoryError(f"{place} holds several names; separate the columns by commas, decimals by points")
         raise TrajectoryError(f"{place} has no unit; name it with its unit, e.g. 'time [s]', 'x [mm]', 'force [N]'")
     name, unit = found["name"].strip(), found["unit"].strip()
     words = name.replace(".", " ").replace("_", " ").split()
@@ -201,8 +211,14 @@ def _read_name(place: str, text: str) -> _Column:
         raise TrajectoryError(
             f"{place} is not known; name it time, x, y, z, 'MARKER x', 'base x' or force, with its unit"
         )
+    if kind == "position" and unit.lower() in ("px", "pixel", "pixels"):
+        raise TrajectoryError(
+            f"{place}: a position in pixels; multiply it by the mm of a pixel in the plane of the swing (a ruler held "
+            "there, over its pixels), let z point up, and name it [mm]"
+        )
     if unit not in _UNITS[kind]:
-        raise TrajectoryError(f"{place}: unit {unit!r} of a {kind}; give {' or '.join(_UNITS[kind])}")
+        hint = "; a balance that shows 1 kg is pulled by 9.81 N" if unit in ("kg", "g") and kind == "force" else ""
+        raise TrajectoryError(f"{place}: unit {unit!r} of a {kind}; give {' or '.join(_UNITS[kind])}{hint}")
     return _Column(kind, _SCALE[unit], marker, axis)
 
 

@@ -16,7 +16,7 @@ from vinesim.tune.features import Features, extract_features, robust_deviation
 from vinesim.tune.fit import Fit, Minimum
 from vinesim.tune.posterior import Posterior, importance_sample, laplace
 from vinesim.tune.priors import physical_priors
-from vinesim.tune.problem import FINER, Evaluation, Problem
+from vinesim.tune.problem import FINER, Evaluation, Noise, Problem
 from vinesim.tune.start import start_values
 from vinesim.tune.trajectory import Trajectory, TrajectoryError
 
@@ -24,6 +24,10 @@ STEP_PHASE = 0.1
 """[rad] By which the first mode turns in a step of the simulation: errs by 0.2 % in modulus before it is corrected."""
 PARAMETERS = {"modulus": ("modulus",), "damping": ("damping",), "mass": ("mass",), "rest": ("bow_y", "bow_z")}
 """What can be fitted, and which columns of a candidate that are."""
+CONTRADICTS = 4.0
+"""[1] Standard deviations of its prior by which a fitted mass is no mass of wood."""
+WIDE = 0.5
+"""[1] A swing over the plant's length that is rather a wrong unit."""
 UNEXPLAINED = 1.3
 """A fit that leaves so many times more than a damped sinusoid does has failed."""
 HORIZONS = (1.0, 2.0, 4.0, 8.0)
@@ -67,21 +71,23 @@ def tune(
     if not coarse:  # a coarse chain swings up to 1 % too slowly, which only a fitted modulus can make good
         chain, dt = msgspec.structs.replace(specimen, segments=FINER * specimen.segments), dt / FINER
     problem = Problem(chain, track, features, fitted, physical_priors(specimen), dt, device, pushed)
-    theta, found, noise = _minimise(problem, start_values(problem), features.noise)
+    theta, found, noise = _minimise(problem, start_values(problem))
     minima: tuple[Minimum, ...] = ()
     if coarse:
         theta, found, noise, minima = _look_for_minima(problem, theta, found, noise)
         theta = problem.correct_discretisation(theta, noise)
         found = problem.evaluate(theta)
     posterior = laplace(problem, theta, found, noise)
+    faults = (*_faults(problem, posterior, _left(problem, found)), *_contradictions(problem, found, theta))
     sample = importance_sample(problem, posterior, noise, samples, seed) if samples else None
     model = np.full(problem.observed.shape, np.nan)
     model[problem.seen] = found.model
     swing = _fitted_features(problem, theta, model)
     return Fit(
-        specimen=specimen, track=track, features=features, posterior=posterior, sample=sample, noise=noise,
+        specimen=specimen, track=track, features=features, posterior=posterior, sample=sample,
+        noise=_left(problem, found), column_noise=noise,
         frequency=swing.frequency, damping_ratio=swing.damping_ratio, model=model, jacobian=found.jacobian,
-        minima=minima, faults=_faults(problem, posterior, noise, found.model), dt=dt,
+        minima=minima, faults=faults, dt=dt,
         force=problem.force, priors=dict(zip(problem.names, problem.priors, strict=True)),
     )  # fmt: skip
 
@@ -114,7 +120,7 @@ def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> N
             remedy = "sweep through the plant's first mode, or shake further"
         raise TrajectoryError(
             f"{track.source}: no swing stands out: {1e3 * reach:.3g} mm of it, {1e3 * features.noise:.3g} mm of noise; "
-            f"check the unit and the columns, {remedy}"
+            f"check the unit, and that an axis of the swing has a column; {remedy}"
         )
     if reach < 0.002 * length:
         raise TrajectoryError(
@@ -123,35 +129,40 @@ def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> N
         )
 
 
-def _minimise(problem: Problem, theta: np.ndarray, noise: float) -> tuple[np.ndarray, Evaluation, float]:
+def _minimise(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Evaluation, np.ndarray]:
     """The minimum near some start and the noise there; by growing horizons where the whole track at once fails."""
-    best = _settle(problem, theta, noise)
-    if best[2] <= UNEXPLAINED * problem.features.noise:
-        return best
     features = problem.features
+    best = _settle(problem, theta, features.noise)
+    if _left(problem, best[1]) <= UNEXPLAINED * features.noise:
+        return best
     grown = start_values(problem)
     for periods in HORIZONS:
         end = features.release + periods / features.frequency
         if end < problem.track.time[-1]:
             grown, _ = problem.minimise(grown, features.noise, end, 15, 1e-3)
     found = _settle(problem, grown, features.noise)
-    return found if found[2] < best[2] else best
+    return found if _left(problem, found[1]) < _left(problem, best[1]) else best
 
 
-def _settle(problem: Problem, theta: np.ndarray, noise: float) -> tuple[np.ndarray, Evaluation, float]:
-    """Minimise, estimate the noise [m] from what is left, and once more if that changes the weights."""
+def _settle(problem: Problem, theta: np.ndarray, noise: Noise) -> tuple[np.ndarray, Evaluation, np.ndarray]:
+    """Minimise, estimate the noise [column] m from what is left, and once more if that changes the weights."""
     for _ in range(2):
         theta, found = problem.minimise(theta, noise)
-        left = max(robust_deviation(found.model - problem.observed[problem.seen]), 1e-7)
-        if abs(math.log(left / noise)) < 0.3:
+        left = np.array([max(robust_deviation(column), 1e-7) for column in problem.residuals(found.model).T])
+        if np.abs(np.log(left / noise)).max() < 0.3:
             break
         noise = left
     return theta, found, left
 
 
+def _left(problem: Problem, found: Evaluation) -> float:
+    """[m] Robust standard deviation of what a fit leaves of all columns together."""
+    return max(robust_deviation(found.model - problem.observed[problem.seen]), 1e-7)
+
+
 def _look_for_minima(
-    problem: Problem, theta: np.ndarray, found: Evaluation, noise: float
-) -> tuple[np.ndarray, Evaluation, float, tuple[Minimum, ...]]:
+    problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.ndarray
+) -> tuple[np.ndarray, Evaluation, np.ndarray, tuple[Minimum, ...]]:
     """Scan the modulus for other minima of the loss; go to one that is better."""
     at = problem.names.index("modulus")
     thetas = np.repeat(theta[None], len(MINIMA) + 1, 0)
@@ -164,7 +175,7 @@ def _look_for_minima(
     if len(lower) and scan[lower].min() < here:
         start = thetas[1 + lower[np.argmin(scan[lower])]]
         other = _settle(problem, start, noise)
-        if other[2] < 0.95 * noise:
+        if _left(problem, other[1]) < 0.95 * _left(problem, found):
             return *other, ()
     own = problem.specimen.modulus.value
     minima = [Minimum(own * math.exp(thetas[1 + i, at]), float(scan[i] / here)) for i in lower]
@@ -179,7 +190,7 @@ def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> 
     return extract_features(dataclasses.replace(problem.track, position=position), release)
 
 
-def _faults(problem: Problem, posterior: Posterior, noise: float, model: np.ndarray) -> tuple[str, ...]:
+def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, ...]:
     """Why the fit is not to be believed; empty if nothing speaks against it."""
     faults = []
     features, curve = problem.features, "sinusoid" if problem.shaking is None else "oscillator"
@@ -198,3 +209,27 @@ def _faults(problem: Problem, posterior: Posterior, noise: float, model: np.ndar
             faults.append(f"{name} went {math.exp(posterior.mean[problem.names.index(name)]):.3g} times off its start")
     assert set(problem.fitted) <= set(COLUMNS)
     return tuple(faults)
+
+
+def _contradictions(problem: Problem, found: Evaluation, theta: np.ndarray) -> list[str]:
+    """What the user gave beside the track and the fit denies."""
+    faults = []
+    features, specimen = problem.features, problem.specimen
+    reach, length = float(np.abs(features.displacement).max()), specimen.length.value
+    failed = _left(problem, found) > UNEXPLAINED * features.noise
+    if reach > WIDE * length and failed:
+        faults.append(f"the swing is {reach:.3g} m wide, the plant {length:.3g} m long: is the unit right (m, cm, mm)?")
+    if problem.force is not None and "mass" not in problem.names and failed:
+        faults.append(
+            f"the gauge showed {problem.force[0]:.3g} N, which such a mass may not allow: check unit and zero of the "
+            "gauge, density and diameters; or fit the mass (--fit modulus,damping,mass), or remove the column"
+        )
+    if "mass" in problem.names:
+        at = problem.names.index("mass")
+        prior = problem.priors[at]
+        if abs(theta[at] - prior.mean) > CONTRADICTS * prior.deviation:
+            faults.append(
+                f"the mass is {math.exp(theta[at]):.3g} times that of the specimen, beyond what wood is: check unit "
+                "and zero of the force, and the diameters"
+            )
+    return faults

@@ -58,6 +58,51 @@ def tune(
     raise typer.Exit(run(data, model, fit, out, json, plot, release, push, samples, seed, device))
 
 
+def track(
+    recording: Annotated[
+        pathlib.Path,
+        typer.Argument(
+            help="MCAP file of ROS topics, rosbag2 folder of such, or a data set as vinesim dataset writes."
+        ),
+    ],
+    marker: Annotated[
+        list[str],
+        typer.Option(help="Colour R,G,B in a picture of the ball at the tip; NAME=R,G,B of another. May repeat."),
+    ],
+    radius: Annotated[float, typer.Option(help="Of the balls [m].")],
+    out: Annotated[pathlib.Path, typer.Option(help="The CSV to write, for vinesim tune.")] = pathlib.Path("track.csv"),
+    image: Annotated[
+        str | None, typer.Option(help="Topic of the colours; the one with rgb or color in its name unless given.")
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="Topic of the aligned depth; the one with depth in its name unless given.")
+    ] = None,
+    pose: Annotated[
+        tuple[float, float, float, float, float, float, float] | None,
+        typer.Option(
+            help="Of the optical frame in the world, X Y Z QX QY QZ QW; level and looking along y unless given."
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Pictures a second, of a data set whose records have no time.")
+    ] = None,
+) -> None:
+    """Track balls of one colour each through recorded RGB-D pictures, into a CSV for vinesim tune.
+
+    No ROS is needed. Pictures in which a ball is hidden are gaps. Needs scipy (extra: tune).
+
+    \b
+    Examples:
+      vinesim track pull.mcap --marker 224,60,130 --radius 0.012 --out pull.csv
+      vinesim track pull.mcap --marker 224,60,130 --marker middle=30,90,220 --radius 0.012
+      vinesim track pull/ --image /camera/color/image_raw --depth /camera/aligned_depth_to_color/image_raw \\
+        --marker 224,60,130 --radius 0.012
+    """
+    from vinesim.cli.tune import track
+
+    raise typer.Exit(track(recording, marker, radius, out, image, depth, pose, rate))
+
+
 def experiment(
     kind: Annotated[
         str,

@@ -1,0 +1,264 @@
+"""RGB-D pictures that were recorded: from rosbag2's MCAP files, without ROS, or a folder as ``vinesim dataset`` writes.
+
+Of ROS messages (CDR, XCDR1) only sensor_msgs/Image and CameraInfo are read, by their definitions.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import json
+import pathlib
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+from vinesim.scene.values import CameraFrame, CameraInfo
+
+LEVEL_POSE = np.array([0.0, 0.0, 0.0, -np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""[7] Optical frame of a level camera that looks along the world's y: x to the right, z up."""
+PAIR_TIME = 0.01
+"""[s] Most between the stamps of a picture's colours and its depth."""
+IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+_COLOURS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]), "bgra8": (4, [2, 1, 0])}
+"""Channels of an encoding, and which of them are red, green and blue."""
+_DEPTHS = {"32FC1": "f4", "16UC1": "u2", "mono16": "u2"}
+_LENSES = ("plumb_bob", "rational_polynomial", "")
+
+
+class RecordedPicturesError(ValueError):
+    """Recorded pictures that cannot be used; one line with file, topic and remedy."""
+
+
+def read_pictures(
+    path: pathlib.Path, *, image: str | None = None, depth: str | None = None, pose: np.ndarray | None = None,
+    rate: float | None = None,
+) -> Iterator[CameraFrame]:  # fmt: skip
+    """The pictures of an MCAP file, a rosbag2 folder of such, or a data set, in the order of time, one at a time.
+
+    A picture of colours without its depth has depth NaN.
+
+    Args:
+        path: file or folder.
+        image: topic of the colours; the only one that is called so (rgb or color) unless given. ``camera_info`` stands
+            beside it.
+        depth: topic of the depth, aligned with the colours; found likewise.
+        pose: [7] of the optical frame in the world; that of the data set, or :data:`LEVEL_POSE`, unless given.
+        rate: pictures a second of a data set whose records have no ``time``.
+
+    :class:`RecordedPicturesError` before the first picture if there is none, or for one that cannot be read.
+    """
+    if not path.exists():
+        raise RecordedPicturesError(f"{path}: is not there; give an MCAP file, a rosbag2 folder or a data set")
+    if path.is_dir() and (path / "records").is_dir():
+        return _dataset(path, pose, rate)
+    files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+    if not files:
+        other = " convert it by: ros2 bag convert, storage mcap" if list(path.glob("*.db3")) else ""
+        raise RecordedPicturesError(f"{path}: no *.mcap and no records/ in it;{other or ' give a recording'}")
+    return _bag(files, image, depth, LEVEL_POSE if pose is None else pose)
+
+
+# ---------------------------------------------------------------------- data sets
+
+
+def _dataset(folder: pathlib.Path, pose: np.ndarray | None, rate: float | None) -> Iterator[CameraFrame]:
+    records = sorted((folder / "records").glob("*.json"))
+    if not records:
+        raise RecordedPicturesError(f"{folder}/records: is empty; give a data set with pictures")
+    for number, file in enumerate(records):
+        try:
+            record = json.loads(file.read_text("utf-8"))
+            camera = record["camera"]
+            k = camera["k"]
+            own = np.array([*camera["position"], *camera["quaternion_xyzw"]], float)
+            lens = tuple(camera["d"]) if any(camera["d"]) else ()
+            info = CameraInfo(camera["width"], camera["height"], k[0], k[4], k[2], k[5], "optical", lens)
+        except (OSError, ValueError, KeyError, TypeError, IndexError) as bad:
+            raise RecordedPicturesError(f"{file}: no record of a camera: {bad!r}; see vinesim dataset") from None
+        if "time" not in record and rate is None:
+            raise RecordedPicturesError(f"{file}: has no 'time'; say how many pictures a second there are (--rate)")
+        time = record["time"] if "time" in record else number / float(rate or 1.0)
+        rgb = _png(folder / "images" / f"{file.stem}.png", cv2.IMREAD_COLOR)[..., ::-1]
+        millimetres = _png(folder / "measured" / f"{file.stem}.png", cv2.IMREAD_UNCHANGED)
+        yield CameraFrame(
+            float(time), folder.name, info, own if pose is None else pose, rgb, _metres(millimetres),
+            np.zeros((0, 0), np.int32),
+        )  # fmt: skip
+
+
+def _png(file: pathlib.Path, flags: int) -> np.ndarray:
+    image = cv2.imread(str(file), flags) if file.exists() else None
+    if image is None:
+        raise RecordedPicturesError(f"{file}: no picture; each record needs one in images/ and one in measured/")
+    return image
+
+
+def _metres(depth: np.ndarray) -> np.ndarray:
+    """Depth in metres, NaN where there is none, of metres or 16-bit millimetres."""
+    if depth.dtype.kind == "u":
+        return np.where(depth > 0, 1e-3 * depth, np.nan).astype(np.float32)
+    return np.where(depth > 0.0, depth, np.nan).astype(np.float32)
+
+
+# ---------------------------------------------------------------------- ROS recordings
+
+
+def _bag(files: list[pathlib.Path], image: str | None, depth: str | None, pose: np.ndarray) -> Iterator[CameraFrame]:
+    name = files[0].parent.name if len(files) > 1 else files[0].name
+    types = _topics(files)
+    image = _choose(name, types, image, ("rgb", "color", "colour"), "--image")
+    depth = _choose(name, types, depth, ("depth",), "--depth")
+    beside = image.rsplit("/", 1)[0] + "/camera_info"
+    if types.get(beside) != INFO:
+        raise RecordedPicturesError(
+            f"{name}: no topic {beside}, which has the focal length of {image}; record it with the pictures"
+        )
+    info, waiting, depths = None, collections.deque(), collections.deque()
+    for topic, data in _messages(files, [image, depth, beside]):
+        try:
+            if topic == beside:
+                info = info or _read_info(data)
+            else:
+                (waiting if topic == image else depths).append(_read_image(data))
+        except (struct.error, ValueError, KeyError, IndexError, UnicodeDecodeError) as bad:
+            raise RecordedPicturesError(f"{name}: a message of {topic} cannot be read: {bad}") from None
+        if info is not None:
+            yield from _pair(name, image, waiting, depths, info, pose, last=False)
+    if info is None:
+        raise RecordedPicturesError(f"{name}: {beside} has no messages; record it with the pictures")
+    yield from _pair(name, image, waiting, depths, info, pose, last=True)
+
+
+def _topics(files: list[pathlib.Path]) -> dict[str, str]:
+    """Type by topic."""
+    types: dict[str, str] = {}
+    for file in files:
+        try:
+            with file.open("rb") as stream:
+                summary = make_reader(stream).get_summary()
+        except (OSError, McapError, struct.error) as bad:
+            raise RecordedPicturesError(f"{file}: is no whole MCAP file: {bad or 'empty'}; give a recording") from None
+        if summary is None:
+            raise RecordedPicturesError(f"{file}: was cut off; mend it with: mcap recover")
+        types |= {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values() if c.schema_id}
+    return types
+
+
+def _choose(name: str, types: dict[str, str], given: str | None, words: tuple[str, ...], option: str) -> str:
+    """A topic of images: the one that was given, or the only one with one of these words."""
+    images = sorted(topic for topic, kind in types.items() if kind == IMAGE)
+    if given is not None:
+        if given not in images:
+            raise RecordedPicturesError(f"{name}: no topic {given} of images; there are: {', '.join(images) or 'none'}")
+        return given
+    found = [topic for topic in images if any(word in topic for word in words)]
+    if words != ("depth",):
+        found = [topic for topic in found if "depth" not in topic]
+    aligned = [topic for topic in found if "aligned" in topic]
+    found = aligned if len(aligned) == 1 else found
+    if len(found) != 1:
+        count = "several topics" if found else "no topic"
+        raise RecordedPicturesError(
+            f"{name}: {count} of images with {' or '.join(words)} in the name; name one with {option}, of: "
+            f"{', '.join(found or images) or 'none (record raw images, not compressed ones)'}"
+        )
+    return found[0]
+
+
+def _messages(files: list[pathlib.Path], topics: list[str]) -> Iterator[tuple[str, bytes]]:
+    for file in files:
+        with file.open("rb") as stream:
+            try:
+                for _, channel, message in make_reader(stream).iter_messages(topics=topics):
+                    yield channel.topic, message.data
+            except (McapError, struct.error) as bad:
+                raise RecordedPicturesError(f"{file}: is damaged: {bad}; mend it with: mcap recover") from None
+
+
+def _pair(
+    name: str, image: str, waiting: collections.deque, depths: collections.deque, info: CameraInfo, pose: np.ndarray,
+    last: bool,
+) -> Iterator[CameraFrame]:  # fmt: skip
+    """Pictures of colours that have met their depth, or can no more."""
+    while waiting:
+        time, rgb = waiting[0]
+        while depths and depths[0][0] < time - PAIR_TIME:
+            depths.popleft()
+        if not depths and not last:
+            return
+        waiting.popleft()
+        depth = np.full(rgb.shape[:2], np.nan, np.float32)
+        if depths and depths[0][0] <= time + PAIR_TIME:
+            depth = depths[0][1]
+        if rgb.ndim != 3 or depth.ndim != 2 or rgb.shape[:2] != depth.shape or depth.shape != (info.height, info.width):
+            raise RecordedPicturesError(
+                f"{name}: {image} has {rgb.shape[:2]} pixels, the depth {depth.shape[:2]}, camera_info "
+                f"{(info.height, info.width)}; record depth that is aligned with the colours"
+            )
+        yield CameraFrame(time, image, info, pose, rgb, depth, np.zeros((0, 0), np.int32))
+
+
+@dataclasses.dataclass(slots=True)
+class _Cdr:
+    """Reads a serialised message, member by member."""
+
+    data: bytes
+    at: int = 4
+    """After the encapsulation, from which alignment counts."""
+
+    def number(self, code: str) -> Any:
+        size = struct.calcsize(code)
+        self.at += -(self.at - 4) % size
+        (value,) = struct.unpack_from(("<" if self.data[1] & 1 else ">") + code, self.data, self.at)
+        self.at += size
+        return value
+
+    def block(self) -> bytes:
+        size = self.number("I")
+        if self.at + size > len(self.data):
+            raise ValueError("it is cut off")
+        self.at += size
+        return self.data[self.at - size : self.at]
+
+    def text(self) -> str:
+        return self.block().rstrip(b"\0").decode()
+
+    def stamp(self) -> float:
+        """[s] Of a header; its frame is skipped."""
+        time = self.number("i") + 1e-9 * self.number("I")
+        self.text()
+        return time
+
+
+def _read_image(data: bytes) -> tuple[float, np.ndarray]:
+    """Stamp [s], and colours uint8 or depth [m]."""
+    cdr = _Cdr(data)
+    time, height, width, encoding = cdr.stamp(), cdr.number("I"), cdr.number("I"), cdr.text()
+    order, step = "><"[not cdr.number("B")], cdr.number("I")
+    rows = np.frombuffer(cdr.block(), np.uint8).reshape(height, step)
+    if encoding in _COLOURS:
+        channels, order = _COLOURS[encoding]
+        return time, rows[:, : width * channels].reshape(height, width, channels)[..., order]
+    if encoding in _DEPTHS:
+        kind = np.dtype(order + _DEPTHS[encoding])
+        return time, _metres(np.ascontiguousarray(rows[:, : width * kind.itemsize]).view(kind))
+    raise ValueError(f"encoding {encoding!r}; give {', '.join((*_COLOURS, *_DEPTHS))}")
+
+
+def _read_info(data: bytes) -> CameraInfo:
+    cdr = _Cdr(data)
+    cdr.stamp()
+    height, width, model = cdr.number("I"), cdr.number("I"), cdr.text()
+    lens = tuple(cdr.number("d") for _ in range(cdr.number("I")))
+    k = [cdr.number("d") for _ in range(9)]
+    if k[0] <= 0.0:
+        raise ValueError("the focal length is 0; calibrate the camera")
+    if any(lens) and (model not in _LENSES or len(lens) not in (5, 8)):
+        raise ValueError(f"distortion {model!r} with {len(lens)} coefficients; give rectified pictures")
+    return CameraInfo(width, height, k[0], k[4], k[2], k[5], "optical", lens if any(lens) else ())
