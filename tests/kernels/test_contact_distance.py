@@ -233,3 +233,38 @@ def test_a_segment_along_a_face_has_its_contact_in_the_middle():
     start, end = np.array([[0.06, 0.0, -0.04]]), np.array([[0.06, 0.0, 0.04]])
 
     assert closest("box", start, end)[0] == pytest.approx([1.0, 0.0, 0.0, 0.01])
+
+
+@wp.kernel
+def _outside(
+    # in
+    half: wp.vec3d,
+    reach: wp.float64,
+    start: wp.array(dtype=wp.vec3d),
+    end: wp.array(dtype=wp.vec3d),
+    # out
+    is_outside_out: wp.array(dtype=wp.bool),
+):
+    i = wp.tid()
+    is_outside_out[i] = distance.is_outside_box(half, start[i], end[i], reach)
+
+
+@pytest.mark.parametrize(
+    ("kind", "half"),
+    [
+        ("sphere", (0.05,) * 3),
+        ("capsule", (0.04, 0.04, 0.14)),
+        ("cylinder", (0.06, 0.06, 0.09)),
+        ("box", KINDS["box"][1]),
+    ],
+)
+def test_what_is_outside_the_box_of_a_shape_is_out_of_reach(kind, half):
+    rng, reach = np.random.default_rng(8), 0.02
+    start, end = rng.normal(size=(2, 5000, 3)) * 0.12
+    is_outside = np.zeros(len(start), np.bool_)
+    ends = [wp.array(x, dtype=wp.vec3d, device="cpu") for x in (start, end)]
+    outputs = [wp.array(is_outside, dtype=wp.bool, device="cpu", copy=False)]
+    wp.launch(_outside, len(start), inputs=[wp.vec3d(*half), reach, *ends], outputs=outputs, device="cpu")
+    is_far = closest(kind, start, end)[:, 3] > reach
+    assert is_far[is_outside].all()
+    assert is_outside.sum() > 0.5 * is_far.sum()  # it finds most

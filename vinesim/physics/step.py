@@ -146,8 +146,9 @@ class Physics:
             self.contact_solver.update_tree_bounds(coarsened)
 
     def _update_elastic_supports(self) -> None:
-        self.update_kinematics()
-        self.elastic_supports.update()
+        if self.elastic_supports.count:
+            self.update_kinematics()
+            self.elastic_supports.update()
 
     def _integrate_plants(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
@@ -167,11 +168,11 @@ class Physics:
         self.detachment_monitor.hand_contacts = self.grasp_manager.contacts
 
     def _put_to_sleep(self) -> None:
-        if self.parameters.sleep:
+        if self.parameters.sleep and self.sleep_monitor.watch():
             keep_awake = self.contact_solver.remote_trees.copy()
             keep_awake[self.contact_solver.near_trees] = True
             keep_awake[self.model.body_tree[self.plants.held_bodies]] = True
-            self.sleep_monitor.update(keep_awake, self.contact_solver.contact_pairs, self.elastic_supports.is_coupled)
+            self.sleep_monitor.check(keep_awake, self.contact_solver.contact_pairs, self.elastic_supports.is_coupled)
 
     # ------------------------------------------------------------------ results of a step
 

@@ -170,6 +170,29 @@ def tree_aabbs(
 
 
 @wp.kernel
+def take_free_velocities(
+    # model
+    parameters: Parameters,
+    # in
+    qvel: wp.array(dtype=wp.float64),
+    qacc: wp.array(dtype=wp.float64),
+    # out
+    rigid_out: RigidBodies,
+):
+    """One thread per degree of freedom: its free velocity in the coming step, and by how much plants changed the last.
+
+    qvel, qacc: [dof] MuJoCo's; what sleeps has an old acceleration, and no velocity.
+    """
+    dof = wp.tid()
+    rigid_out.correction_before[dof] = rigid_out.correction[dof]
+    rigid_out.correction[dof] = qvel[dof] - rigid_out.velocity_free[dof]
+    velocity = wp.float64(0.0)
+    if rigid_out.tree_asleep[rigid_out.dof_tree[dof]] < 0:
+        velocity = qvel[dof] + parameters.dt * qacc[dof]
+    rigid_out.velocity_free[dof] = velocity
+
+
+@wp.kernel
 def actor_aabbs(
     # model
     actors: Actors,

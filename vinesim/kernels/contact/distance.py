@@ -272,6 +272,18 @@ def segment_primitive_distance(
 
 
 @wp.func
+def is_outside_box(half: wp.vec3d, a: wp.vec3d, b: wp.vec3d, reach: wp.float64):
+    """Whether the segment a b is farther than ``reach`` [m] beyond one side of a box, in the box's frame.
+
+    ``half`` [m]: half edges. What the box contains is no nearer.
+    """
+    outside = bool(False)
+    for i in range(3):
+        outside = outside or wp.max(wp.min(a[i], b[i]), -wp.max(a[i], b[i])) - half[i] > reach
+    return outside
+
+
+@wp.func
 def has_flat_or_straight_side(kind: int):
     """Whether a segment can lie along this kind of primitive."""
     return kind == BOX or kind == CAPSULE or kind == CYLINDER

@@ -18,8 +18,10 @@ from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import (
     MESH,
+    PLANE,
     has_flat_or_straight_side,
     interval_along_face,
+    is_outside_box,
     segment_primitive_distance,
     vec5d,
 )
@@ -329,8 +331,12 @@ def add_pair(
     margin = parameters.margin + (wp.float64(capsule_states.speed[s]) + geom_states.speed[g]) * parameters.dt
     between = wp.float64(0.5) * (a + b) - center
     limit = bound + geoms.radius[g] + margin
-    if wp.dot(between, between) < limit * limit:
-        rotation = rigid.xmat[geoms.id[g]]
+    rotation = rigid.xmat[geoms.id[g]]
+    near = wp.dot(between, between) < limit * limit
+    if near and not is_round and geoms.kind[g] != PLANE:
+        to_local = wp.transpose(rotation)  # far cheaper than the distance, and decides half of all pairs
+        near = not is_outside_box(geoms.half[g], to_local * (a - center), to_local * (b - center), radius + margin)
+    if near:
         nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
         if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules, bodies.is_cut):
             ends = contact_ends(is_round, parameters, geoms, hulls, g, rotation, center, a, b, nearest)

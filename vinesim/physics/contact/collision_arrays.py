@@ -6,12 +6,14 @@ import dataclasses
 import functools
 
 import numpy as np
+import warp as wp
 
 from vinesim import frames
-from vinesim.kernels.contact import structs
+from vinesim.kernels.contact import broadphase, structs
+from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_geoms import RigidGeoms, concatenate, persistent_names
 from vinesim.physics.contact.plant_capsules import PlantCapsules
-from vinesim.physics.contact.warp_arrays import SharedArrays
+from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.berry_clusters import spans
@@ -128,7 +130,13 @@ class RigidArrays:
     close and when bunches take bodies: :meth:`update` writes what is listed now.
     """
 
-    def __init__(self, rigid: RigidWorld, remote_actors: set[str], previous: RigidArrays | None) -> None:
+    def __init__(
+        self,
+        rigid: RigidWorld,
+        remote_actors: set[str],
+        kernel_parameters: structs.Parameters,
+        previous: RigidArrays | None,
+    ) -> None:
         """``previous``: where the velocities of the last step are taken from, by the names of degrees of freedom."""
         self.world, data = rigid.mj_model, rigid.mj_data
         world = self.world
@@ -163,6 +171,10 @@ class RigidArrays:
             correction=correction,
             correction_before=before,
             tree_island=np.zeros(world.ntree, np.int32),
+        )
+        qvel, qacc = (share(values, wp.float64) for values in (data.qvel, data.qacc))
+        self._take_free_velocities = bind_launch(
+            broadphase.take_free_velocities, [kernel_parameters, qvel, qacc], [self.bodies.struct]
         )
         self.factors = SharedArrays(
             structs.RigidFactors,
@@ -212,9 +224,6 @@ class RigidArrays:
             self.bodies.correction[other] = self.bodies.correction_before[other] = 0.0
         return number[former]
 
-    def begin_step(self, rigid: RigidWorld) -> None:
+    def begin_step(self) -> None:
         """Take over the free velocities of the coming step, and what plants changed in the last one."""
-        bodies = self.bodies
-        bodies.correction_before[:] = bodies.correction
-        np.subtract(rigid.mj_data.qvel, bodies.velocity_free, out=bodies.correction)
-        bodies.velocity_free[:] = rigid.velocity_free
+        self._take_free_velocities(self.world.nv)

@@ -60,7 +60,7 @@ class ContactSolver:
         self._reported: tuple[Contact, ...] | None = ()
         self._touched: tuple[tuple[int, str], ...] | None = ()
         self._generation = 0
-        numbers = kernel_parameters(self.parameters)
+        self._kernel_parameters = numbers = kernel_parameters(self.parameters)
         self._arrays = PlantArrays(model, plants, self.capsules)
         self._rigid_arrays: RigidArrays | None = None
         self.detection = ContactDetection(plants, self._arrays, self.parameters, numbers)
@@ -79,7 +79,7 @@ class ContactSolver:
         if len(fallen_asleep):
             self.update_tree_bounds(fallen_asleep)
         assert self._rigid_arrays is not None
-        self._rigid_arrays.begin_step(self.rigid)
+        self._rigid_arrays.begin_step()
         self.near_trees = self.detection.find_near_trees()
         if len(self.near_trees) and not tree_awake[self.near_trees].all():
             self.plants.wake(self.near_trees)
@@ -193,10 +193,9 @@ class ContactSolver:
     @property
     def contact_pairs(self) -> np.ndarray:
         """[k, 2] Pairs of awake trees that were in contact in the last step."""
-        bodies = np.stack(
-            [self.impulses.contacts.body[: self.count], self.impulses.contacts.other_body[: self.count]], -1
-        )
-        return self.model.body_tree[bodies[bodies[:, 1] >= 0]]
+        contacts = self.impulses.contacts
+        of_plants = np.flatnonzero(contacts.other_body[: self.count] >= 0)
+        return self.model.body_tree[np.stack([contacts.body[of_plants], contacts.other_body[of_plants]], -1)]
 
     @property
     def touched_trees(self) -> tuple[tuple[int, str], ...]:
@@ -237,7 +236,7 @@ class ContactSolver:
             self.impulses.renumber_geoms(previous.update(self.rigid, self.remote_actors))
             self.detection.update_rigid_geoms()
             return
-        self._rigid_arrays = arrays = RigidArrays(self.rigid, self.remote_actors, previous)
+        self._rigid_arrays = arrays = RigidArrays(self.rigid, self.remote_actors, self._kernel_parameters, previous)
         self._generation = self.rigid.generation
         self.detection.set_rigid_world(arrays)
         self.impulses.set_rigid_world(arrays, self.detection, previous)

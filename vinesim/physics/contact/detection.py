@@ -14,7 +14,14 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.contact import broadphase, narrowphase_plants, narrowphase_rigid, sleeping_trees, structs
+from vinesim.kernels.contact import (
+    broadphase,
+    narrowphase_plants,
+    narrowphase_rigid,
+    sleeping_trees,
+    structs,
+    sweep_order,
+)
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
@@ -45,7 +52,7 @@ class ContactDetection:
         self._kernel_parameters = kernel_parameters
         trees = len(arrays.trees.is_fine)
         self._order, self._partition = np.zeros(trees, np.int32), (0, 0)
-        self._sorted_rows = np.zeros(trees, np.int32)
+        self._sorted_rows = np.zeros((2, trees), np.int32)
         self._is_near, self._is_reached = np.zeros(trees, np.bool_), np.zeros(trees, np.bool_)
         self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
         self.counters = np.zeros(structs.COUNTERS, np.int32)
@@ -110,7 +117,7 @@ class ContactDetection:
         self._actor_aabbs(self.rigid_arrays.actor_count)
         self._is_near[:] = False
         self._mark_near_trees(len(self._blocks))
-        return np.flatnonzero(self._is_near)
+        return self._is_near.nonzero()[0]
 
     def _bound_static_geoms(self) -> None:
         """Boxes around blocks of static geoms; the ground reaches down without end."""
@@ -137,19 +144,16 @@ class ContactDetection:
         """Sleeping trees [k] with which one of the listed awake ones is in contact, or will be before the step ends."""
         self._is_reached[:] = False
         self._launch_over_trees(int(self.counters[structs.AWAKE_TREES]), self._find_reached_trees)
-        return np.flatnonzero(self._is_reached)
+        return self._is_reached.nonzero()[0]
 
     def find_candidates(self, plant_plant_contacts: bool) -> None:
         """Fill ``candidates`` for the listed awake trees."""
         trees = int(self.counters[structs.AWAKE_TREES])
         if trees > self._room:
             self._allocate_candidates(2 * trees)
-        awake = self.arrays.trees.awake[:trees]
         self._launch_over_trees(trees, self._find_rigid_contacts)
         if plant_plant_contacts:
-            low = self.tree_boxes.low[awake]
-            axis = self.counters[structs.SORT_AXIS] = int(np.argmax(low.max(0) - low.min(0)))
-            self._sorted_rows[:trees] = np.argsort(low[:, axis], kind="stable")
+            self._sort_awake_trees(1)
             self._launch_over_trees(trees, self._find_plant_contacts)
 
     def deepest(self, trees: int, count: int) -> np.ndarray:
@@ -216,9 +220,13 @@ class ContactDetection:
             [candidates],
             **by_tree,
         )  # fmt: skip
+        sorted_rows, scratch = (share(rows, wp.int32) for rows in self._sorted_rows)
+        self._sort_awake_trees = bind_launch(
+            sweep_order.sort_awake_trees, [trees, tree_boxes], [share(self.counters, wp.int32), sorted_rows, scratch]
+        )
         self._find_plant_contacts = bind_launch(
             narrowphase_plants.find_plant_contacts,
-            [parameters, capsules, order, share(self._sorted_rows, wp.int32), share(self.counters, wp.int32), trees,
+            [parameters, capsules, order, sorted_rows, share(self.counters, wp.int32), trees,
              tree_boxes, wood_boxes, bodies, capsule_states],
             [candidates],
             **by_tree,

@@ -69,8 +69,8 @@ class ImpulseSolver:
         """[n, 6] N, N m on them, at their origins, world axes."""
         self.rigid_force: np.ndarray | None = None
         """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
-        self.sweeps = self.island_count = 0
-        """Of the last solve: sweeps that its slowest island took, and the number of islands."""
+        self.island_count = 0
+        """Islands of the last solve."""
 
     def set_rigid_world(
         self, rigid_arrays: RigidArrays, detection: ContactDetection, previous: RigidArrays | None
@@ -128,6 +128,11 @@ class ImpulseSolver:
             memory = self._memory[name] = np.zeros(2 * size)
         return memory[:size].reshape(shape)
 
+    @property
+    def sweeps(self) -> int:
+        """Sweeps that the slowest island of the last solve took."""
+        return int(self.islands.sweeps[: self.island_count].max(initial=0))
+
     def clear(self) -> None:
         """Forget the last solve, but for its warm start."""
         self.bodies, self.wrenches, self.rigid_force = self.bodies[:0], self.wrenches[:0], None
@@ -143,26 +148,31 @@ class ImpulseSolver:
             self.bind_launches(self._detection)
             self._build_islands(1)
         rows, touched, island_count = self.rows, int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
-        self.bodies = bodies = self.touched.body[:touched].copy()
+        self.bodies = self.touched.body[:touched].copy()
         rigid_jacobian, rigid_response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
         rigid_jacobian[:] = 0.0
         rigid_response[:] = 0.0
         self._write_contact_rows(n)
 
-        self.response.compute(n, bodies)
-        if self.rigid.is_constrained(self.rigid_arrays.geoms.body[self.contacts.other[:n].clip(0)]):
+        self.response.compute(n)
+        if self.rigid.mj_data.nefc and self.rigid.is_constrained(self._touched_rigid_bodies(n)):
             rigid_response[:] = self.rigid.impulse_response(rigid_jacobian).T
         else:
             self._respond_rigidly(row_count)
         self._assemble_delassus(n)
         self._solve_islands(island_count)
-        self.sweeps, self.island_count = int(self.islands.sweeps[:island_count].max()), island_count
+        self.island_count = island_count
 
         self.warm_start.count[0] = n
         self._store_warm_start(n)
         self._accumulate_wrenches(1)
         self.wrenches = self._wrench[:touched].copy()
         self.rigid_force = rows.impulse[:row_count] @ rigid_jacobian / -self.parameters.dt
+
+    def _touched_rigid_bodies(self, count: int) -> np.ndarray:
+        """MuJoCo's bodies [k] on the other side of the first ``count`` contacts, once for each."""
+        other = self.contacts.other[:count]
+        return self.rigid_arrays.geoms.body[other[other >= 0]]
 
     def bind_launches(self, detection: ContactDetection) -> None:
         """Bind every kernel to its arrays; to call again when ``detection`` has new arrays of candidates."""

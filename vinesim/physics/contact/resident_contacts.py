@@ -69,7 +69,7 @@ class ResidentContacts:
         self._check(rigid)
         self._numbers = kernel_parameters(parameters)
         self._take_over_plants(PlantArrays(model, plants, plant_capsules(model)))
-        self._take_over_geoms(RigidArrays(rigid, set(), None))
+        self._take_over_geoms(RigidArrays(rigid, set(), self._numbers, None))
         self._allocate()
         self._launches = self._bind()
 

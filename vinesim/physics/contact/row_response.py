@@ -46,8 +46,7 @@ class RowResponse:
             there,
         )
 
-    def compute(self, contacts: int, bodies: np.ndarray) -> None:
-        """Fill :attr:`sides` of the first ``contacts``, which touch ``bodies`` [k]; belongs to the last prediction."""
-        self.plants.require_stepped(bodies)
+    def compute(self, contacts: int) -> None:
+        """Fill :attr:`sides` of the first ``contacts``; all touch trees of the last prediction, and belong to it."""
         self._respond(2 * contacts)
         self.plants.buffers.synchronize()

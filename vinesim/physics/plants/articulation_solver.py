@@ -28,6 +28,7 @@ from vinesim.kernels.articulation.first_mode import MAX_SUBSTEPS, substeps_for
 from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
+from vinesim.physics.plants.contact_loads import ContactLoads
 from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches, kernel_parameters
 from vinesim.physics.plants.remote_pose import blend_towards
@@ -38,7 +39,7 @@ from vinesim.physics.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
-_NO_TREES = np.zeros(0, np.int32)
+_NO_TREES, _NO_WRENCHES = np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
 
 
 class ArticulationSolver:
@@ -115,6 +116,11 @@ class ArticulationSolver:
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
             | model.is_on_arm(), thread_pool=self.thread_pool,
         )  # fmt: skip
+        self._loads = ContactLoads(
+            body_tree=model.body_tree, place_in_tree=self._place_in_tree, is_stepped=self._runner.is_stepped,
+            tree_moving=self.tree_moving, body_wrench=self._wrench, touched=self._subset,
+            euler_steps=self._euler_steps, onset=self.onset_steps + 1,  # the first step counts
+        )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self.berry_clusters = BerryClusters(self)
@@ -161,6 +167,7 @@ class ArticulationSolver:
         """Impulses of a plastic impact while it is solved [body, 6] N s, N m s."""
         self.joint_xd_free, self.joint_qd_free = np.zeros((bodies, 3), np.float32), np.zeros((bodies, 3), np.float32)
         """Predicted rates of roots and joints [body, 3] m/s, rad/s."""
+        self._place_in_tree = (np.arange(bodies) - model.tree_first[model.body_tree]).astype(np.int32)
         # as the kernels see the trees: a cut body has no parent and no lever
         self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
         self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
@@ -168,10 +175,7 @@ class ArticulationSolver:
         self._floating, self._falling_roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
         self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
-        self._last_contact = np.full(trees, -2, np.int64)  # tick of the last contact
-        self._loaded_bodies = np.zeros(0, np.int32)
         self._stepping, self._subset, self._groups = (np.zeros(n, np.int32) for n in (trees, trees, (trees, 2)))
-        self._checked: np.ndarray | None = None  # bodies that are known to be stepping
 
     def _pin_arrays(self) -> None:
         """Move the arrays of solver, ties and state to where the device can reach them."""
@@ -323,7 +327,7 @@ class ArticulationSolver:
 
         ``trees`` [k]: only these, woken or given another phi after the prediction of all.
         """
-        self._checked, launches = None, self.launches
+        launches = self.launches
         self._runner.list_trees(self._awake)
         if trees is None:
             launches.upload_step(count := len(self._runner.stepped))
@@ -350,26 +354,25 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, touched, loaded = self.launches, _NO_TREES, self._loaded_bodies
+        launches, touched, loads = self.launches, _NO_TREES, self._loads
         count = len(self._runner.stepped)
-        self._wrench[loaded], self._loaded_bodies = 0.0, _NO_TREES
         if bodies is not None and len(bodies):
-            self.require_stepped(bodies)
-            np.add.at(self._wrench, bodies, np.asarray(wrenches, np.float32))
-            self._loaded_bodies = np.array(bodies, np.int32)
-            touched = np.array(sorted(set(self.model.body_tree[bodies].tolist())), np.int32)
-            self.list_subset(touched)
+            touched = loads.replace(bodies, np.asarray(wrenches), self.tick)
+            if touched is None:
+                raise self._refusal(np.asarray(bodies))
             launches.upload_wrenches(count)
             launches.apply_wrenches(len(touched))
-            begun = touched[self._last_contact[touched] < self.tick - 1]
-            self._euler_steps[begun] = np.maximum(self._euler_steps[begun], self.onset_steps + 1)  # this step counts
-            self._last_contact[touched] = self.tick
-        elif len(loaded):
-            launches.upload_wrenches(count)
+        elif len(loads):
+            self._unload(count)
         self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)
         self.buffers.synchronize()
         self.tick += 1
+
+    def _unload(self, count: int) -> None:
+        """Take the wrenches of the last contacts off the first ``count`` trees of the list."""
+        self._loads.replace(_NO_TREES, _NO_WRENCHES, self.tick)
+        self.launches.upload_wrenches(count)
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
@@ -388,11 +391,9 @@ class ArticulationSolver:
         """
         self._runner.list_trees(self._awake)
         floating = self._floating_roots()
-        if len(self._loaded_bodies) and steps > 0:  # the next prediction still knows the last contacts
+        if len(self._loads) and steps > 0:  # the next prediction still knows the last contacts
             self._runner.predict()
-            self._wrench[self._loaded_bodies] = 0.0
-            self._loaded_bodies = _NO_TREES
-            self.launches.upload_wrenches(len(self._runner.stepped))
+            self._unload(len(self._runner.stepped))
             self._runner.integrate(_NO_TREES, *floating)
             self._runner.advance(steps - 1, *floating, between)
         else:
@@ -431,22 +432,23 @@ class ArticulationSolver:
 
     def require_stepped(self, bodies: np.ndarray) -> None:
         """:class:`ValueError` unless the trees of ``bodies`` [k] were in the last prediction."""
-        if bodies is self._checked or len(bodies) == 0:
-            return
-        bodies = self._checked = np.asarray(bodies)
         trees = self.model.body_tree[bodies]
-        stepped = self._runner.stepped
-        at = np.searchsorted(stepped, trees)
-        if len(stepped) == 0 or (stepped[np.minimum(at, len(stepped) - 1)] != trees).any():
-            late = int(np.argmin(np.isin(trees, stepped)))
-            raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
-        riding = bodies - self.model.tree_first[trees] >= self.tree_moving[trees]
-        if riding.any():
-            late = int(np.argmax(riding))
-            raise ValueError(
-                f"body {bodies[late]} is touched, but tree {trees[late]} is coarse and the body rides on its bunch: "
-                "touch the bunch, or refine the tree before predict()"
-            )
+        is_stepped, moves = self._runner.is_stepped[trees], self._place_in_tree[bodies] < self.tree_moving[trees]
+        if not (is_stepped & moves).all():
+            raise self._refusal(np.asarray(bodies))
+
+    def _refusal(self, bodies: np.ndarray) -> ValueError:
+        """Why one of some bodies [k] cannot be touched."""
+        trees = self.model.body_tree[bodies]
+        is_stepped = self._runner.is_stepped[trees]
+        if not is_stepped.all():
+            late = int(np.argmin(is_stepped))
+            return ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
+        late = int(np.argmin(self._place_in_tree[bodies] < self.tree_moving[trees]))
+        return ValueError(
+            f"body {bodies[late]} is touched, but tree {trees[late]} is coarse and the body rides on its bunch: "
+            "touch the bunch, or refine the tree before predict()"
+        )
 
     def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""

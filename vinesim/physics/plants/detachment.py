@@ -11,12 +11,17 @@ import dataclasses
 import math
 
 import numpy as np
+import warp as wp
 
 from vinesim import frames
 from vinesim.errors import checked_index
+from vinesim.kernels.articulation.overloads import count_overloaded_steps
+from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.contact_solver import ContactSolver
+from vinesim.physics.contact.warp_arrays import share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.plants.berry_clusters import spans
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import Organ
@@ -78,8 +83,22 @@ class DetachmentMonitor:
         self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
         self._awake: np.ndarray | None = None
-        self._awake_bunches = self._bunches[:0]
+        self._awake_count, self._awake_bunches = 0, np.zeros(len(order), np.int32)
+        self._awake_bodies = np.zeros(0, np.int32)
+        self._carried, self._longest = np.zeros((len(order), 6), np.float32), np.zeros(1, np.int32)
         self._detachments: list[Detachment] = []
+        self._bind()
+
+    def _bind(self) -> None:
+        model = self.plants.model
+        self._count_overloaded_steps = bind_launch(
+            count_overloaded_steps,
+            [share(model.bunch_body, wp.int32), share(model.body_tree, wp.int32), share(model.bunch_pull, wp.float32),
+             share(model.bunch_bend, wp.float32), share(self._awake_bunches, wp.int32),
+             share(self._carried, wp.spatial_vector), share(self.plants.state.bunch_attached, wp.bool),
+             share(self.contact_solver.remote_trees, wp.bool)],
+            [share(self._overloaded_steps, wp.int32), share(self._longest, wp.int32)],
+        )  # fmt: skip
 
     # ------------------------------------------------------------------ the tick
 
@@ -95,38 +114,36 @@ class DetachmentMonitor:
     def _detach_overloaded(self) -> None:
         """Detach the bunches whose peduncles have been overloaded for long enough, on trees that this client
         simulates."""
-        model = self.plants.model
-        bunches = self._attached_bunches()
-        if self.contact_solver.remote_trees.any():
-            bunches = bunches[~self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunches]]]]
-        if len(bunches) == 0:
+        self._list_awake_bunches()
+        count = self._awake_count
+        if count == 0:
             return
-        carried = self.plants.joint_wrench(model.bunch_body[bunches])
-        square = carried * carried
-        pulled = square[:, :3].sum(1) / np.square(model.bunch_pull[bunches])
-        bent = square[:, 3:].sum(1) / np.square(model.bunch_bend[bunches])
-        strained = np.maximum(pulled, bent) > 1.0
-        if not strained.any():
-            self._overloaded_steps[bunches] = 0
+        self._carried[:count] = self.plants.joint_wrench(self._awake_bodies)
+        self._longest[0] = 0
+        self._count_overloaded_steps(count)
+        if self._longest[0] < self._overload_limit:
             return
-        self._overloaded_steps[bunches] = np.where(strained, self._overloaded_steps[bunches] + 1, 0)
-        for i in np.flatnonzero(self._overloaded_steps[bunches] >= self._overload_limit):
-            bunch = int(bunches[i])
-            self._pick(
-                bunch, "pull" if pulled[i] >= bent[i] else "bend", self._hardest_pressing_actor(bunch), carried[i]
-            )
+        model, attached = self.plants.model, self.plants.state.bunch_attached
+        for i in np.flatnonzero(self._overloaded_steps[self._awake_bunches[:count]] >= self._overload_limit).tolist():
+            bunch = int(self._awake_bunches[i])
+            is_remote = self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunch]]]
+            if attached[bunch] and not is_remote:
+                square = np.square(self._carried[i])
+                pulled = square[:3].sum() / np.square(model.bunch_pull[bunch])
+                bent = square[3:].sum() / np.square(model.bunch_bend[bunch])
+                cause, actor = "pull" if pulled >= bent else "bend", self._hardest_pressing_actor(bunch)
+                self._pick(bunch, cause, actor, self._carried[i].copy())
 
-    def _attached_bunches(self) -> np.ndarray:
-        """The bunches on awake trees that have not been picked [k]."""
+    def _list_awake_bunches(self) -> None:
+        """List the bunches of awake trees, those that have been picked included."""
         awake = self.plants.awake
         if awake is not self._awake:
             self._awake = awake
             first = self._first[awake]
-            count = self._first[awake + 1] - first
-            inner = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-            self._awake_bunches = self._bunches[np.repeat(first, count) + inner]
-        attached = self.plants.state.bunch_attached[self._awake_bunches]
-        return self._awake_bunches if attached.all() else self._awake_bunches[attached]
+            bunches = self._bunches[spans(first, self._first[awake + 1] - first)]
+            self._awake_count = len(bunches)
+            self._awake_bunches[: len(bunches)] = bunches
+            self._awake_bodies = self.plants.model.bunch_body[bunches]
 
     def _cut_with_blades(self) -> None:
         """Cut what is in the mouths that are closing."""

@@ -48,6 +48,8 @@ class ElasticSupports:
         self.deflection = np.zeros((len(self._tree), 3))
         """[node, 3] of wires m from where they are when nothing has moved, of arms their twist [rad, 0, 0]; wires
         first, each from start to end."""
+        self.count = len(first)
+        """Supports in all."""
         self._active, self._is_moved = np.zeros(len(first), np.int32), np.zeros(trees, np.bool_)
         self._active_count, self._moved_count = 0, np.zeros(1, np.int32)
         self.is_coupled = np.zeros(trees, np.bool_)

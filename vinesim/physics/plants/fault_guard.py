@@ -46,6 +46,8 @@ class FaultGuard:
         plants, state = self.plants, self.plants.state
         awake = plants.awake
         rate = plants.tree_rate[awake]
+        if rate.max(initial=0.0) <= min(plants.max_rate, plants.fault_rate):  # not for NaN
+            return awake[:0]
         stopped = awake[~(rate <= plants.fault_rate)]
         self.slowed += int(np.count_nonzero(rate > plants.max_rate)) - int(np.count_nonzero(rate > plants.fault_rate))
         if len(stopped) == 0:

@@ -43,7 +43,7 @@ class LevelOfDetail:
     @property
     def fine_trees(self) -> np.ndarray:
         """The trees whose clusters move, sorted [k]."""
-        return np.flatnonzero(self.plants.state.tree_fine)
+        return self.plants.state.tree_fine.nonzero()[0]
 
     def update(self, near: np.ndarray) -> np.ndarray:
         """Before ``predict()``: ``near`` [k] are the awake trees that an actor reaches into; those that were coarsened
@@ -69,8 +69,7 @@ class LevelOfDetail:
             if is_done.any():
                 coarsened = fine[is_done]
                 plants.coarsen(coarsened)
-        fresh = wanted[~state.tree_fine[wanted]]
-        if len(fresh):
+        if len(wanted) and len(fresh := wanted[~state.tree_fine[wanted]]):
             self._alone[fresh] = self._still[fresh] = 0
             plants.refine(fresh)
         return coarsened

@@ -11,7 +11,11 @@ only if nothing keeps one of them awake.
 from __future__ import annotations
 
 import numpy as np
+import warp as wp
 
+from vinesim.kernels.articulation.quiet_steps import count_quiet_steps
+from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.warp_arrays import share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.equilibrium import EquilibriumFinder
@@ -52,6 +56,12 @@ class SleepMonitor:
         """Tick of each tree's :attr:`_seen_x` [tree]; -1: it has none."""
         self._seen_x = np.zeros((len(plants.model.body_mass), 3), np.float32)
         """[body, 3] m where bodies were then."""
+        self._limit, self._trees = np.zeros(1, np.float32), np.zeros(trees, np.int32)
+        self._count_quiet_steps = bind_launch(
+            count_quiet_steps,
+            [share(self._limit, wp.float32), share(self._trees, wp.int32), share(plants.tree_rate, wp.float32)],
+            [share(self.quiet_steps, wp.int32), share(self._is_at_rest, wp.bool), share(self._seen_tick, wp.int64)],
+        )
 
     @property
     def restless(self) -> np.ndarray:
@@ -76,17 +86,27 @@ class SleepMonitor:
         self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS,
         is_coupled: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
-        """After an integration: the trees that have just been put to sleep [k].
+        """:meth:`watch`, and :meth:`check` where it is due: the trees that have just been put to sleep [k].
 
         ``keep_awake`` [tree] bool: what an actor is near to, holds or owns. ``contact_pairs`` [n, 2]: awake trees that
         touch each other. ``is_coupled`` [tree] bool: awake trees that wires join to others. They are not moved to rest:
         where that is depends on the others.
         """
+        return self.check(keep_awake, contact_pairs, is_coupled) if self.watch() else self.plants.awake[:0]
+
+    def watch(self) -> bool:
+        """After an integration: note which trees were slow in it; whether they are due for :meth:`check`."""
         plants, awake = self.plants, self.plants.awake
-        self.quiet_steps[awake] += 1
-        self._forget(awake[~(plants.tree_rate[awake] < self.rate)])
-        if plants.tick % self._check_steps:
-            return awake[:0]
+        self._limit[0], self._trees[: len(awake)] = self.rate, awake
+        self._count_quiet_steps(len(awake))
+        return plants.tick % self._check_steps == 0
+
+    def check(
+        self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS,
+        is_coupled: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Measure the trees that have been slow for long enough; see :meth:`update`."""
+        plants, awake = self.plants, self.plants.awake
         slow = awake[self.quiet_steps[awake] >= self.patience]
         if len(slow) == 0:
             return slow

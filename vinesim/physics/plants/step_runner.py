@@ -79,6 +79,8 @@ class StepRunner:
         self._pool, self._threads = thread_pool, 1 if thread_pool is None else thread_pool.size
         self.stepped = np.zeros(0, np.int32)
         """The trees of this step [k], sorted."""
+        self.is_stepped = np.zeros(len(tree_size), np.bool_)
+        """Which these are [tree]."""
         self.fast = np.zeros(0, np.int32)
         """Those of them whose step is to be divided [k], sorted."""
         self._whole, self._levels, self._roots, self._root_levels = 0, (), 0, ()
@@ -114,6 +116,8 @@ class StepRunner:
         if self.stepped is trees and not self._launches.substeps_due:
             return
         self._launches.substeps_due = False
+        self.is_stepped[self.stepped] = False
+        self.is_stepped[trees] = True
         self.stepped = trees
         self._list[: len(trees)] = trees
         self._launches.count_substeps(len(trees))
@@ -163,6 +167,9 @@ class StepRunner:
 
     def _list_roots(self, roots: np.ndarray, trees: np.ndarray) -> None:
         """List floating roots [k] (places of bodies) of trees [k] as their trees are listed."""
+        if len(roots) == 0:
+            self._roots, self._root_levels = 0, ()
+            return
         order, self._roots, self._root_levels = _by_substeps(np.arange(len(roots)), self._steps_of[trees])
         self._floating[: len(roots)] = roots[order]
 

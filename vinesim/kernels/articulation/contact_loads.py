@@ -1,0 +1,72 @@
+"""Wrenches of contacts on the bodies of plants, and the trees that they touch."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+LOADED = wp.constant(0)
+"""Place in ``numbers`` of how many bodies the last step loaded."""
+GIVEN = wp.constant(1)
+"""Of how many are loaded now."""
+TICK = wp.constant(2)
+"""Of the number of this step."""
+ONSET_STEPS = wp.constant(3)
+"""Of the steps with phi = 1 that follow on the first one of a contact, and that one."""
+TOUCHED = wp.constant(4)
+"""Of how many trees they belong to."""
+REFUSED = wp.constant(5)
+"""Of the number of the first given body that cannot be loaded, counted from 1; 0 if all can."""
+NUMBERS = 6
+
+
+@wp.kernel
+def load_bodies(
+    # model
+    body_tree: wp.array(dtype=wp.int32),
+    place_in_tree: wp.array(dtype=wp.int32),
+    # in
+    is_stepped: wp.array(dtype=wp.bool),
+    tree_moving: wp.array(dtype=wp.int32),
+    body: wp.array(dtype=wp.int32),
+    wrench: wp.array(dtype=wp.spatial_vector),
+    # out
+    numbers_out: wp.array(dtype=wp.int64),
+    loaded_out: wp.array(dtype=wp.int32),
+    body_wrench_out: wp.array(dtype=wp.spatial_vector),
+    touched_out: wp.array(dtype=wp.int32),
+    last_contact_out: wp.array(dtype=wp.int64),
+    tree_euler_steps_out: wp.array(dtype=wp.int32),
+):
+    """One thread in all: replace the wrenches of the last step by those of this one, and list the trees touched.
+
+    Nothing happens if a body cannot be loaded: its tree was not in the last prediction (is_stepped [tree]), or it is not
+    among the first tree_moving [tree] bodies of that. place_in_tree: [body] from 0 on.
+    body, wrench: [k] a body may be given several times. loaded_out: [k] the bodies of the last call, then those of this
+    one. body_wrench_out: [body] N, N m sums. touched_out: [j] each tree once. last_contact_out: [tree] step in which it
+    was touched last. tree_euler_steps_out: [tree] raised where contact begins.
+    """
+    given = int(numbers_out[GIVEN])
+    numbers_out[REFUSED] = wp.int64(0)
+    for i in range(given):
+        tree = body_tree[body[i]]
+        if not is_stepped[tree] or place_in_tree[body[i]] >= tree_moving[tree]:
+            numbers_out[REFUSED] = wp.int64(i + 1)
+            return
+    for i in range(int(numbers_out[LOADED])):
+        body_wrench_out[loaded_out[i]] = wp.spatial_vector()
+    tick = numbers_out[TICK]
+    count = int(0)
+    for i in range(given):
+        k = body[i]
+        loaded_out[i] = k
+        body_wrench_out[k] = body_wrench_out[k] + wrench[i]
+        tree = body_tree[k]
+        last = last_contact_out[tree]
+        if last != tick:
+            touched_out[count] = tree
+            count = count + 1
+            last_contact_out[tree] = tick
+            if last < tick - wp.int64(1):
+                tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], int(numbers_out[ONSET_STEPS]))
+    numbers_out[LOADED] = wp.int64(given)
+    numbers_out[TOUCHED] = wp.int64(count)
