@@ -17,11 +17,12 @@ from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene import appearance
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import INTENTIONS
+from vinesim.scene.values import INTENTIONS, HumanSpec
 from vinesim.web.page_server import WINDOW, PageServer
 
 MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
@@ -574,6 +575,51 @@ def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_pe
             page.call("Input.dispatchKeyEvent", type="keyDown", key="Tab", code="Tab", windowsVirtualKeyCode=9)
             page.run("document.activeElement.isReached = true")
         assert page.run(f"{CONTROLS}.filter((one) => !one.isReached).map((one) => one.outerHTML)") == []
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_names_stand_just_above_heads_near_and_far_and_stay_in_the_picture(page):
+    """By projection: eyes at a known place that look along x, and the highest point of a hat 0.14 m above its eyes."""
+    width, height, level = 480, 360, 1.65
+    places = {"anna": (0.7, -0.1), "ben": (3.0, 0.8), "clara": (12.0, -3.0)}
+    shapes = appearance.load_human_model(1.75).parts["head"]
+    hat = max(float(shape.mesh.corners[..., 2].max()) for shape in shapes if shape.mesh is not None)
+    top = standing_pose(frames.pose(np.zeros(3))).head[2] + hat
+    focal = height / 2 / np.tan(np.radians(30.0))
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
+        x, y = live.client.pose[:2]
+        for k, (name, (ahead, left)) in enumerate(places.items()):
+            pose = standing_pose(frames.pose(np.array([x + ahead, y + left, 0.0]), frames.from_yaw(np.pi)))
+            live.due.append(lambda spec=HumanSpec(name, k + 1, pose): live.client.physics.add_human(spec))
+        open_page(page, live)
+        page.resize(width, height)
+        page.run(f"Object.assign(vinesim.viewer.eyes, {{ place: [{x}, {y}, {level}], yaw: 0, pitch: 0 }}), 0")
+        boxes = """Object.fromEntries([...vinesim.viewer.labels].map(([name, label]) => {
+          const { left, right, top, bottom, height } = label.getBoundingClientRect();
+          return [name, { middle: (left + right) / 2, left, right, top, bottom, height }];
+        }))"""
+        wait(lambda: page.run(boxes).keys() == places.keys(), "three names")
+        is_drawn_anew(page)
+        shown = page.run(boxes)
+        for name, (ahead, left) in places.items():
+            head = standing_pose(frames.pose(np.array([ahead, left, 0.0]), frames.from_yaw(np.pi))).head
+            scale = focal / head[0]
+            assert shown[name]["middle"] == pytest.approx(width / 2 - left * scale, abs=2.0), name
+            above = height / 2 - (top - level) * scale - shown[name]["bottom"]
+            assert 0.0 < above < 0.06 * scale + 2.0, (name, "less than 6 cm above the hat [px]", above)
+            assert 14.0 < shown[name]["height"] < 26.0, name
+        assert shown["anna"]["height"] > shown["ben"]["height"] > shown["clara"]["height"]
+
+        page.run("vinesim.viewer.eyes.pitch = -0.5, 0")  # the tops of near heads are above the picture
+        is_drawn_anew(page)
+        bar = page.run("document.getElementById('top').getBoundingClientRect().bottom")
+        shown = page.run(boxes)
+        assert "anna" in shown
+        assert all(bar <= box["top"] and box["bottom"] <= height for box in shown.values())
+        page.run("vinesim.viewer.eyes.yaw = 2.5, 0")
+        wait(lambda: page.run(boxes) == {}, "nobody is in the picture")
         assert page.errors == []
 
 
