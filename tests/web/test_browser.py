@@ -550,6 +550,37 @@ def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile(page):
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
+def test_a_spectator_alone_and_a_slow_browser_are_told_so_and_buttons_follow_who_comes(page):
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live, touch_screen(page, 390, 844):
+        notices = "document.getElementById('notices').textContent"
+        page.open(live.server.address)
+        slow = "Object.defineProperty(vinesim.viewer, 'frame', { get: () => 1, set() {} }), 0"
+        wait(lambda: page.run("window.vinesim?.viewer !== undefined"), "the vineyard is loaded")
+        page.run(slow)
+        wait(lambda: "Nobody else is here yet" in page.run(notices), "who is alone is told so")
+        assert "draws slowly" in page.run(notices)
+        wait(lambda: 0 < page.run("vinesim.triangles") <= 60_000, "fewer triangles")
+        assert page.run("[vinesim.viewer.renderer.domElement.width, innerWidth]") == [195, 390]
+
+        pose = standing_pose(frames.pose(np.array([-8.0, -3.0, 0.0])))
+        live.due.append(lambda: live.client.physics.add_human(HumanSpec("anna", 1, pose)))
+        wait(lambda: page.run("vinesim.viewer.actors().length") == 1, "anna has come")
+        tap(
+            page,
+            page.run(
+                "(({ x, y }) => [x + 5, y + 5])(document.querySelector('#overlays summary').getBoundingClientRect())"
+            ),
+        )
+        tap_button(page, "follow")
+        wait(lambda: np.linalg.norm(live.client.pose[:2] - pose.head[:2]) < 4.0, "the eyes have followed her")
+        assert page.run("vinesim.viewer.labels.has('anna')")
+        tap_button(page, "label")
+        wait(lambda: page.run("vinesim.viewer.labels.size") == 0, "without her name")
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
 @pytest.mark.parametrize("is_person", [False, True], ids=["spectator", "person"])
 def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_person):
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=is_person) as live:
@@ -570,7 +601,7 @@ def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_pe
             assert page.run(MISPLACED) == [], "folded and not"
         page.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         controls = page.run(f"{CONTROLS}.length")
-        assert controls == folded + 8 + is_person * (2 + len(INTENTIONS)), "with overlays and intentions"
+        assert controls == folded + 10 + is_person * (1 + len(INTENTIONS)), "with overlays and intentions"
         for _ in range(controls):
             page.call("Input.dispatchKeyEvent", type="keyDown", key="Tab", code="Tab", windowsVirtualKeyCode=9)
             page.run("document.activeElement.isReached = true")

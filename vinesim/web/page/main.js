@@ -22,6 +22,10 @@ const LONGEST = 0.1; // s: what moves by keys moves no further in one picture
 const FINGER = 22; // px: a tap so far beside a thing means it
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
+/** A browser that draws fewer pictures a second than this after so many draws less from then on. */
+const SLOW = 5, FIRST_PICTURES = 12, FEW_TRIANGLES = 60_000;
+const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser from now on.";
+const NOBODY = "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
 const element = (id) => document.getElementById(id);
 
 /** A number in the address, null if it has none: triangles, pictures a second (rate), shadows. */
@@ -55,6 +59,9 @@ class Viewer {
     this.help.hidden = false;
     this.intention = "";
     this.offerIntentions(world.header.intentions);
+    element("follow").hidden = this.isPerson;
+    for (const [name, code] of [["follow", "KeyF"], ["label", "KeyN"]])
+      element(name).addEventListener("click", () => { this.press(code); element(name).blur(); });
     const isRoomy = innerWidth > 640 && innerHeight > 560; // as in the style sheet
     for (const panel of document.querySelectorAll("details")) panel.open = isRoomy;
     for (const help of document.querySelectorAll("#bottom .help")) help.addEventListener("click", () => { help.hidden = true; });
@@ -65,6 +72,7 @@ class Viewer {
     this.heardAt = performance.now();
     this.pace = new Pace(LONGEST);
     this.followed = -1;
+    this.isAdvised = false;
     this.shadowAt = asked("shadows") === 0 ? Infinity : -1e9;
     this.lastFrame = performance.now();
     this.shortest = 0; // time between two pictures of a desktop at least [s]
@@ -169,12 +177,16 @@ class Viewer {
 
   press(code) {
     this.overlays.press(code);
-    if (code === "KeyF") {
+    if (code === "KeyF" && !this.isPerson) {
       const actors = this.actors();
       this.followed = actors.length ? (this.followed + 2) % (actors.length + 1) - 1 : -1;
+      if (!actors.length) say(NOBODY);
     }
     if (code === "KeyT") this.shears.toggle("right");
-    if (code === "KeyN") element("names").hidden = !element("names").hidden;
+    if (code === "KeyN") {
+      element("names").hidden = !element("names").hidden;
+      element("label").setAttribute("aria-pressed", String(!element("names").hidden));
+    }
     if (code === "KeyH") this.help.hidden = !this.help.hidden;
   }
 
@@ -196,6 +208,7 @@ class Viewer {
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
     const actors = this.actors();
     if (this.eyes.update(seconds)) this.followed = -1;
+    element("follow").setAttribute("aria-pressed", String(this.followed >= 0));
     if (this.followed >= 0 && this.followed < actors.length) {
       const { carrier } = actors[this.followed];
       this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
@@ -233,9 +246,22 @@ class Viewer {
       element("state").textContent = said;
       const isKnown = this.newest.rigid === this.world.rigidVersion;
       this.absence.drawn(this.newest.time, this.world.picked, isKnown ? actors.map(({ name }) => name) : null);
+      this.adviseOnce(actors, rate);
       this.newest = null;
       if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(this.message(pose)));
     }
+  }
+
+  /** After the first pictures: what a newcomer may wonder about. */
+  adviseOnce(actors, rate) {
+    if (this.isAdvised || page.drawn < FIRST_PICTURES) return;
+    this.isAdvised = true;
+    if (actors.length === 0 && this.timeline === null) say(NOBODY);
+    if (rate > SLOW || this.headset.isWorn || asked("triangles") !== null || asked("rate") !== null) return;
+    this.renderer.setPixelRatio(0.5);
+    this.world.budget = FEW_TRIANGLES;
+    this.world.listedAt = null;
+    say(TOO_SLOW);
   }
 
   /** What the client is told: the state that was drawn, where the eyes are, and the person's head and hands. */
