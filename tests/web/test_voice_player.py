@@ -54,7 +54,7 @@ def test_a_voice_waits_longer_after_stalls_and_no_longer_than_needed_once_its_ne
         assert 0 < bad["stalls"] < 12, "it has learned to wait"
         assert bad["delays"][-1] > 2 * FRAME
 
-        after = play(*[rough] * 12, *[even] * 12)
+        after = play(*[rough] * 12, *[even] * 24)
         assert after["stalls"] == bad["stalls"], "no new ones"
         assert after["delays"][11] == bad["delays"][11]
         assert after["delays"][-1] <= START + 2 * QUANTUM, "as early as before"

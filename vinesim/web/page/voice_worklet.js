@@ -4,6 +4,7 @@ const FRAME = 960; // samples of 20 ms at 48 kHz
 /** Delay of a voice behind the beginning of its first frame, at first and at most: a frame, and a reserve. */
 const START = 1.5 * FRAME, LARGEST = 12 * FRAME; // samples
 const RESERVE = FRAME / 2; // samples by which frames may come too early
+const EASE = 8; // of what was too early, the share 1/so much is waited for no more
 const SPARE = 4 * FRAME; // samples that may wait beyond these
 const SILENT = 0.01; // amplitude below which a frame may be the last one of a while: nothing is sent for silence
 const RAMP = 96; // samples of a fade, 2 ms
@@ -36,8 +37,8 @@ class Capture extends AudioWorkletProcessor {
 
 /**
  * Plays a voice half a frame after its first frame has come. A queue that is empty amid a voice makes it wait for
- * longer from then on. What every frame of a sentence came too early by is waited for no more from the next one on, and one
- * that goes on for a second is cut by a frame, so that a voice is no later than its network makes it.
+ * longer from then on. What every frame of a sentence came too early by is waited for less from the next one on, and one
+ * that goes on for a second is cut by a frame, so that a voice is soon no later than its network makes it.
  */
 class Player extends AudioWorkletProcessor {
   constructor() {
@@ -97,7 +98,7 @@ class Player extends AudioWorkletProcessor {
       this.counts.stalls += 1;
       this.port.postMessage(this.counts);
     } else if (!this.hasStalled && this.least < Infinity)
-      this.target = Math.max(START, this.target - Math.max(this.least - RESERVE, 0) / 2);
+      this.target = Math.max(START, this.target - Math.max(this.least - RESERVE, 0) / EASE);
     this.hasStalled = isStall;
     this.begin();
   }
