@@ -130,3 +130,24 @@ def test_the_blades_go_with_the_person():
     assert physics.detachment_monitor.blades == []
     with pytest.raises(ValueError, match="no robot 'eva'"):
         physics.add_blade("eva", "right_hand", frames.pose(np.zeros(3)), np.ones(3))
+
+
+def test_what_is_between_the_blades_is_known_before_they_close():
+    physics, _, eva = at_peduncle()
+    eva.run(1)
+    assert eva.human.between_blades() == ("", "bunch")
+    eva.run(1, right_closed=True)
+    assert eva.human.between_blades() == ("", ""), "a stalk without its bunch"
+    eva.run(1, right_closed=False, right_shears=False)
+    assert eva.human.between_blades() == ("", ""), "no shears"
+    assert not physics.state.bunch_attached.any()
+
+
+@pytest.mark.parametrize(("radius", "between"), [(0.0055, "cane"), (0.009, "strong wood")])
+def test_wood_between_the_blades_is_told_apart_by_its_strength(radius, between):
+    physics = Physics(assemble([cane((0.0, 0.0, 1.3), radius=radius)]))
+    at = physics.snapshot().body_q[8].astype(float)
+    eva = Person(physics, at[:3] + frames.rotate(at[3:], np.array([0.03, 0.0, 0.0])), right_shears=True)
+    eva.run(1)
+    assert eva.human.between_blades() == ("", between)
+    assert not physics.state.body_cut.any()

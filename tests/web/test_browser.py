@@ -17,11 +17,12 @@ from vinesim.client.client import Client
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene import appearance
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import INTENTIONS
+from vinesim.scene.values import INTENTIONS, HumanSpec
 from vinesim.web.page_server import WINDOW, PageServer
 
 MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
@@ -33,7 +34,7 @@ HEADSET = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
 
 MISPLACED = """
 (() => {
-  const shown = [...document.querySelectorAll(".panel, #enter")].filter((one) => one.getClientRects().length);
+  const shown = [...document.querySelectorAll(".panel, #enter")].filter((one) => one.checkVisibility());
   const boxes = shown.map((one) => [one.id || one.className, one.getBoundingClientRect()]);
   const wrong = boxes.filter(([, { left, top, right, bottom }]) =>
     left < 0 || top < 0 || right > innerWidth || bottom > innerHeight).map(([name]) => `${name} is cut off`);
@@ -45,7 +46,27 @@ MISPLACED = """
   return wrong;
 })()
 """
-CONTROLS = "[...document.querySelectorAll('button, input, select')].filter((one) => one.getClientRects().length)"
+SEEN_CUT = """
+(viewer, cut) => {
+  const { world, camera } = viewer, [, mark] = viewer.shears.marks;
+  const project = (point) => {
+    const { x, y } = viewer.project(point);
+    return [(x + 1) / 2 * innerWidth, (1 - y) / 2 * innerHeight];
+  };
+  const place = mark.position.clone().set(...cut), eye = mark.position.clone().set(...viewer.eyes.place);
+  const off = Math.hypot(...project(mark.position).map((value, axis) => value - project(place)[axis]));
+  // parts of the hand that the line from the eyes to the cut passes through: boxes around their primitives
+  const hides = [...world.bounds].filter(([carrier, box]) => {
+    if (!/^viewer.right_(hand|thumb|index|middle|ring|little|forearm)/.test(world.nameOf(carrier))) return false;
+    for (let share = 0; share < 1; share += 0.002)
+      if (box.containsPoint(world.within(carrier, eye.clone().lerp(place, share)))) return true;
+    return false;
+  }).map(([carrier]) => world.nameOf(carrier));
+  return { mark: mark.visible, off, hides };
+}
+"""
+"""Whether a mark is drawn, how far from where the cut is [px], and what of the hand is before that."""
+CONTROLS = "[...document.querySelectorAll('button, input, select, summary')].filter((one) => one.checkVisibility())"
 
 
 class LiveVineyard:
@@ -116,6 +137,15 @@ def open_page(page, live, before=""):
     assert page.errors == []
 
 
+def look_at(page, point):
+    """Turn the page's eyes to a point [3] m; where they are [3] m."""
+    eye = np.array(page.run("vinesim.viewer.eyes.place"))
+    way = point - eye
+    pitch = np.arctan2(way[2], np.hypot(*way[:2]))
+    page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
+    return eye
+
+
 def press(page, code):
     """Press a key once."""
     page.key(code, down=True)
@@ -181,12 +211,9 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch(page):
         open_page(page, live)
         physics, body = live.client.physics, live.client.model.bunch_body[BUNCH]
         here = physics.state.body_q[body, :3].copy()
-        eye = np.array(page.run("vinesim.viewer.eyes.place"))
+        eye = look_at(page, live.bunch)
         assert np.linalg.norm(eye - live.client.humans["viewer"].pose.head[:3]) < 1e-3, "the person's own eyes"
-        way = live.bunch - eye
-        pitch = np.arctan2(way[2], np.hypot(*way[:2]))
-        page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
-        page.run(f"vinesim.viewer.hand.distance = {np.linalg.norm(way) + 0.02}")
+        page.run(f"vinesim.viewer.hand.distance = {np.linalg.norm(live.bunch - eye) + 0.02}")
         page.run("document.querySelector('#intentions button').click()")
         wait(lambda: live.client.humans["viewer"].intention == INTENTIONS[1], "the person indicates what comes")
         page.key("KeyR", down=True)
@@ -232,12 +259,8 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
             half = frames.pose(np.array([0.5 * model.body_length[stalk], 0.0, 0.0]))
             return frames.compose(physics.state.body_q[stalk].astype(float), half)[:3]
 
-        eye = np.array(page.run("vinesim.viewer.eyes.place"))
-        way = middle() - eye
-        ahead = np.sqrt(way @ way - shears.mouth[2] ** 2)
-        pitch = np.arctan2(way[2], np.hypot(*way[:2])) - np.arctan2(shears.mouth[2], ahead)
-        page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
-        page.run(f"vinesim.viewer.hand.distance = {ahead - shears.mouth[0]}, 0")
+        eye = look_at(page, middle())
+        page.run(f"vinesim.viewer.hand.distance = {np.linalg.norm(middle() - eye)}, 0")
         drawn = "vinesim.viewer.world.names.includes('viewer/right_shears_blade')"
         page.run(
             "window.load = fetch, window.fetch = (path) => new Promise((go) => { goOn = () => go(load(path)); }), 0"
@@ -253,7 +276,7 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
         page.run("goOn(), window.fetch = load, 0")
         wait(lambda: page.run(drawn), "the page draws them")
         assert live.client.humans["viewer"].pose.right_shears
-        assert page.run("document.querySelector('#tools button').getAttribute('aria-pressed')") == "true"
+        assert page.run("document.getElementById('shears').getAttribute('aria-pressed')") == "true"
         press(page, "KeyR")
 
         def is_between_blades():
@@ -262,16 +285,128 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
 
         wait(is_between_blades, "the peduncle is between the blades")
         assert physics.state.bunch_attached[BUNCH]
+        wait(lambda: page.run("document.getElementById('hold').innerText") == "Space cut bunch", "the button says so")
+        seen = page.run(f"({SEEN_CUT})(vinesim.viewer, {list(map(float, middle()))})")
+        assert seen["mark"]
+        assert seen["off"] < 6.0, "a mark is where the blades cut [px]"
+        assert seen["hides"] == [], "nothing of the hand is before it"
         press(page, "Space")
         wait(lambda: not physics.state.bunch_attached[BUNCH], "the bunch is cut")
         said = "The shears in the right hand cut 1 bunch."
         wait(lambda: page.run("vinesim.viewer.shears.told.at(-1)") == said, "the page says so")
         assert "cut 1 bunch" in page.run("document.getElementById('notices').textContent")
         wait(lambda: page.run("vinesim.haptics.right?.[0] > 0.99"), "the hand feels it")
-        press(page, "Space")
-        wait(lambda: not live.client.humans["viewer"].pose.right_closed, "the shears open")
-        page.run("document.querySelector('#tools button').click()")
+        wait(lambda: not live.client.humans["viewer"].pose.right_closed, "the shears open by themselves")
+        assert len(page.run("vinesim.viewer.shears.told")) == 1
+        wait(lambda: page.run("document.getElementById('hold').innerText") == "Space cut", "nothing is between them")
+        page.run("document.getElementById('shears').click()")
         wait(lambda: not page.run(drawn), "they are put away")
+        assert page.errors == []
+
+
+@contextlib.contextmanager
+def touch_screen(page, width, height):
+    """A phone without a mouse, within the block."""
+    page.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": True}
+    page.call("Emulation.setDeviceMetricsOverride", **metrics)
+    try:
+        yield
+    finally:
+        page.call("Emulation.setTouchEmulationEnabled", enabled=False)
+
+
+def touch(page, kind, *points):
+    """An event of some fingers [px]; kinds: touchStart, touchMove, touchEnd."""
+    points = [{"x": float(x), "y": float(y), "id": k} for k, (x, y) in enumerate(points)]
+    page.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+
+
+def tap(page, place):
+    touch(page, "touchStart", place)
+    touch(page, "touchEnd")
+
+
+def tap_button(page, name):
+    box = f"document.getElementById('{name}').getBoundingClientRect()"
+    tap(page, page.run(f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({box})"))
+
+
+def in_picture(page, point):
+    """Where a point [3] m of the world is shown [px]."""
+    return page.run(f"""(({{ world, eyes }}, viewer, point) => {{
+      const {{ x, y }} = viewer.project(world.place(0).set(...point));
+      return [(x + 1) / 2 * innerWidth, (1 - y) / 2 * innerHeight];
+    }})(vinesim.viewer, vinesim.viewer, {[float(value) for value in point]})""")
+
+
+def is_drawn_anew(page):
+    """Wait until pictures begun from now on are drawn."""
+    drawn = page.run("vinesim.frames")
+    wait(lambda: page.run("vinesim.frames") > drawn + 1, "two pictures later")
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_a_person_with_a_phone_picks_one_bunch_and_cuts_another_by_touch_alone(page):
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, touch_screen(page, 390, 844):
+        page.open(live.server.address + "?triangles=10000&rate=10&shadows=0")
+        wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
+        physics, human = live.client.physics, live.client.humans["viewer"]
+        hand = lambda: physics.hand("viewer", "right")  # noqa: E731
+        start = human.pose.head.copy()
+
+        # one finger looks, and what it only passes over is not reached for
+        touch(page, "touchStart", (200, 500))
+        touch(page, "touchMove", (230, 500))
+        touch(page, "touchEnd")
+        wait(lambda: frames.to_yaw(human.pose.head[3:]) > 0.09, "one finger looks")
+        assert not page.run("vinesim.viewer.hand.reaching")
+        look_at(page, live.bunch)
+        is_drawn_anew(page)
+
+        tap(page, in_picture(page, live.bunch))
+        assert page.run("vinesim.viewer.hand.target.what") == "bunch"
+        wait(lambda: hand().touching, "the hand reaches the bunch")
+        tap_button(page, "hold")
+        wait(lambda: hand().held is not None, "it grasps it")
+        assert page.run("document.getElementById('hold').innerText") == "let go"
+        assert physics.state.bunch_attached[BUNCH]
+        touch(page, "touchStart", (150, 400), (250, 400))
+        touch(page, "touchMove", (150, 500), (250, 500))
+        touch(page, "touchEnd")
+        wait(lambda: not physics.state.bunch_attached[BUNCH], "who walks back with it by two fingers picks it")
+        assert np.linalg.norm(hand().force) <= 100.0 + 1e-6
+        assert human.pose.head[0] < start[0]
+        tap_button(page, "reach")
+        wait(lambda: hand().pose[2] < start[2] - 0.5, "the arm hangs down")
+        assert hand().held is not None, "and holds the bunch still"
+        tap_button(page, "hold")
+        wait(lambda: hand().held is None, "it lets go")
+
+        # what is too far away is said; shears cut the stalk of the bunch that was tapped
+        model = live.client.model
+        hangs = model.forward_kinematics(model.joint_settled)[model.bunch_body][:, :3] - np.array([0.0, 0.0, 0.06])
+        far = np.linalg.norm(hangs - start[:3], axis=1) + 10.0 * (np.arange(len(hangs)) == BUNCH)
+        other = int(far.argmin())
+        place = hangs[other] - np.array([1.2, 0.0, hangs[other][2]])
+        page.run(f"vinesim.viewer.eyes.place.splice(0, 2, {place[0]}, {place[1]}), 0")
+        look_at(page, hangs[other])
+        is_drawn_anew(page)
+        tap_button(page, "shears")
+        wait(lambda: human.pose.right_shears, "she takes the shears")
+        tap(page, in_picture(page, hangs[other]))
+        said = page.run("document.getElementById('notices').textContent")
+        assert "This bunch is 1.2 m away" in said
+        assert "walk nearer" in said
+        assert not page.run("vinesim.viewer.hand.reaching")
+        page.run(f"vinesim.viewer.eyes.place.splice(0, 1, {place[0] + 0.65}), 0")
+        look_at(page, hangs[other])
+        is_drawn_anew(page)
+        tap(page, in_picture(page, hangs[other]))
+        wait(lambda: page.run("document.getElementById('hold').innerText") == "cut bunch", "its stalk is between them")
+        tap_button(page, "hold")
+        wait(lambda: not physics.state.bunch_attached[other], "it is cut")
         assert page.errors == []
 
 
@@ -415,6 +550,37 @@ def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile(page):
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
+def test_a_spectator_alone_and_a_slow_browser_are_told_so_and_buttons_follow_who_comes(page):
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live, touch_screen(page, 390, 844):
+        notices = "document.getElementById('notices').textContent"
+        page.open(live.server.address)
+        slow = "Object.defineProperty(vinesim.viewer, 'frame', { get: () => 1, set() {} }), 0"
+        wait(lambda: page.run("window.vinesim?.viewer !== undefined"), "the vineyard is loaded")
+        page.run(slow)
+        wait(lambda: "Nobody else is here yet" in page.run(notices), "who is alone is told so")
+        assert "draws slowly" in page.run(notices)
+        wait(lambda: 0 < page.run("vinesim.triangles") <= 60_000, "fewer triangles")
+        assert page.run("[vinesim.viewer.renderer.domElement.width, innerWidth]") == [195, 390]
+
+        pose = standing_pose(frames.pose(np.array([-8.0, -3.0, 0.0])))
+        live.due.append(lambda: live.client.physics.add_human(HumanSpec("anna", 1, pose)))
+        wait(lambda: page.run("vinesim.viewer.actors().length") == 1, "anna has come")
+        tap(
+            page,
+            page.run(
+                "(({ x, y }) => [x + 5, y + 5])(document.querySelector('#overlays summary').getBoundingClientRect())"
+            ),
+        )
+        tap_button(page, "follow")
+        wait(lambda: np.linalg.norm(live.client.pose[:2] - pose.head[:2]) < 4.0, "the eyes have followed her")
+        assert page.run("vinesim.viewer.labels.has('anna')")
+        tap_button(page, "label")
+        wait(lambda: page.run("vinesim.viewer.labels.size") == 0, "without her name")
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
 @pytest.mark.parametrize("is_person", [False, True], ids=["spectator", "person"])
 def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_person):
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=is_person) as live:
@@ -427,11 +593,64 @@ def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_pe
             wait(lambda width=width: page.run("innerWidth") == width, "the page has this size")
             assert page.run(MISPLACED) == [], (width, height)
         controls = page.run(f"{CONTROLS}.length")
-        assert controls == 8 + is_person * len(INTENTIONS), "hear, speak, overlays, timeline; shears and intentions"
+        folded = page.run("[...document.querySelectorAll('details')].filter((one) => one.checkVisibility()).length")
+        assert folded == 1 + is_person, "overlays and intentions"
+        assert controls == folded + 5 + is_person * 3, "hear, speak, timeline; hand and shears"
+        for _ in range(2):
+            page.run("document.querySelectorAll('details').forEach((one) => { one.open = !one.open; })")
+            assert page.run(MISPLACED) == [], "folded and not"
+        page.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+        controls = page.run(f"{CONTROLS}.length")
+        assert controls == folded + 10 + is_person * (1 + len(INTENTIONS)), "with overlays and intentions"
         for _ in range(controls):
             page.call("Input.dispatchKeyEvent", type="keyDown", key="Tab", code="Tab", windowsVirtualKeyCode=9)
             page.run("document.activeElement.isReached = true")
         assert page.run(f"{CONTROLS}.filter((one) => !one.isReached).map((one) => one.outerHTML)") == []
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_names_stand_just_above_heads_near_and_far_and_stay_in_the_picture(page):
+    """By projection: eyes at a known place that look along x, and the highest point of a hat 0.14 m above its eyes."""
+    width, height, level = 480, 360, 1.65
+    places = {"anna": (0.7, -0.1), "ben": (3.0, 0.8), "clara": (12.0, -3.0)}
+    shapes = appearance.load_human_model(1.75).parts["head"]
+    hat = max(float(shape.mesh.corners[..., 2].max()) for shape in shapes if shape.mesh is not None)
+    top = standing_pose(frames.pose(np.zeros(3))).head[2] + hat
+    focal = height / 2 / np.tan(np.radians(30.0))
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
+        x, y = live.client.pose[:2]
+        for k, (name, (ahead, left)) in enumerate(places.items()):
+            pose = standing_pose(frames.pose(np.array([x + ahead, y + left, 0.0]), frames.from_yaw(np.pi)))
+            live.due.append(lambda spec=HumanSpec(name, k + 1, pose): live.client.physics.add_human(spec))
+        open_page(page, live)
+        page.resize(width, height)
+        page.run(f"Object.assign(vinesim.viewer.eyes, {{ place: [{x}, {y}, {level}], yaw: 0, pitch: 0 }}), 0")
+        boxes = """Object.fromEntries([...vinesim.viewer.labels].map(([name, label]) => {
+          const { left, right, top, bottom, height } = label.getBoundingClientRect();
+          return [name, { middle: (left + right) / 2, left, right, top, bottom, height }];
+        }))"""
+        wait(lambda: page.run(boxes).keys() == places.keys(), "three names")
+        is_drawn_anew(page)
+        shown = page.run(boxes)
+        for name, (ahead, left) in places.items():
+            head = standing_pose(frames.pose(np.array([ahead, left, 0.0]), frames.from_yaw(np.pi))).head
+            scale = focal / head[0]
+            assert shown[name]["middle"] == pytest.approx(width / 2 - left * scale, abs=2.0), name
+            above = height / 2 - (top - level) * scale - shown[name]["bottom"]
+            assert 0.0 < above < 0.06 * scale + 2.0, (name, "less than 6 cm above the hat [px]", above)
+            assert 14.0 < shown[name]["height"] < 26.0, name
+        assert shown["anna"]["height"] > shown["ben"]["height"] > shown["clara"]["height"]
+
+        page.run("vinesim.viewer.eyes.pitch = -0.5, 0")  # the tops of near heads are above the picture
+        is_drawn_anew(page)
+        bar = page.run("document.getElementById('top').getBoundingClientRect().bottom")
+        shown = page.run(boxes)
+        assert "anna" in shown
+        assert all(bar <= box["top"] and box["bottom"] <= height for box in shown.values())
+        page.run("vinesim.viewer.eyes.yaw = 2.5, 0")
+        wait(lambda: page.run(boxes) == {}, "nobody is in the picture")
         assert page.errors == []
 
 

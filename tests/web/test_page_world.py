@@ -194,7 +194,7 @@ def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(a
 
     parts = ["anna/right_shears_blade", "anna/right_shears_hook"]
     told, names, _ = shown(shears=False, closed=False)
-    assert told["shears"] == {"closures": 0, "said": []}
+    assert told["shears"] == {"closures": 0, "said": [], "between": ["", ""]}
     assert not set(parts) & set(names)
     told, names, places = shown(shears=True, closed=False)
     assert set(parts) <= set(names)

@@ -78,6 +78,13 @@ class LocalHuman:
         )
         return HumanUpdate(self.name, now, pose, velocity, self.intention)
 
+    def between_blades(self) -> tuple[str, ...]:
+        """What the shears in the left and the right hand would cut now, in words: see :meth:`Shears.between`."""
+        return tuple(
+            shears.between() if getattr(self.pose, f"{side}_shears") else ""
+            for shears, side in zip(self._shears, SIDES, strict=True)
+        )
+
     def hand_wrenches_on(self, robots: Container[str]) -> dict[str, dict[str, np.ndarray]]:
         """Wrenches [6] of the hands on some ``robots`` in the last step, by robot and link; after :meth:`update`."""
         return {robot: links for robot, links in self._hand_wrenches.items() if robot in robots}

@@ -57,6 +57,7 @@ class Shears:
         """``name`` of a person in ``physics``, ``side`` of the hand."""
         model = appearance.load_shears()
         self.side = side
+        self._monitor = physics.detachment_monitor
         self._force = model.force
         self._blade = physics.add_blade(name, f"{side}_hand", model.mouth, model.mouth_half)
         self._closures = 0
@@ -68,6 +69,15 @@ class Shears:
         if is_closed and not self._was_closed and getattr(pose, f"{self.side}_shears"):
             self._blade.close(self._force)
         self._was_closed = is_closed
+
+    def between(self) -> str:
+        """After a step: what the blades would cut if they closed now, "bunch" or "cane"; "strong wood" if all that is
+        there is too strong for them; "" if nothing is there."""
+        wood = self._monitor.wood_in_mouth(self._blade)
+        weak = [bunch for body, bunch in wood if self._monitor.cutting_force(body) <= self._force]
+        if not weak:
+            return "strong wood" if wood else ""
+        return "bunch" if max(weak) >= 0 else "cane"
 
     def closure(self) -> Closure | None:
         """After a step: how the blades closed in it; None if they did not."""

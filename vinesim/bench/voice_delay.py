@@ -23,6 +23,8 @@ from vinesim.bench.support.browser import AS_RECORDED, Page, browser_page, micro
 from vinesim.client.processes.child_process import START_TIMEOUT, ProcessFailed, ProcessGroup, free_port
 from vinesim.scene.values import Measurement
 
+_Frames = dict[str, list[tuple[float, str]]]
+"""By event, the times [ms] of frames and their data."""
 BURSTS = 60
 """Measured bursts."""
 FREQUENCY, LENGTH, LEVEL = 600.0, 0.12, 0.5
@@ -61,6 +63,22 @@ PROBE = """(async () => {
   return true;
 })()"""
 """Notes the times at which bursts begin [ms]."""
+NOTE = """(() => {
+  const { voice } = vinesim, now = () => performance.timeOrigin + performance.now();
+  const note = (object, method, times, data = () => []) => {
+    const call = object[method].bind(object);
+    object[method] = (...values) => { times.push([now(), data(...values).join()]); return call(...values); };
+  };
+  window.times = { full: [], sent: [], received: [], decoded: [] };
+  %s
+  return true;
+})()"""
+SENDS = """note(voice, 'send', times.sent, (_, data) => data);
+  if (voice.encoder) note(voice.encoder, 'encode', times.full); else times.full = times.sent;"""
+RECEIVES = "const one = %s; note(one, 'take', times.received, (_, __, data) => data); note(one, 'play', times.decoded);"
+"""Note when frames [ms, data] are full in the page's own thread, encoded and sent; received, decoded."""
+STAGES = ("the rest of its frame", "encoding", "network of two clients and a server", "decoding", "queue and output")
+"""Of the way of the first frame of a burst."""
 
 
 def voice() -> Iterator[Measurement]:
@@ -75,10 +93,14 @@ def voice() -> Iterator[Measurement]:
             page.resize(160, 120)
             page.open(address + ADDRESS, before=AS_RECORDED)
             _wait(lambda page=page: page.run("window.vinesim?.drawn >= 2"), "a picture")
-        said, heard, output, stalls = _measure(*pages)
+        said, heard, output, stalls, frames = _measure(*pages)
     took = np.array([next((1.0 * b - a for b in heard if 0 <= b - a < 1e3 * LATEST), np.nan) for a in said])
     yield Measurement("voice", f"bursts that were not heard, of {len(took)}", float(np.isnan(took).sum()), "")
     yield Measurement("voice", "gaps that the second page had to bridge", float(stalls), "")
+    for stage, took_there in zip(STAGES, _stages(np.array(said), took, frames), strict=True):
+        for share in (50, 95):
+            value = float(np.nanpercentile(took_there, share))
+            yield Measurement("voice", f"of this {stage}, percentile {share}", value, "ms")
     took = took[~np.isnan(took)]
     yield Measurement("voice", "output of the browser, as it says", output, "ms")
     for share in (50, 95):
@@ -115,20 +137,41 @@ def _start(group: ProcessGroup) -> list[str]:
     return [f"http://127.0.0.1:{port}/" for port in ports]
 
 
-def _measure(first: Page, second: Page) -> tuple[list[float], list[float], float, int]:
-    """Times at which bursts began in both pages, delay of the second one's output [ms], and its gaps."""
+def _stages(said: np.ndarray, took: np.ndarray, times: _Frames) -> np.ndarray:
+    """How long each of :data:`STAGES` took [stage, burst] ms for the first frame that was full after a burst began and
+    was sent: nothing is sent for silence; NaN: not known. ``times`` [ms] of frames and their data."""
+    sent, received, decoded = times["sent"], times["received"], times["decoded"]
+    full = np.array([at for at, _ in times["full"]])
+    full = full[np.maximum(np.searchsorted(full, [at for at, _ in sent], "right") - 1, 0)]
+    stages = np.full((len(STAGES), len(said)), np.nan)
+    for burst, began in enumerate(said):
+        k = int(np.searchsorted(full, began))
+        coming = enumerate(received[: len(decoded)])
+        there = next((i for i, (at, data) in coming if k < len(sent) and data == sent[k][1] and at >= sent[k][0]), None)
+        if there is not None:
+            way = [began, full[k], sent[k][0], received[there][0], decoded[there][0], began + took[burst]]
+            stages[:, burst] = np.diff(way)
+    return stages
+
+
+def _measure(first: Page, second: Page) -> tuple[list[float], list[float], float, int, _Frames]:
+    """Times at which bursts began in both pages, delay of the second one's output [ms], its gaps, and times of frames
+    [ms] with their data."""
     second.run("vinesim.voice.hear()")
     first.run("vinesim.voice.toggleSpeaking()")
     speaker = f"vinesim.voice.speakers.get({FIRST[0]!r})"
     _wait(lambda: second.run(f"{speaker}?.received > 20"), f"the voice of {FIRST[0]}")
     for page, source in ((second, f"{speaker}.player"), (first, "vinesim.voice.microphone.source")):
         page.run(PROBE % (source, HEARD_LEVEL, QUIET))
+    first.run(NOTE % SENDS)
+    second.run(NOTE % (RECEIVES % speaker))
     before = int(second.run(f"{speaker}.counts.stalls"))
     _wait(lambda: first.run("bursts.length") > BURSTS, "bursts")
     time.sleep(LATEST)
     output = "1000 * (vinesim.voice.context.baseLatency + vinesim.voice.context.outputLatency)"
     stalls = int(second.run(f"{speaker}.counts.stalls")) - before
-    return first.run("bursts")[:BURSTS], second.run("bursts"), float(second.run(output)), stalls
+    frames = {name: at for page in (first, second) for name, at in page.run("times").items() if at}
+    return first.run("bursts")[:BURSTS], second.run("bursts"), float(second.run(output)), stalls, frames
 
 
 def _wait(condition: Callable[[], object], what: str) -> None:

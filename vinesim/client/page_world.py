@@ -15,6 +15,8 @@ from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator, follow_view
 from vinesim.physics.plants.sway import Sway
 from vinesim.physics.rigid.human_shapes import SIDES
+from vinesim.scene.appearance import load_shears
+from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, Snapshot
 from vinesim.sensors.scene import textures
@@ -33,6 +35,8 @@ MAX_PRIMITIVES = 400_000
 """Of plants and ground that a page loads: 32 MB."""
 MAX_SENTENCES = 4
 """Closures of shears that a state tells of: pages learn of both hands, and of those between two states."""
+BLADE_STEPS = 5
+"""Pages are told every so many steps what is between the blades of shears."""
 _TURN_STEPS = 32767
 """Steps of a component of a quaternion from 0 to 1."""
 
@@ -94,8 +98,9 @@ class PageWorld:
         """Of the person's left and right hand [2, 7]: as simulated, and the controllers that they followed."""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
-        self._shears: dict[str, Any] = {"closures": 0, "said": []}
-        """How often the person's shears have closed, and what they cut the last times; replaced, never changed."""
+        self._shears: dict[str, Any] = {"closures": 0, "said": [], "between": ["", ""]}
+        """How often the person's shears have closed, what they cut the last times, and what is between the open blades
+        of both hands; replaced, never changed."""
 
     # ------------------------------------------------------------------ in the client's loop
 
@@ -133,7 +138,7 @@ class PageWorld:
             if human.closures:
                 said = [*self._shears["said"], *(closure.sentence for closure in human.closures)]
                 closures = self._shears["closures"] + len(human.closures)
-                self._shears = {"closures": closures, "said": said[-MAX_SENTENCES:]}
+                self._shears = {**self._shears, "closures": closures, "said": said[-MAX_SENTENCES:]}
         if self._sway is None or not server.has_viewers:
             return
         self._contacts = physics.contacts if self._overlay_pages else ()
@@ -146,6 +151,9 @@ class PageWorld:
                 "hand_proxy": np.array([hand.pose for hand in hands], np.float32),
                 "hand_controller": np.array([hand.controller for hand in hands], np.float32),
             }
+            if physics.tick % BLADE_STEPS == 0:
+                between = self._client.humans[self._client.name].between_blades()
+                self._shears = {**self._shears, "between": list(between)}
         with self._lock:
             self._snapshot = self._tick, swayed
         server.notify()
@@ -177,6 +185,7 @@ class PageWorld:
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
                 "person": None if self._person is None else self._client.name,
+                "mouth": None if self._person is None else load_shears().mouth[:3].tolist(),
                 "replay": None if self._replay is None else self._replay.status(),
                 "intentions": [] if self._person is None else list(INTENTIONS[1:]),
                 "gestures": {} if self._person is None else dict(self._person.gestures.poses),
@@ -187,7 +196,7 @@ class PageWorld:
                 "tree_first": model.tree_first.astype(np.uint32), "poses": self._at_rest.astype(np.float32),
                 "outline": outline, "hull": hull,
                 "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(self._start_view(), np.float32),
-            },
+            } | ({} if self._person is None else _within_reach(model)),
         )  # fmt: skip
 
     def rigid(self) -> bytes:
@@ -323,6 +332,19 @@ def _tracked(person: TrackedPerson) -> TrackedPoints:
         (OPEN_HAND if hands[0] is None else hands[0].fingers, OPEN_HAND if hands[1] is None else hands[1].fingers),
         person.shears,
     )  # fmt: skip
+
+
+def _within_reach(model: Model) -> dict[str, np.ndarray]:
+    """What a person may reach for: bodies of wood and their lengths [m]; of each bunch its body, length and radius [m],
+    and the last piece of its stalk."""
+    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
+    stalk = model.body_parent[model.bunch_body]
+    return {
+        "wood": wood.astype(np.uint32), "wood_length": model.body_length[wood].astype(np.float32),
+        "bunch_body": model.bunch_body.astype(np.uint32), "bunch_length": model.bunch_length.astype(np.float32),
+        "bunch_radius": model.bunch_radius.astype(np.float32), "bunch_stalk": stalk.astype(np.uint32),
+        "stalk_length": model.body_length[stalk].astype(np.float32),
+    }  # fmt: skip
 
 
 def _turns(pose: np.ndarray) -> np.ndarray:

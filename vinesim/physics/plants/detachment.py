@@ -164,6 +164,13 @@ class DetachmentMonitor:
                         self.pick(bunch, "blade", blade.actor)
                 blade.detachments = tuple(self._detachments[before:])
 
+    def wood_in_mouth(self, blade: Blade) -> list[tuple[int, int]]:
+        """After a step: bodies that a blade would cut if it were strong enough, and the bunch that each carries; -1: a
+        cane."""
+        bodies = self._bodies_in_mouth(blade).tolist()
+        found = [(body, int(self._bunch_of[body])) for body in bodies]
+        return [(body, bunch) for body, bunch in found if bunch < 0 or self.plants.state.bunch_attached[bunch]]
+
     def cutting_force(self, body: int) -> float:
         """[N] that it takes to cut a piece of wood across: its cross-section at the root end times its strength."""
         return self._cutting_strength * math.pi * float(self.plants.model.body_radius[body, 0]) ** 2

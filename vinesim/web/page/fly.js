@@ -35,9 +35,12 @@ export class FlyingEyes {
     if (!last) return;
     const dx = event.clientX - last[0], dy = event.clientY - last[1];
     this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
-    if (this.fingers.size > 1) this.move(-0.004 * dy * this.speed, 0.004 * dx * this.speed, 0);
+    if (this.fingers.size > 1) this.push(-0.004 * dy * this.speed, 0.004 * dx * this.speed);
     else this.look(0.0035 * dx, 0.0035 * dy);
   }
+
+  /** Two fingers ask to move [m]. */
+  push(ahead, left) { this.move(ahead, left, 0); }
 
   look(yaw, pitch) {
     this.yaw += yaw;

@@ -30,12 +30,17 @@ export class LateHands {
     });
   }
 
+  /** Pose (Matrix4, world) of the palm of a side, 0 left and 1 right, where it is now; null: not known. */
+  palm(person, k) {
+    const seen = person[SIDES[k]];
+    return seen === null || this.held === null ? null : matrix(seen.pose).multiply(this.held[k].offset);
+  }
+
   /** Move the hands with their tracked poses of this moment: a free hand has no delay, one that is held back keeps the
    * offset that it had. */
   draw(person) {
     if (this.held === null) return;
-    const moved = SIDES.map((side, k) => person[side] === null ? null
-      : matrix(person[side].pose).multiply(this.held[k].offset).multiply(this.held[k].back));
+    const moved = SIDES.map((_, k) => this.palm(person, k)?.multiply(this.held[k].back) ?? null);
     const place = new THREE.Vector3(), turn = new THREE.Quaternion(), scale = new THREE.Vector3();
     const data = this.world.poses.image.data;
     for (const [side, carrier, pose] of this.parts) {

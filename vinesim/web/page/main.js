@@ -1,13 +1,15 @@
 // The page: loads the vineyard, follows its states; a spectator flies, a person walks, reaches and may wear a headset.
 
 import * as THREE from "./vendor/three.module.js";
+import { pointAt } from "./aim.js";
 import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
+import { ARM, Hand } from "./hand.js";
 import { Headset } from "./headset.js";
 import { Absence, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { LateHands } from "./late.js";
-import { DeskHand, Pace, WalkingEyes } from "./person.js";
+import { Pace, WalkingEyes } from "./person.js";
 import { Shears } from "./shears.js";
 import { Timeline } from "./timeline.js";
 import { Voice } from "./voice.js";
@@ -17,6 +19,13 @@ const RETRY = 1000; // ms
 const SILENCE = 3; // s
 const SHADOW_PERIOD = 250; // ms
 const LONGEST = 0.1; // s: what moves by keys moves no further in one picture
+const FINGER = 22; // px: a tap so far beside a thing means it
+const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
+const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
+/** A browser that draws fewer pictures a second than this after so many draws less from then on. */
+const SLOW = 5, FIRST_PICTURES = 12, FEW_TRIANGLES = 60_000;
+const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser from now on.";
+const NOBODY = "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
 const element = (id) => document.getElementById(id);
 
 /** A number in the address, null if it has none: triangles, pictures a second (rate), shadows. */
@@ -36,10 +45,11 @@ class Viewer {
     this.camera = new THREE.PerspectiveCamera(60, 1, 0.03, 500);
     this.isPerson = world.header.person !== null;
     this.eyes = new (this.isPerson ? WalkingEyes : FlyingEyes)(this.renderer.domElement, start);
-    this.hand = this.isPerson ? new DeskHand(this.renderer.domElement, world.header.gestures) : null;
+    const { mouth, gestures } = world.header;
+    this.hand = this.isPerson ? new Hand(this.renderer.domElement, gestures, mouth, (cursor) => this.reach(cursor)) : null;
     this.rig = new THREE.Group();
     this.scene.add(this.rig);
-    this.shears = new Shears(this.isPerson);
+    this.shears = new Shears(mouth, world.group);
     this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons, (side) => this.shears.toggle(side));
     this.offerHeadset();
     this.absence = new Absence();
@@ -49,6 +59,12 @@ class Viewer {
     this.help.hidden = false;
     this.intention = "";
     this.offerIntentions(world.header.intentions);
+    element("follow").hidden = this.isPerson;
+    for (const [name, code] of [["follow", "KeyF"], ["label", "KeyN"]])
+      element(name).addEventListener("click", () => { this.press(code); element(name).blur(); });
+    const isRoomy = innerWidth > 640 && innerHeight > 560; // as in the style sheet
+    for (const panel of document.querySelectorAll("details")) panel.open = isRoomy;
+    for (const help of document.querySelectorAll("#bottom .help")) help.addEventListener("click", () => { help.hidden = true; });
     const { replay } = world.header;
     this.timeline = replay === null ? null : new Timeline(replay, (wish) => this.ask(wish));
     this.newest = null;
@@ -56,6 +72,7 @@ class Viewer {
     this.heardAt = performance.now();
     this.pace = new Pace(LONGEST);
     this.followed = -1;
+    this.isAdvised = false;
     this.shadowAt = asked("shadows") === 0 ? Infinity : -1e9;
     this.lastFrame = performance.now();
     this.shortest = 0; // time between two pictures of a desktop at least [s]
@@ -71,6 +88,7 @@ class Viewer {
   /** One button for each thing that a person may indicate to do; a second click ends it. */
   offerIntentions(intentions) {
     const panel = element("intentions");
+    const summary = panel.querySelector("summary"), asks = summary.textContent;
     panel.hidden = intentions.length === 0;
     for (const intention of intentions) {
       const button = panel.appendChild(document.createElement("button"));
@@ -80,6 +98,7 @@ class Viewer {
         this.intention = this.intention === intention ? "" : intention;
         for (const other of panel.querySelectorAll("button"))
           other.setAttribute("aria-pressed", String(other.textContent === this.intention));
+        summary.textContent = `${asks} ${this.intention}`;
         button.blur(); // keys go on to move
       });
     }
@@ -129,7 +148,7 @@ class Viewer {
     this.heardAt = performance.now();
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
     this.headset.pulse(state.haptics);
-    this.shears.take(state);
+    if (this.shears.take(state)) this.hand.cut();
     if (state.rigid > Math.max(this.world.rigidVersion, this.shapes?.version ?? 0) && !this.loading) {
       this.loading = true;
       this.shapes = await load("rigid").catch(() => null); // a client that goes meanwhile is waited for by the socket
@@ -158,12 +177,16 @@ class Viewer {
 
   press(code) {
     this.overlays.press(code);
-    if (code === "KeyF") {
+    if (code === "KeyF" && !this.isPerson) {
       const actors = this.actors();
       this.followed = actors.length ? (this.followed + 2) % (actors.length + 1) - 1 : -1;
+      if (!actors.length) say(NOBODY);
     }
     if (code === "KeyT") this.shears.toggle("right");
-    if (code === "KeyN") element("names").hidden = !element("names").hidden;
+    if (code === "KeyN") {
+      element("names").hidden = !element("names").hidden;
+      element("label").setAttribute("aria-pressed", String(!element("names").hidden));
+    }
     if (code === "KeyH") this.help.hidden = !this.help.hidden;
   }
 
@@ -185,6 +208,7 @@ class Viewer {
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
     const actors = this.actors();
     if (this.eyes.update(seconds)) this.followed = -1;
+    element("follow").setAttribute("aria-pressed", String(this.followed >= 0));
     if (this.followed >= 0 && this.followed < actors.length) {
       const { carrier } = actors[this.followed];
       this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
@@ -199,6 +223,7 @@ class Viewer {
     if (this.isPerson) {
       this.person = this.track(pose, seconds);
       this.lateHands.draw(this.person);
+      this.shears.draw([0, 1].map((k) => this.lateHands.palm(this.person, k)), facing(pose));
     }
     this.renderer.info.reset();
     if (now - this.shadowAt > SHADOW_PERIOD) {
@@ -216,13 +241,27 @@ class Viewer {
     if (this.newest !== null) {
       page.drawn += 1;
       page.tick = this.newest.tick;
-      const said = `${this.world.header.scene}  ${this.newest.time.toFixed(1)} s  ${(1 / this.frame).toFixed(0)} frames/s`;
+      const rate = 1 / this.frame;
+      const said = `${this.world.header.scene}  ${this.newest.time.toFixed(1)} s  ${rate.toFixed(rate < 10 ? 1 : 0)} frames/s`;
       element("state").textContent = said;
       const isKnown = this.newest.rigid === this.world.rigidVersion;
       this.absence.drawn(this.newest.time, this.world.picked, isKnown ? actors.map(({ name }) => name) : null);
+      this.adviseOnce(actors, rate);
       this.newest = null;
       if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(this.message(pose)));
     }
+  }
+
+  /** After the first pictures: what a newcomer may wonder about. */
+  adviseOnce(actors, rate) {
+    if (this.isAdvised || page.drawn < FIRST_PICTURES) return;
+    this.isAdvised = true;
+    if (actors.length === 0 && this.timeline === null) say(NOBODY);
+    if (rate > SLOW || this.headset.isWorn || asked("triangles") !== null || asked("rate") !== null) return;
+    this.renderer.setPixelRatio(0.5);
+    this.world.budget = FEW_TRIANGLES;
+    this.world.listedAt = null;
+    say(TOO_SLOW);
   }
 
   /** What the client is told: the state that was drawn, where the eyes are, and the person's head and hands. */
@@ -235,9 +274,27 @@ class Viewer {
   /** The person's tracked head and hands in this frame, a time [s] after the last one. */
   track(pose, seconds) {
     if (this.headset.isWorn) return { head: pose, ...this.headset.hands() };
-    const ray = new THREE.Vector3(...this.hand.cursor, 0.5).unproject(this.camera).sub(this.camera.position).normalize();
-    const right = this.hand.tracked(pose.slice(0, 3), [ray.x, -ray.z, ray.y], this.eyes.yaw, seconds);
+    this.hand.withShears = this.shears.taken.right;
+    const right = this.hand.tracked(pose, this.eyes.yaw, this.ray(this.hand.cursor), this.world, seconds);
+    this.hand.show(this.shears.between[1]);
     return { head: pose, left: null, right };
+  }
+
+  /** Direction (Vector3, world) from the eyes through a place of the picture, -1 to 1. */
+  ray(cursor) {
+    const { x, y, z } = new THREE.Vector3(...cursor, 0.5).unproject(this.camera).sub(this.camera.position).normalize();
+    return new THREE.Vector3(x, -z, y);
+  }
+
+  /** Reach for what was tapped; what is too far away is said. */
+  reach(cursor) {
+    if (this.headset.isWorn) return;
+    const spread = FINGER / (innerHeight / 2) * Math.tan(this.camera.fov / 2 * Math.PI / 180);
+    const found = pointAt(this.world, new THREE.Vector3(...this.eyes.place), this.ray(cursor),
+      { spread, reach: ARM, farthest: FARTHEST, withShears: this.shears.taken.right });
+    if (found === null) return;
+    if (found.distance <= ARM) this.hand.reachFor(found);
+    else say(`This ${found.what} is ${found.distance.toFixed(1)} m away, an arm reaches ${ARM} m: walk nearer.`);
   }
 
   /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
@@ -253,24 +310,38 @@ class Viewer {
 
   /** Names above the other actors. */
   label(actors) {
-    const names = element("names"), there = new Set();
+    const names = element("names"), there = new Set(), eye = new THREE.Vector3(...this.eyes.place);
+    const lowest = element("top").getBoundingClientRect().bottom;
     if (!names.hidden)
       for (const { name, carrier } of actors) {
         if (name === this.world.header.person) continue;
-        const head = this.world.names.indexOf(`${name}/head`), isPerson = head >= 0;
-        const point = this.world.place(isPerson ? this.world.bodies + 1 + head : carrier);
-        point.z = isPerson ? point.z + 0.35 : Math.max(point.z, 0) + 1.9;
-        point.applyEuler(this.world.group.rotation).project(this.camera);
-        if (point.z > 1) continue;
+        const head = this.world.names.indexOf(`${name}/head`), parts = head < 0 ? this.parts(name) : [this.world.bodies + 1 + head];
+        const point = this.world.place(head < 0 ? carrier : parts[0]), top = this.world.top(parts);
+        const distance = point.distanceTo(eye);
+        const below = this.project(point);
+        if (below.z > 1 || Math.abs(below.x) > 1 || Math.abs(below.y) > 1.2 || !Number.isFinite(top)) continue;
+        const above = this.project(point.setZ(top + NAME.gap));
         there.add(name);
         if (!this.labels.has(name)) {
           this.labels.set(name, names.appendChild(document.createElement("div")));
           this.labels.get(name).textContent = name;
         }
-        const x = (point.x + 1) / 2 * innerWidth, y = (1 - point.y) / 2 * innerHeight;
-        this.labels.get(name).style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
+        const label = this.labels.get(name), size = NAME.far + (NAME.near - NAME.far) * Math.min(1, NAME.from / distance);
+        label.style.fontSize = `${size.toFixed(1)}px`;
+        const x = (above.x + 1) / 2 * innerWidth, y = Math.max((1 - above.y) / 2 * innerHeight, lowest + 2 * size);
+        label.style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
       }
     for (const [name, label] of this.labels) if (!there.has(name)) { label.remove(); this.labels.delete(name); }
+  }
+
+  /** Carriers of an actor. */
+  parts(actor) {
+    return this.world.names.flatMap((name, k) => name.startsWith(`${actor}/`) ? [this.world.bodies + 1 + k] : []);
+  }
+
+  /** A point (Vector3, world) in the picture: -1 to 1 right and up, beyond 1 in z: behind the eyes. */
+  project(point) {
+    return point.clone().applyEuler(this.world.group.rotation).project(this.camera);
   }
 
   resize() {
@@ -278,6 +349,11 @@ class Viewer {
     this.camera.aspect = innerWidth / innerHeight;
     this.camera.updateProjectionMatrix();
   }
+}
+
+/** Quaternion, in the world, of something flat that faces eyes at a pose [7]. */
+function facing(pose) {
+  return new THREE.Quaternion(...pose.slice(3)).multiply(new THREE.Quaternion(0, -Math.SQRT1_2, 0, Math.SQRT1_2));
 }
 
 function fail(failure) {

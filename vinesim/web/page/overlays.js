@@ -18,7 +18,7 @@ export class Overlays {
     this.buttons = {};
     for (const [code, [name, text]] of Object.entries(KINDS)) {
       const button = this.buttons[name] = this.panel.appendChild(document.createElement("button"));
-      button.textContent = `${code.slice(3)}  ${text}`;
+      button.innerHTML = `<kbd class="keys">${code.slice(3)}</kbd> ${text}`;
       button.setAttribute("aria-pressed", "false");
       button.addEventListener("click", () => { this.toggle(name); button.blur(); });
     }

@@ -1,11 +1,9 @@
-// A person without a headset: walks by keys, looks and reaches by the mouse.
+// A person without a headset: walks in the world's time, by keys or by two fingers.
 
 import { FlyingEyes } from "./fly.js";
 
-const WALK = 1.4, CROUCH = 0.55, ARM = 0.75, REACH = 0.9; // m/s, m, m, m/s
-/** Where the hand hangs, from the eyes: ahead, to the left, up [m]. */
-const HANGING = [0.3, -0.2, -0.7];
-const FIST = [1, 1, 1, 1, 1], OPEN = [0, 0, 0, 0, 0];
+const WALK = 1.4, CROUCH = 0.55; // m/s, m
+const LONGEST_WISH = 1; // m that fingers ask for in advance
 
 /**
  * A person walks and reaches in the world's time: where the client is slower than real time, or pauses, so is the person,
@@ -40,6 +38,13 @@ export class WalkingEyes extends FlyingEyes {
     this.height = pose[2];
     this.speed = WALK;
     this.crouch = 0;
+    this.wish = [0, 0]; // m ahead and to the left that fingers have asked for, and that are not walked yet
+  }
+
+  /** Fingers may be faster than a person. */
+  push(ahead, left) {
+    const wish = [this.wish[0] + ahead, this.wish[1] + left], length = Math.hypot(...wish);
+    this.wish = wish.map((value) => value * Math.min(1, LONGEST_WISH / Math.max(length, 1e-9)));
   }
 
   move(ahead, left) {
@@ -53,57 +58,10 @@ export class WalkingEyes extends FlyingEyes {
     this.crouch += Math.min(Math.max(goal - this.crouch, -1.5 * seconds), 1.5 * seconds);
     this.place[2] = this.height - this.crouch;
     this.speed = WALK;
+    const share = Math.min(1, WALK * seconds / Math.max(Math.hypot(...this.wish), 1e-9));
+    const [ahead, left] = this.wish;
+    this.wish = [(1 - share) * ahead, (1 - share) * left];
+    this.move(share * ahead, share * left);
     return super.update(seconds);
-  }
-}
-
-/** The right hand of a person at a desk: it reaches to where the cursor points. */
-export class DeskHand {
-  /** `gestures`: finger poses by name; the digits make them, in their order. */
-  constructor(element, gestures) {
-    this.fingers = null;
-    const poses = Object.values(gestures);
-    addEventListener("keydown", (event) => {
-      const pose = event.code.startsWith("Digit") ? poses[event.code.slice(5) - 1] : undefined;
-      if (pose) this.fingers = this.fingers === pose ? null : pose;
-    });
-    this.reaching = this.closed = false;
-    this.distance = 0.5; // m from the eyes
-    this.cursor = [0, 0]; // -1 to 1, right and up
-    element.addEventListener("contextmenu", (event) => event.preventDefault());
-    const buttons = (event) => {
-      this.cursor = [2 * event.clientX / innerWidth - 1, 1 - 2 * event.clientY / innerHeight];
-      if (event.pointerType !== "mouse") return;
-      if (event.buttons & 2) { this.reaching = true; this.closed = Boolean(event.buttons & 1); }
-      else if (this.byMouse) this.reaching = this.closed = false;
-      this.byMouse = Boolean(event.buttons & 2);
-    };
-    for (const name of ["pointerdown", "pointermove", "pointerup"]) element.addEventListener(name, buttons);
-    element.addEventListener("wheel", (event) => {
-      if (this.reaching) this.distance = Math.min(Math.max(this.distance - event.deltaY / 2000, 0.25), ARM);
-    });
-    addEventListener("keydown", (event) => {
-      if (event.code === "KeyR" && !event.repeat) { this.reaching = !this.reaching; this.closed = false; }
-      if (event.code === "Space" && !event.repeat && this.reaching) this.closed = !this.closed;
-    });
-  }
-
-  /**
-   * The tracked hand for the page's message, a time [s] after the last one: it moves at the speed of an arm.
-   * `ray` is the direction [3] of the cursor from the `eye` [3], `yaw` that of the head.
-   */
-  tracked(eye, ray, yaw, seconds) {
-    const c = Math.cos(yaw), s = Math.sin(yaw), [x, y, z] = HANGING;
-    const goal = this.reaching ? ray.map((value) => this.distance * value) : [c * x - s * y, s * x + c * y, z];
-    this.offset ??= goal;
-    const way = goal.map((value, axis) => value - this.offset[axis]), length = Math.hypot(...way);
-    const share = Math.min(1, REACH * seconds / Math.max(length, 1e-6));
-    this.offset = this.offset.map((value, axis) => value + share * way[axis]);
-    const pitch = this.reaching ? Math.asin(Math.min(Math.max(ray[2], -1), 1)) : 0;
-    const heading = this.reaching ? Math.atan2(ray[1], ray[0]) : yaw;
-    const [cy, sy, cp, sp] = [Math.cos(heading / 2), Math.sin(heading / 2), Math.cos(pitch / 2), Math.sin(-pitch / 2)];
-    const place = this.offset.map((value, axis) => eye[axis] + value);
-    return { pose: [...place, -sy * sp, cy * sp, sy * cp, cy * cp], closed: this.closed,
-      fingers: this.fingers ?? (this.closed ? FIST : OPEN) };
   }
 }

@@ -3,6 +3,8 @@
 const FRAME = 960; // samples of 20 ms at 48 kHz
 /** Delay of a voice behind the beginning of its first frame, at first and at most: a frame, and a reserve. */
 const START = 1.5 * FRAME, LARGEST = 12 * FRAME; // samples
+const RESERVE = FRAME / 2; // samples by which frames may come too early
+const EASE = 8; // of what was too early, the share 1/so much is waited for no more
 const SPARE = 4 * FRAME; // samples that may wait beyond these
 const SILENT = 0.01; // amplitude below which a frame may be the last one of a while: nothing is sent for silence
 const RAMP = 96; // samples of a fade, 2 ms
@@ -35,7 +37,8 @@ class Capture extends AudioWorkletProcessor {
 
 /**
  * Plays a voice half a frame after its first frame has come. A queue that is empty amid a voice makes it wait for
- * longer from then on; one that was never shorter than a frame for a second is cut by one, so that a voice is no later than its network makes it.
+ * longer from then on. What every frame of a sentence came too early by is waited for less from the next one on, and one
+ * that goes on for a second is cut by a frame, so that a voice is soon no later than its network makes it.
  */
 class Player extends AudioWorkletProcessor {
   constructor() {
@@ -50,9 +53,11 @@ class Player extends AudioWorkletProcessor {
     this.last = 0;
     this.counts = { stalls: 0, cut: 0 };
     this.peak = 0; // of the last frame
-    this.least = Infinity; // samples that waited in the last second
-    this.passed = 0; // samples of it
+    this.least = Infinity; // samples that still waited when a frame came, since the voice began or was cut
+    this.passed = 0; // samples since then
+    this.hasStalled = false; // in this sentence
     this.port.onmessage = ({ data }) => {
+      if (this.plays) this.least = Math.min(this.least, this.waiting);
       this.frames.push(data);
       this.peak = data.reduce((most, value) => Math.max(most, Math.abs(value)), 0);
       this.waiting += data.length;
@@ -67,17 +72,35 @@ class Player extends AudioWorkletProcessor {
     this.port.postMessage(this.counts);
   }
 
-  /** After some samples: cut what has waited for nothing. */
+  /** After some samples of a voice that goes on: cut what has waited for nothing. */
   follow(count) {
-    this.least = this.plays ? Math.min(this.least, this.waiting) : 0;
+    if (!this.plays) return;
     this.passed += count;
     if (this.passed < 50 * FRAME) return;
-    if (this.least > FRAME) {
+    if (this.least < Infinity && Math.min(this.least, this.waiting) > FRAME) {
       this.target = Math.max(START, this.target - FRAME);
       this.cut();
     }
+    this.begin();
+  }
+
+  begin() {
     this.passed = 0;
     this.least = Infinity;
+  }
+
+  /** The queue is empty: the voice has stalled, or a sentence is over. */
+  end() {
+    this.plays = false;
+    const isStall = this.peak > SILENT;
+    if (isStall) {
+      this.target = Math.min(this.target + FRAME / 2, LARGEST);
+      this.counts.stalls += 1;
+      this.port.postMessage(this.counts);
+    } else if (!this.hasStalled && this.least < Infinity)
+      this.target = Math.max(START, this.target - Math.max(this.least - RESERVE, 0) / EASE);
+    this.hasStalled = isStall;
+    this.begin();
   }
 
   process(_, outputs) {
@@ -93,14 +116,7 @@ class Player extends AudioWorkletProcessor {
         if (this.at === this.frames[0].length) { this.frames.shift(); this.at = 0; }
         this.level = Math.min(1, this.level + 1 / RAMP);
       } else {
-        if (this.plays) {
-          this.plays = false;
-          if (this.peak > SILENT) {
-            this.target = Math.min(this.target + FRAME / 2, LARGEST);
-            this.counts.stalls += 1;
-            this.port.postMessage(this.counts);
-          }
-        }
+        if (this.plays) this.end();
         this.level = Math.max(0, this.level - 1 / RAMP);
       }
       out[i] = this.level * this.last;

@@ -12,7 +12,8 @@ const COARSEST = 1000;
 const RIGID_COARSER = [3, 8];
 /** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
 const VANISHING = 2600;
-const LEAF = 2, SPHEROID = 1;
+/** Numbers of kinds, as in `MESHES`. */
+const SPHEROID = 1, LEAF = 2, BOX = 3, ELLIPSOID = 4, TRIANGLE = 6;
 const TRIANGLE_BUDGET = 300_000;
 /** The lists of what is drawn are made anew when the eye has moved so far [m]. */
 const STRIDE = 0.25;
@@ -40,6 +41,7 @@ export class World {
     this.rigidClusters = clusters({ first: [], size: [], kind: [], bunch: [], ball: [], shape: [], carrier: [] });
     this.picked = new Set();
     this.names = [];
+    this.bounds = new Map(); // of rigid bodies: boxes around their primitives, by carrier, in its frame
     this.hidden = new Set(); // carriers whose rigid primitives are not drawn
     this.rigidVersion = 0;
     this.eye = new THREE.Vector3();
@@ -146,6 +148,7 @@ export class World {
     this.write(arrays, this.plants);
     this.rigidClusters = clusters(arrays);
     this.names = header.names;
+    this.bounds = boundsOf(arrays);
     const own = partsBeforeEyes(this.header);
     this.hidden = new Set();
     this.names.forEach((name, k) => { if (own.has(name)) this.hidden.add(this.bodies + 1 + k); });
@@ -195,6 +198,34 @@ export class World {
   /** Place [3] of a carrier, in the world. */
   place(carrier) {
     return new THREE.Vector3().fromArray(this.poses.image.data, 8 * carrier);
+  }
+
+  /** Name of a rigid body, whose carrier changes when others come and go; "": a plant's. */
+  nameOf(carrier) { return this.names[carrier - this.bodies - 1] ?? ""; }
+
+  /** Quaternion of a carrier. */
+  turn(carrier) {
+    return new THREE.Quaternion().fromArray(this.poses.image.data, 8 * carrier + 4).normalize();
+  }
+
+  /** A point of the world (Vector3) in the frame of a carrier. */
+  within(carrier, point) {
+    return point.clone().sub(this.place(carrier)).applyQuaternion(this.turn(carrier).conjugate());
+  }
+
+  /** A point (Vector3) in the frame of a carrier, in the world. */
+  beyond(carrier, point) {
+    return point.clone().applyQuaternion(this.turn(carrier)).add(this.place(carrier));
+  }
+
+  /** Height of the highest point of the boxes around some carriers [m]. */
+  top(carriers) {
+    return Math.max(...carriers.filter((carrier) => this.bounds.has(carrier)).map((carrier) => {
+      const up = new THREE.Vector3(0, 0, 1).applyQuaternion(this.turn(carrier).conjugate());
+      const { min, max } = this.bounds.get(carrier);
+      const over = ["x", "y", "z"].reduce((sum, axis) => sum + Math.max(up[axis] * min[axis], up[axis] * max[axis]), 0);
+      return this.place(carrier).z + over;
+    }));
   }
 
   /** Heading of a carrier about the vertical [rad]. */
@@ -312,6 +343,30 @@ function dataTexture(format, type, Kind, channels, texels, shift) {
   return texture;
 }
 
+/** Boxes around the primitives of each carrier, in its frame. */
+function boundsOf({ shape, first, size, kind, carrier }) {
+  const bounds = new Map();
+  first.forEach((start, k) => {
+    for (let row = start; row < start + size[k]; ++row) {
+      const [a, b, c] = [0, 4, 8].map((at) => new THREE.Vector3().fromArray(shape, 16 * row + at));
+      const radius = shape[16 * row + 3], box = new THREE.Box3(), around = new THREE.Vector3();
+      if (kind[k] === TRIANGLE) box.setFromPoints([a, b, c]);
+      else if (kind[k] === BOX || kind[k] === ELLIPSOID) {
+        const turn = new THREE.Quaternion().fromArray(shape, 16 * row + 4);
+        [radius, c.x, c.y].forEach((half, axis) => {
+          const edge = new THREE.Vector3().setComponent(axis, half).applyQuaternion(turn);
+          around.add(edge.set(Math.abs(edge.x), Math.abs(edge.y), Math.abs(edge.z)));
+        });
+        box.setFromPoints([a]).expandByVector(around);
+      } else if (kind[k] === SPHEROID) box.setFromPoints([a]).expandByScalar(radius * Math.max(shape[16 * row + 7], 1));
+      else box.setFromPoints([a, b]).expandByScalar(radius);
+      const of = carrier[start];
+      bounds.set(of, (bounds.get(of) ?? new THREE.Box3()).union(box));
+    }
+  });
+  return bounds;
+}
+
 /** Runs of primitives, with the mean thickness of their parts [m]. */
 function clusters(arrays) {
   const { first, size, kind, bunch, ball, shape } = arrays, count = first.length;
@@ -319,7 +374,7 @@ function clusters(arrays) {
   for (let k = 0; k < count; ++k) {
     let sum = 0;
     for (let i = 0; i < size[k]; ++i) sum += Math.abs(shape[16 * (first[k] + i) + 3]);
-    thickness[k] = kind[k] === 6 ? 1 : Math.max(sum / size[k], 1e-4) * (kind[k] === LEAF ? 0.6 : kind[k] === SPHEROID ? 0.8 : 1);
+    thickness[k] = kind[k] === TRIANGLE ? 1 : Math.max(sum / size[k], 1e-4) * (kind[k] === LEAF ? 0.6 : kind[k] === SPHEROID ? 0.8 : 1);
   }
   const carrier = Array.from(first, (row) => arrays.carrier[row]);
   return { first, size, kind, bunch, ball, thickness, carrier };

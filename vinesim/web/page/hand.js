@@ -1,0 +1,176 @@
+// The right hand of a person without a headset: it reaches to where the mouse points, or for what was tapped.
+
+import * as THREE from "./vendor/three.module.js";
+
+/** From the eyes at most, and how fast hands move and turn [m, m/s, rad/s]. */
+export const ARM = 0.75;
+const REACH = 0.9, TURN = 3;
+const NEAREST = 0.25; // m from the eyes
+/** A hand comes to what was tapped from so far before it at most [m]: one that came from below would lift it. */
+const APPROACH = 0.2;
+/** Where the hand hangs, from the eyes: ahead, to the left, up [m]. */
+const HANGING = [0.3, -0.2, -0.7];
+/**
+ * How a hand comes to what it reaches for: from the line of sight to the left, up and about its own axis [rad], with a
+ * share of how steep that line is. An empty hand comes along it; blades come from the right and from below, or the hand
+ * would hide what they cut. GUESSED, by pictures.
+ */
+const EMPTY = { left: 0, up: 0, roll: 0, steep: 1 }, WITH_SHEARS = { left: 0.9, up: 0.35, roll: -0.8, steep: 0.5 };
+/** Between palm and fingers [m], in the palm's frame. */
+const GRASP = [0.06, 0, 0];
+const FIST = [1, 1, 1, 1, 1], OPEN = [0, 0, 0, 0, 0];
+/** A finger that moves less than this [px] between touching and leaving the screen has tapped. */
+const STILL = 10;
+
+export class Hand {
+  /**
+   * `gestures`: finger poses by name; the digits make them, in their order. `mouth` [3]: where shears cut, in the palm's
+   * frame [m]. `tap(cursor)` is called for taps and clicks at a place of the picture.
+   */
+  constructor(element, gestures, mouth, tap) {
+    this.mouth = mouth;
+    this.withShears = false;
+    this.fingers = null;
+    this.reaching = this.closed = false;
+    this.opensAfterCut = false;
+    this.distance = 0.5; // m from the eyes, of what follows the cursor
+    this.cursor = [0, 0]; // -1 to 1, right and up
+    this.target = null; // what was tapped, as `pointAt` finds it
+    this.kept = null; // Vector3 in the head's frame, where the target was when the hand closed
+    this.angles = { left: 0, up: 0, roll: 0 };
+    this.listenToMouse(element);
+    this.listenToTaps(element, tap);
+    this.listenToKeys(Object.values(gestures));
+    this.buttons = Object.fromEntries(["reach", "hold"].map((name) => [name, document.getElementById(name)]));
+    this.buttons.reach.addEventListener("click", () => { this.toggleReach(); this.buttons.reach.blur(); });
+    this.buttons.hold.addEventListener("click", () => { this.toggleHold(); this.buttons.hold.blur(); });
+  }
+
+  listenToMouse(element) {
+    element.addEventListener("contextmenu", (event) => event.preventDefault());
+    const follow = (event) => {
+      if (event.pointerType !== "mouse") return;
+      this.cursor = cursorOf(event);
+      if (event.buttons & 2) Object.assign(this, { reaching: true, target: null, closed: Boolean(event.buttons & 1) });
+      else if (this.byMouse) this.reaching = this.closed = false;
+      this.byMouse = Boolean(event.buttons & 2);
+    };
+    for (const name of ["pointerdown", "pointermove", "pointerup"]) element.addEventListener(name, follow);
+    element.addEventListener("wheel", (event) => {
+      if (this.reaching) this.distance = Math.min(Math.max(this.distance - event.deltaY / 2000, NEAREST), ARM);
+    });
+  }
+
+  /** One finger, or the left button, that touches and leaves at the same place. */
+  listenToTaps(element, tap) {
+    const down = new Map();
+    let isTap = false;
+    element.addEventListener("pointerdown", (event) => {
+      isTap = down.size === 0 && event.button === 0;
+      down.set(event.pointerId, [event.clientX, event.clientY]);
+    });
+    element.addEventListener("pointermove", (event) => {
+      const from = down.get(event.pointerId);
+      if (from && Math.hypot(event.clientX - from[0], event.clientY - from[1]) > STILL) isTap = false;
+    });
+    element.addEventListener("pointercancel", (event) => { down.delete(event.pointerId); isTap = false; });
+    element.addEventListener("pointerup", (event) => {
+      down.delete(event.pointerId);
+      if (isTap && event.button === 0) tap(cursorOf(event));
+      isTap = false;
+    });
+  }
+
+  listenToKeys(poses) {
+    addEventListener("keydown", (event) => {
+      if (event.repeat) return;
+      const pose = event.code.startsWith("Digit") ? poses[event.code.slice(5) - 1] : undefined;
+      if (pose) this.fingers = this.fingers === pose ? null : pose;
+      if (event.code === "KeyR") this.toggleReach();
+      if (event.code === "Space" && event.target === document.body) this.toggleHold();
+    });
+  }
+
+  /** Reach to where the cursor is, or let the arm hang; a hand that holds something goes on holding it. */
+  toggleReach() {
+    this.reaching = !this.reaching;
+    this.target = null;
+  }
+
+  /** Grasp, or let go; with shears: cut, after which they open again. */
+  toggleHold() {
+    this.closed = !this.closed;
+    this.opensAfterCut = this.closed && this.withShears;
+  }
+
+  /** Reach for a point in the frame of what carries it, and follow that until the hand closes. */
+  reachFor(target) { Object.assign(this, { target, kept: null, reaching: true }); }
+
+  /** A state tells that the shears have closed. */
+  cut() {
+    if (this.opensAfterCut) this.closed = this.opensAfterCut = false;
+  }
+
+  /** Say on the buttons what the hand does, and with shears what is `between` the blades. */
+  show(between) {
+    const { reach, hold } = this.buttons;
+    reach.setAttribute("aria-pressed", String(this.reaching));
+    hold.setAttribute("aria-pressed", String(this.closed));
+    const says = this.withShears ? `cut${between ? ` ${between}` : ""}` : this.closed ? "let go" : "grasp";
+    if (hold.lastElementChild.textContent !== says) hold.lastElementChild.textContent = says;
+  }
+
+  /** What the hand reaches for, from the `eye`: Vector3, at most an arm's length [m]. */
+  aim(eye, head, ray, world) {
+    if (this.target === null) return ray.clone().multiplyScalar(this.distance);
+    const { carrier, at, name } = this.target;
+    if (this.kept === null || (!this.closed && world.nameOf(carrier) === name))
+      this.kept = world.beyond(carrier, at).sub(eye).clampLength(0, ARM).applyQuaternion(head.clone().conjugate());
+    return this.kept.clone().applyQuaternion(head);
+  }
+
+  /** Move a `place` back `ahead`, the less the nearer the hand is to the line along which it comes there. */
+  stopBefore(place, ahead) {
+    if (!this.offset) return;
+    const way = place.clone().sub(this.offset), beside = way.addScaledVector(ahead, -way.dot(ahead)).length();
+    place.addScaledVector(ahead, -Math.min(APPROACH, 2 * beside));
+  }
+
+  /**
+   * The tracked hand for the page's message, a time [s] after the last one: it moves at the speed of an arm.
+   * `pose` [7] of the head, `yaw` of it; `ray` Vector3: direction of the cursor from the eyes.
+   */
+  tracked(pose, yaw, ray, world, seconds) {
+    const eye = new THREE.Vector3(...pose.slice(0, 3)), head = new THREE.Quaternion(...pose.slice(3));
+    const goal = { left: 0, up: 0, roll: 0 }, place = new THREE.Vector3();
+    if (this.reaching) {
+      const aim = this.aim(eye, head, ray, world), hold = this.withShears ? WITH_SHEARS : EMPTY;
+      goal.left = wrapped(Math.atan2(aim.y, aim.x) - yaw + hold.left);
+      goal.up = hold.up + hold.steep * Math.atan2(aim.z, Math.hypot(aim.x, aim.y));
+      goal.roll = hold.roll;
+      const turn = turnOf(goal, yaw);
+      place.set(...(this.withShears ? this.mouth : GRASP)).applyQuaternion(turn).negate().add(aim);
+      if (this.target !== null && !this.closed) this.stopBefore(place, new THREE.Vector3(1, 0, 0).applyQuaternion(turn));
+    } else place.set(...HANGING).applyAxisAngle(new THREE.Vector3(0, 0, 1), yaw);
+    for (const [name, angle] of Object.entries(goal)) {
+      const way = name === "left" ? wrapped(angle - this.angles.left) : angle - this.angles[name];
+      this.angles[name] += Math.min(Math.max(way, -TURN * seconds), TURN * seconds);
+    }
+    this.offset ??= place.clone();
+    const way = place.sub(this.offset);
+    this.offset.addScaledVector(way, Math.min(1, REACH * seconds / Math.max(way.length(), 1e-6)));
+    return { pose: [...this.offset.clone().add(eye), ...turnOf(this.angles, yaw)], closed: this.closed,
+      fingers: this.fingers ?? (this.closed ? FIST : OPEN) };
+  }
+}
+
+/** Quaternion of angles to the left of a `yaw`, up, and about the hand's own axis. */
+function turnOf({ left, up, roll }, yaw) {
+  return new THREE.Quaternion().setFromEuler(new THREE.Euler(roll, -up, yaw + left, "ZYX"));
+}
+
+/** An angle between -pi and pi. */
+const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
+
+/** Where in the picture: -1 to 1, right and up. */
+const cursorOf = (event) => [2 * event.clientX / innerWidth - 1, 1 - 2 * event.clientY / innerHeight];
