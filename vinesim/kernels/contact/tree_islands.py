@@ -23,6 +23,7 @@ from vinesim.kernels.articulation.structs import (
 )
 from vinesim.kernels.contact.forces import store_contact
 from vinesim.kernels.contact.jacobians import row_vector, write_rows
+from vinesim.kernels.contact.row_solver import solve_few_rows, solve_many_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
     Capsules,
@@ -209,7 +210,21 @@ def last_newton_sweep(count: int, max_newton_steps: int, max_newton_contacts: in
     return wp.where(count > wp.min(max_newton_contacts, MOST_NEWTON_CONTACTS), 0, max_newton_steps)
 
 
-@wp.kernel(cuda_max_registers=64)
+@wp.func
+def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out: TreeSystem):
+    """Copy what the contacts of one tree must fulfil, and where their impulses stand."""
+    for row in range(lane, size, lanes):
+        for k in range(size):
+            target_out.matrix[k, row] = source.matrix[k, row]
+        target_out.free[row] = source.free[row]
+        target_out.impulse[row] = source.impulse[row]
+        target_out.velocity[row] = source.velocity[row]
+        target_out.friction[row // 3] = source.friction[row // 3]
+        target_out.compliance[row // 3] = source.compliance[row // 3]
+    synchronize_lanes(lanes)
+
+
+@wp.kernel(cuda_max_registers=128)
 def solve_trees(
     # model
     max_sweeps: int,
@@ -225,25 +240,35 @@ def solve_trees(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """``lanes`` threads per tree: two sweeps over its contacts and what is between them; lists the trees that need more."""
+    """``lanes`` threads per tree solve for its impulses; lists the trees that need more threads or sweeps.
+
+    On a GPU 16 threads solve trees of few contacts at once, see :func:`vinesim.kernels.contact.row_solver.solve_few_rows`,
+    in full warps. On a CPU two sweeps are done here.
+    """
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
-    count = tree_contacts_out.count[tree]
-    if count == 0:
-        return
+    count = int(0)
+    if tree < trees:
+        count = tree_contacts_out.count[tree]
     system = view_system(system_out, tree, trees, width)
-    search = view_search(search_out, tree, trees, width + 1)
-    update_velocities(lane, lanes, 3 * count, system)
     newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-    limit = wp.min(FIRST_SWEEPS, max_sweeps)
-    sweeps, busy = solve_tree(0, lane, lanes, count, limit, newton_end, tolerance, system, search)
-    if lane == 0:
-        tree_contacts_out.sweeps[tree] = sweeps
-    if lane == 0 and busy and sweeps < max_sweeps:
-        tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
+    sweeps = solve_few_rows(
+        count, max_sweeps, FIRST_SWEEPS, newton_end, tolerance, system.matrix, system.free, system.friction,
+        system.compliance, system.impulse, system.velocity,
+    )  # fmt: skip
+    busy = sweeps < 0
+    if lanes == 1 and count > 0:
+        search = view_search(search_out, tree, trees, width + 1)
+        update_velocities(lane, lanes, 3 * count, system)
+        limit = wp.min(FIRST_SWEEPS, max_sweeps)
+        sweeps, busy = solve_tree(0, lane, lanes, count, limit, newton_end, tolerance, system, search)
+    if lane == 0 and count > 0:
+        tree_contacts_out.sweeps[tree] = wp.max(sweeps, 0)
+        if busy and sweeps < max_sweeps:
+            tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
 
 
-@wp.kernel(cuda_max_registers=64)
+@wp.kernel
 def solve_busy_trees(
     # model
     max_sweeps: int,
@@ -272,27 +297,24 @@ def solve_busy_trees(
     for i in range(group, tree_contacts_out.busy_count[0], groups):
         tree = tree_contacts_out.busy[i]
         count = tree_contacts_out.count[tree]
-        size = 3 * count
         system = view_system(system_out, tree, trees, width)
-        for row in range(lane, size, lanes):
-            for k in range(size):
-                dense.matrix[k, row] = system.matrix[k, row]
-            dense.free[row] = system.free[row]
-            dense.impulse[row] = system.impulse[row]
-            dense.velocity[row] = system.velocity[row]
-            dense.friction[row // 3] = system.friction[row // 3]
-            dense.compliance[row // 3] = system.compliance[row // 3]
-        synchronize_lanes(lanes)
         newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-        copy_rows(lane, lanes, size, dense.impulse, search.before)
-        copy_rows(lane, lanes, size, dense.impulse, search.first)
-        sweeps, _busy = solve_tree(
-            tree_contacts_out.sweeps[tree], lane, lanes, count, max_sweeps, newton_end, tolerance, dense, search
-        )
-        for row in range(lane, size, lanes):
-            system.impulse[row] = dense.impulse[row]
-            system.velocity[row] = dense.velocity[row]
-        synchronize_lanes(lanes)
+        sweeps = solve_many_rows(
+            count, max_sweeps, FIRST_SWEEPS, newton_end, tolerance, system.matrix, system.free, system.friction,
+            system.compliance, system.impulse, system.velocity,
+        )  # fmt: skip
+        if sweeps < 0:
+            sweeps = tree_contacts_out.sweeps[tree]
+            copy_system(lane, lanes, 3 * count, system, dense)
+            if sweeps == 0:
+                update_velocities(lane, lanes, 3 * count, dense)
+            copy_rows(lane, lanes, 3 * count, dense.impulse, search.before)
+            copy_rows(lane, lanes, 3 * count, dense.impulse, search.first)
+            sweeps, _busy = solve_tree(
+                sweeps, lane, lanes, count, max_sweeps, newton_end, tolerance, dense, search
+            )  # fmt: skip
+            copy_rows(lane, lanes, 3 * count, dense.impulse, system.impulse)
+            copy_rows(lane, lanes, 3 * count, dense.velocity, system.velocity)
         if lane == 0:
             tree_contacts_out.sweeps[tree] = sweeps
         synchronize_lanes(lanes)

@@ -1,10 +1,11 @@
 """The impulses of one tree's contacts with what does not move: the conditions and steps of the solver of islands, dense.
 
 :mod:`vinesim.kernels.contact.projected_gauss_seidel` solves islands of many blocks that rigid bodies couple, and finds its
-way through lists of them. The contacts of a tree alone are one matrix, and nothing else moves: then a row is a sum. Most
-trees need two sweeps and a Newton step between them, which four threads of a GPU take for each. Trees that need more get a
-warp each. The threads of a tree share its rows, and all take the same decisions from the same numbers. On a CPU one thread has all rows. The matrix is in single precision, as
-the impulse response is that it comes from; all else is in double precision.
+way through lists of them. The contacts of a tree alone are one matrix, and nothing else moves: then a row is a sum. On a
+GPU :mod:`vinesim.kernels.contact.row_solver` does the same in registers, and what is here solves the trees that have too
+many contacts for that, a warp each, whose threads share the rows and all take the same decisions from the same numbers. On
+a CPU one thread has all rows. The matrix is in single precision, as the impulse response is that it comes from; all else is
+in double precision.
 """
 
 import warp as wp
@@ -18,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 LANES_ACROSS = wp.constant(16)
 """Threads that share the columns of a row when a system is solved; two rows at once."""
 FIRST_SWEEPS = wp.constant(2)
-"""Sweeps after which a tree gets a warp."""
+"""Sweeps after which a tree is listed as one that needs more; impulses as they are then are what the search returns to."""
 MOST_NEWTON_CONTACTS = wp.constant(16)
 """Contacts whose numbers fit into one word: trees with more take no Newton steps."""
 

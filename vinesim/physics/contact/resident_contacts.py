@@ -34,8 +34,8 @@ DEFAULT_SLOTS = 8
 """Contacts that one tree can have at once: 6 kB a tree."""
 PAIRS_PER_SLOT = 4
 """Pairs of capsules and geoms whose boxes may overlap, for each contact that a tree can have."""
-FIRST_LANES = 4
-"""Threads of a GPU that share a tree in its first sweeps."""
+FIRST_LANES = 16
+"""Threads of a GPU that share a tree of few contacts, a row each."""
 WARPS = 132 * 32
 """Warps of a GPU that solve at once: as many as one with 132 multiprocessors keeps."""
 
@@ -193,7 +193,8 @@ class ResidentContacts:
         self._system.matrix = self._zeros(float, trees * rows, rows)
         self._system.friction, self._system.compliance = self.contacts.friction, self.contacts.compliance
         self._system.impulse = self.rows.impulse
-        self._search = self._allocated(TreeSearch, dict.fromkeys(TreeSearch.vars, trees * rows), {"factor": rows + 1})
+        searched = trees * rows if self._device.is_cpu else 1  # a GPU searches in registers
+        self._search = self._allocated(TreeSearch, dict.fromkeys(TreeSearch.vars, searched), {"factor": rows + 1})
         busy_rows = self._groups * rows
         self._dense = self._allocated(TreeSystem, dict.fromkeys(TreeSystem.vars, busy_rows), {"matrix": rows})
         self._dense_search = self._allocated(
@@ -220,7 +221,7 @@ class ResidentContacts:
         scratch, prediction, work = fill(s.Scratch), fill(s.Prediction), fill(s.WrenchScratch)
         onset, contacts = self.plants.onset_steps, self._tree_contacts
         width = 3 * self.slots
-        few, lanes = (1, 1) if self._device.is_cpu else (FIRST_LANES, WARP_SIZE)
+        few, lanes, block = (1, 1, 1) if self._device.is_cpu else (FIRST_LANES, WARP_SIZE, FULL_BLOCK)
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
             block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
@@ -242,7 +243,7 @@ class ResidentContacts:
                   self.contacts, self.rows, contacts, compliances, self._response),
             bound(tree_delassus.write_delassus, trees * self.slots, model, trees, width, factors, contacts,
                   self.contacts, self.rows, compliances, self._response, self._system),
-            bound(tree_islands.solve_trees, trees * few, p.solver_sweeps, p.solver_newton_steps,
+            bound(tree_islands.solve_trees, -(-trees * few // block) * block, p.solver_sweeps, p.solver_newton_steps,
                   p.solver_newton_contacts, p.solver_tolerance, trees, width, few, contacts, self._system,
                   self._search),
             bound(tree_islands.solve_busy_trees, self._groups * lanes, p.solver_sweeps, p.solver_newton_steps,
