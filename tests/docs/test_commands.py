@@ -122,8 +122,9 @@ def test_the_short_commands_of_a_page_run(page, tmp_path):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     shutil.copy(ROOT / "examples/plants/vine.mtg", tmp_path)
     lines = [line for line in commands_of(page) if line.startswith(RUNS)]
-    if any("pull.csv" in line for line in lines):
-        measure(load_specimen(ROOT / "examples/cane.toml"), Experiment(duration=2.0)).write(tmp_path / "pull.csv")
+    track = measure(load_specimen(ROOT / "examples/cane.toml"), Experiment(duration=2.0))
+    for name in ("pull.csv", "filmed.csv"):
+        track.write(tmp_path / name)
     if any("run.mcap" in line for line in lines):
         record_a_pick(tmp_path / "run.mcap")
     for line in lines:

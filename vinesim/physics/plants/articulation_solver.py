@@ -357,9 +357,7 @@ class ArticulationSolver:
         launches, touched, loads = self.launches, _NO_TREES, self._loads
         count = len(self._runner.stepped)
         if bodies is not None and len(bodies):
-            touched = loads.replace(bodies, np.asarray(wrenches), self.tick)
-            if touched is None:
-                raise self._refusal(np.asarray(bodies))
+            touched = loads.replace(np.asarray(bodies), np.asarray(wrenches), self.tick)
             launches.upload_wrenches(count)
             launches.apply_wrenches(len(touched))
         elif len(loads):
@@ -431,24 +429,8 @@ class ArticulationSolver:
         self._subset[: len(trees)] = trees
 
     def require_stepped(self, bodies: np.ndarray) -> None:
-        """:class:`ValueError` unless the trees of ``bodies`` [k] were in the last prediction."""
-        trees = self.model.body_tree[bodies]
-        is_stepped, moves = self._runner.is_stepped[trees], self._place_in_tree[bodies] < self.tree_moving[trees]
-        if not (is_stepped & moves).all():
-            raise self._refusal(np.asarray(bodies))
-
-    def _refusal(self, bodies: np.ndarray) -> ValueError:
-        """Why one of some bodies [k] cannot be touched."""
-        trees = self.model.body_tree[bodies]
-        is_stepped = self._runner.is_stepped[trees]
-        if not is_stepped.all():
-            late = int(np.argmin(is_stepped))
-            return ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
-        late = int(np.argmin(self._place_in_tree[bodies] < self.tree_moving[trees]))
-        return ValueError(
-            f"body {bodies[late]} is touched, but tree {trees[late]} is coarse and the body rides on its bunch: "
-            "touch the bunch, or refine the tree before predict()"
-        )
+        """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""
+        self._loads.require_stepped(np.asarray(bodies))
 
     def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
         """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""

@@ -35,7 +35,8 @@ class ContactLoads:
         touched: [tree] where the touched trees are listed.
         euler_steps: [tree] steps with phi = 1 that are left; raised to ``onset`` where contact begins.
         """
-        self._touched = touched
+        self._touched, self._body_tree, self._place_in_tree = touched, body_tree, place_in_tree
+        self._is_stepped, self._tree_moving = is_stepped, tree_moving
         self._numbers = np.zeros(kernels.NUMBERS, np.int64)
         self._numbers[kernels.ONSET_STEPS] = onset
         last_contact = np.full(len(touched), -2, np.int64)  # step of the last contact
@@ -47,8 +48,7 @@ class ContactLoads:
             share(body_wrench, wp.spatial_vector), share(touched, wp.int32), share(last_contact, wp.int64),
             share(euler_steps, wp.int32),
         ]  # fmt: skip
-        self._loaded = np.zeros(0, np.int32)
-        self._make_room(LEAST_ROOM)
+        self._loaded = self._body = np.zeros(0, np.int32)  # room is made, and the kernel loaded, by the first contact
 
     def _make_room(self, bodies: int) -> None:
         loaded, self._loaded = self._loaded, np.zeros(bodies, np.int32)
@@ -64,18 +64,31 @@ class ContactLoads:
         """How many bodies are loaded, those given several times counted so often."""
         return int(self._numbers[kernels.LOADED])
 
-    def replace(self, bodies: np.ndarray, wrenches: np.ndarray, tick: int) -> np.ndarray | None:
+    def replace(self, bodies: np.ndarray, wrenches: np.ndarray, tick: int) -> np.ndarray:
         """Load ``bodies`` [k] with ``wrenches`` [k, 6] in step ``tick`` instead of those of the last call.
 
-        A body may be given several times. Returns the trees touched [j], a view of the list; None, and nothing is
-        changed, if a body was not in the last prediction.
+        A body may be given several times. Returns the trees touched [j], a view of the list. :class:`ValueError`, and
+        nothing is changed, if a body was not in the last prediction.
         """
         count = len(bodies)
         if count > len(self._body):
-            self._make_room(2 * count)
+            self._make_room(max(2 * count, LEAST_ROOM))
         self._body[:count], self._wrench[:count] = bodies, wrenches
         self._numbers[kernels.GIVEN], self._numbers[kernels.TICK] = count, tick
         self._load(1)
         if self._numbers[kernels.REFUSED]:
-            return None
+            self.require_stepped(bodies)
         return self._touched[: self._numbers[kernels.TOUCHED]]
+
+    def require_stepped(self, bodies: np.ndarray) -> None:
+        """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""
+        trees = self._body_tree[bodies]
+        if not (is_stepped := self._is_stepped[trees]).all():
+            late = int(np.argmin(is_stepped))
+            raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
+        if not (moves := self._place_in_tree[bodies] < self._tree_moving[trees]).all():
+            late = int(np.argmin(moves))
+            raise ValueError(
+                f"body {bodies[late]} is touched, but tree {trees[late]} is coarse and the body rides on its bunch: "
+                "touch the bunch, or refine the tree before predict()"
+            )
