@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 
 import numpy as np
 import warp as wp
@@ -173,9 +174,7 @@ class RigidArrays:
             tree_island=np.zeros(world.ntree, np.int32),
         )
         qvel, qacc = (share(values, wp.float64) for values in (data.qvel, data.qacc))
-        self._take_free_velocities = bind_launch(
-            broadphase.take_free_velocities, [kernel_parameters, qvel, qacc], [self.bodies.struct]
-        )
+        self._free_velocities = [kernel_parameters, qvel, qacc]
         self.factors = SharedArrays(
             structs.RigidFactors,
             tree_dof=world.tree_dofadr,
@@ -223,6 +222,10 @@ class RigidArrays:
             self.bodies.velocity_free[other] = rigid.velocity_free[other]
             self.bodies.correction[other] = self.bodies.correction_before[other] = 0.0
         return number[former]
+
+    @functools.cached_property
+    def _take_free_velocities(self) -> Callable[..., None]:
+        return bind_launch(broadphase.take_free_velocities, self._free_velocities, [self.bodies.struct])
 
     def begin_step(self) -> None:
         """Take over the free velocities of the coming step, and what plants changed in the last one."""
