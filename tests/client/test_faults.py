@@ -36,7 +36,9 @@ def test_a_client_without_faults_has_none(client) -> None:
     client.tick()
     values = Status(client, RateLoop(0.01)).current()
     assert values["faults"] == {}
-    assert "FAULTS" not in status_line(values)
+    assert status_line(values).endswith("  alone")
+    values |= {"frames_dropped": 3, "sound_dropped": 1}
+    assert status_line(values).endswith("  alone  dropped: 3 pictures and scans, 1 frames of sound")
 
 
 def test_a_tree_that_is_stopped_is_counted_shown_and_logged_once(client, caplog) -> None:

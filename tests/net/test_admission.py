@@ -186,3 +186,19 @@ def test_a_server_that_came_before_its_predecessor_went_admits_again():
     admission.watch()
     do_all(tasks)
     assert (admission.is_served, admission.count) == (True, count + 1)
+
+
+def test_a_server_that_goes_while_its_reply_is_on_the_way_is_missed():
+    session = _SlowlyRouted(lost=1)
+    admission, tasks = start_admission(session)
+    reply = session.get
+
+    def get_and_lose(key: str, **options: object) -> list[types.SimpleNamespace]:
+        session.on_matching(types.SimpleNamespace(matching=False))
+        session.matching_status.matching = False
+        return reply(key, **options)
+
+    session.get = get_and_lose
+    do_all(tasks)
+    admission.watch()
+    assert not admission.is_served

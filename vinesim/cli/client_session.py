@@ -220,12 +220,23 @@ def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form
 
 def status_line(values: dict[str, Any]) -> str:
     """One line of text for a status."""
-    faults = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in values["faults"].items())
-    return (
-        f"{values['time']:7.1f} s  {values['tick_hz']:6.2f} Hz  p99 {values['tick_p99_ms']:5.2f} ms  "
-        f"awake {values['awake']:3d}  force {values['force']:6.2f} N  "
-        f"dropped {values['frames_dropped']} frames {values['messages_dropped']} messages "
-        f"{values['sound_lost'] + values['sound_dropped']} of sound  "
-        f"in {values['bytes_in']} B  out {values['bytes_out']} B  with {', '.join(values['others']) or 'no others'}"
-        f"{'  FAULTS: ' if faults else ''}{faults}"
-    )
+    counts = {
+        "pictures and scans": values["frames_dropped"],
+        "messages": values["messages_dropped"],
+        "frames of sound": values["sound_lost"] + values["sound_dropped"],
+    }
+    parts = [
+        f"{values['time']:7.1f} s",
+        f"{values['tick_hz']:6.2f} Hz",
+        f"p99 {values['tick_p99_ms']:5.2f} ms",
+        f"{values['awake']:3d} plants awake",
+        f"force {values['force']:6.2f} N",
+        f"in {1e-3 * values['bytes_in']:.1f} kB",
+        f"out {1e-3 * values['bytes_out']:.1f} kB",
+        f"with {', '.join(values['others'])}" if values["others"] else "alone",
+    ]
+    if dropped := ", ".join(f"{count} {kind}" for kind, count in counts.items() if count):
+        parts.append(f"dropped: {dropped}")
+    if faults := ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in values["faults"].items()):
+        parts.append(f"FAULTS: {faults}")
+    return "  ".join(parts)

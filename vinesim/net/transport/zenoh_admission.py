@@ -83,12 +83,17 @@ class ServerAdmission:
             self._submit_join()
 
     def watch(self) -> None:
-        """Called from time to time: ask a server that is there although the last thing heard is that one went.
+        """Called from time to time: mend what Zenoh's threads reported late or in another order.
 
-        Zenoh may report that a server came before it reports that its predecessor went.
+        A server may be reported as gone before the reply in which it admitted this actor is read, or after its
+        successor was reported: then the present state of the querier counts.
         """
-        if self._querier is not None and not self.is_served:
+        if self._querier is None:
+            return
+        if not self.is_served:
             self._submit_join()
+        elif self._servers and not has_match(self._querier):
+            self.is_served = False
 
     def _submit_join(self) -> None:
         """Have the hello sent again by the bus's own thread, unless that is submitted already."""
