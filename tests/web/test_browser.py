@@ -585,7 +585,11 @@ def test_a_spectator_alone_and_a_slow_browser_are_told_so_and_buttons_follow_who
 def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_person):
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=is_person) as live:
         open_page(page, live)
-        told = {"closures": 2, "said": ["The shears in the left hand missed: there was no wood.", "They cut 1 bunch."]}
+        told = {
+            "closures": 2,
+            "between": ["", ""],
+            "said": ["The shears in the left hand missed: there was no wood.", "They cut 1 bunch."],
+        }
         page.run(f"(({{ shears }}) => {{ shears.closures = 0; shears.take({{ shears: {told} }}); }})(vinesim.viewer)")
         page.run("document.getElementById('timeline').hidden = false")
         for width, height in ((1280, 720), (1024, 600), (844, 390), (390, 844)):
