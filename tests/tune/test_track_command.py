@@ -25,7 +25,7 @@ from vinesim.tune import Experiment, Trajectory, TrajectoryError, measure, read_
 from vinesim.tune.fit import specimen_toml
 
 INFO = CameraInfo(320, 240, 300.0, 300.0, 159.5, 119.5, "optical")
-PINK, BLUE, RADIUS, AWAY = (224, 60, 130), (30, 60, 220), 0.015, 0.8
+PINK, BLUE, RADIUS, AWAY = (224, 60, 130), (30, 60, 220), 0.011 / 0.707, 0.8  # the balls are seen at whole mm
 MARKERS = ["224,60,130", "middle=30,60,220"]
 START = 1_732_415_000.25
 """[s] Stamp of the first picture: seconds since 1970, as ROS has them."""
