@@ -114,7 +114,7 @@ print(sorted(os.path.getsize(path) for path in segments))
 @wheels_only
 @pytest.mark.parametrize("reach", ["SUBNET", "LOCALHOST"])
 def test_only_nodes_with_pictures_use_shared_memory(reach):
-    """A stopped subscriber holds up whoever writes into its queue in shared memory, so the small topics go by UDP."""
+    """Writing to the shared-memory queue of a stopped subscriber takes two seconds, so small topics go by UDP."""
     environ = {name: value for name, value in os.environ.items() if name != middleware.PROFILE_VARIABLE}
     environ |= {middleware.RANGE_VARIABLE: reach, "ROS_DOMAIN_ID": str(101 + os.getpid() % 100)}  # without peers
 

@@ -557,7 +557,7 @@ def test_a_spectator_alone_and_a_slow_browser_are_told_so_and_buttons_follow_who
         slow = "Object.defineProperty(vinesim.viewer, 'frame', { get: () => 1, set() {} }), 0"
         wait(lambda: page.run("window.vinesim?.viewer !== undefined"), "the vineyard is loaded")
         page.run(slow)
-        wait(lambda: "Nobody else is here yet" in page.run(notices), "who is alone is told so")
+        wait(lambda: "Nobody else is here yet" in page.run(notices), "a spectator without other actors is told so")
         assert "draws slowly" in page.run(notices)
         wait(lambda: 0 < page.run("vinesim.triangles") <= 60_000, "fewer triangles")
         assert page.run("[vinesim.viewer.renderer.domElement.width, innerWidth]") == [195, 390]
@@ -654,7 +654,7 @@ def test_names_stand_just_above_heads_near_and_far_and_stay_in_the_picture(page)
         assert "anna" in shown
         assert all(bar <= box["top"] and box["bottom"] <= height for box in shown.values())
         page.run("vinesim.viewer.eyes.yaw = 2.5, 0")
-        wait(lambda: page.run(boxes) == {}, "nobody is in the picture")
+        wait(lambda: page.run(boxes) == {}, "the picture shows no actor")
         assert page.errors == []
 
 
