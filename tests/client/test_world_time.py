@@ -40,6 +40,18 @@ def test_a_slow_client_keeps_up_and_no_time_runs_back() -> None:
     assert (found - clock).max() < 1e-3
 
 
+def test_a_client_that_catches_up_is_not_ahead() -> None:
+    """25 steps in 75 ms, after it stood for 250 ms: stamps are at most 60 ms ahead, and always rise."""
+    passed = np.full(2000, DT)
+    passed[1000] = 0.25
+    passed[1001:1025] = 3e-3
+    clock = 100.0 + np.cumsum(passed)
+    found = stamps(clock)
+    assert (np.diff(found) > 0.0).all()
+    assert (clock - found).max() <= MAX_LAG + 1e-9
+    assert (found - clock).max() < MAX_LAG + DT
+
+
 def test_a_clock_that_is_set_back_a_little_is_waited_for() -> None:
     """Two seconds back (another server): time goes on at nine tenths of its rate until it is met, and never back."""
     clock = 100.0 + np.arange(4000) * DT

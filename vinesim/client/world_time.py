@@ -16,7 +16,10 @@ GAIN = 0.01
 MAX_RATE = 0.1
 """[s/s] Largest rate at which the offset follows: a step of 10 ms is stamped as 9 to 11 ms."""
 MAX_LAG = 0.05
-"""[s] Stamps are never further behind the server's clock: a client that is slow skips ahead."""
+"""[s] Stamps are never further behind the server's clock: a client that is slow skips ahead. Where they are further ahead
+of it, steps that follow each other faster than ``dt`` (a loop catches up) are stamped no faster than the clock runs."""
+MIN_RATE = 0.1
+"""[s/s] Stamps rise in every step, by this share of ``dt`` at least."""
 MAX_LEAD = 5.0
 """[s] A server's clock that is further behind belongs to another run of the world, and is taken at once."""
 
@@ -30,11 +33,13 @@ class WorldTime:
         """World's time minus simulated time [s]."""
         self.is_shared = False
         """Whether a server's clock is followed."""
-        self._max_change = MAX_RATE * dt
+        self._dt = dt
+        self._clock = 0.0  # at the last step
 
     def follow(self, simulated: float, clock: float) -> None:
         """Follow the server's ``clock`` [s] at the step that starts at ``simulated`` time [s]; call it every step."""
         away = clock - simulated - self.offset
+        passed, self._clock = clock - self._clock, clock
         if not self.is_shared:
             self.is_shared = True
             self.offset += away
@@ -42,5 +47,8 @@ class WorldTime:
             log.warning("the server's clock is %.1f s behind what it was: time goes back", -away)
             self.offset += away
         else:
-            self.offset += min(max(GAIN * away, -self._max_change), self._max_change)
+            change = min(max(GAIN * away, -MAX_RATE * self._dt), MAX_RATE * self._dt)
+            if away < -MAX_LAG and passed >= 0.0:
+                change = min(change, max(passed, MIN_RATE * self._dt) - self._dt)
+            self.offset += change
             self.offset = max(self.offset, clock - simulated - MAX_LAG)
