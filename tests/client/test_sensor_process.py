@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import os
 import signal
@@ -19,6 +20,7 @@ from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.sensing import worker_process
+from vinesim.client.sensing.picture_keeper import RENEWAL_PERIOD, PictureKeeper
 from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.client.sensing.worker_process import WorkerError
 from vinesim.client.tasks.start_poses import spawn_pose
@@ -28,7 +30,8 @@ from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import HumanSpec
+from vinesim.scene.values import CameraFrame, HumanSpec
+from vinesim.sensors.camera.camera import CameraSpec
 
 CAMERA = "head_front_camera"
 
@@ -202,6 +205,37 @@ def test_the_kept_picture_is_written(robot, tmp_path):
     robot.run_for_pictures(1)
     robot.sensors.save_picture(tmp_path)
     assert cv2.imread(str(tmp_path / "rgb.png")).std() > 10.0
+
+
+def test_without_subscribers_a_picture_is_rendered_only_where_it_would_be_kept(robot, tmp_path):
+    """While the score rises by the camera's rate; afterwards none, and the one with the highest score is written."""
+    physics, counter = robot.client.physics, itertools.count(1)
+    robot.client.frame_score = lambda: float(next(counter))
+    robot.run_for_pictures(5)
+    robot.client.frame_score = lambda: 0.5
+    shown = robot.frames()
+    for _ in range(2):
+        until = physics.tick + 4 * round(RENEWAL_PERIOD / physics.dt)
+        robot.run_until(lambda until=until: physics.tick >= until, "four times the period in which others are renewed")
+    assert robot.frames() <= shown + 2  # those on their way when the score fell
+    robot.sensors.save_picture(tmp_path)
+    assert cv2.imread(str(tmp_path / "rgb.png")).std() > 10.0
+
+
+def test_of_pictures_that_show_as_much_the_newest_is_kept():
+    keeper = PictureKeeper()
+    assert keeper.wants(0.0, 0.0)
+    keeper.keep(frame := blank_frame(0.0), 0.0)
+    assert [keeper.wants(time, 0.0) for time in (0.5, RENEWAL_PERIOD)] == [False, True]
+    assert keeper.wants(0.1, 0.1)
+    assert not keeper.wants(9.0, -0.1)
+    assert keeper.frame is frame
+
+
+def blank_frame(time: float) -> CameraFrame:
+    info = CameraSpec.load("d435").info("optical")
+    nothing = np.zeros((0, 0))
+    return CameraFrame(time, CAMERA, info, frames.pose(np.zeros(3)), nothing, nothing, nothing)
 
 
 def test_a_list_of_bodies_that_comes_after_its_snapshot_does_not_stop_the_start(monkeypatch: pytest.MonkeyPatch):

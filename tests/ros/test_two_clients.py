@@ -178,8 +178,8 @@ def test_names_and_frames_of_two_clients_do_not_collide(world: World, peer: Stoc
 def test_stamps_of_both_clients_compare_with_the_one_clock(world: World, peer: StockNode) -> None:
     """At one moment, what either client stamps and what /clock says differ by no more than a client may be off.
 
-    Of the newest messages the one counts that was sent soonest after its step: the others only tell how busy the machine
-    is. A client that the machine starves for seconds sends none in time; those seconds pass.
+    Of the newest messages the one counts that was sent soonest after its step: the others only tell how busy the
+    machine is. A client that the machine starves for seconds sends none in time; those seconds pass.
     """
     leads = collections.defaultdict[str, collections.deque[int]](lambda: collections.deque(maxlen=NEWEST))
 

@@ -16,8 +16,8 @@ GAIN = 0.01
 MAX_RATE = 0.1
 """[s/s] Largest rate at which the offset follows: a step of 10 ms is stamped as 9 to 11 ms."""
 MAX_LAG = 0.05
-"""[s] Stamps are never further behind the server's clock: a client that is slow skips ahead. Where they are further ahead
-of it, steps that follow each other faster than ``dt`` (a loop catches up) are stamped no faster than the clock runs."""
+"""[s] Stamps are never further behind the server's clock: a client that is slow skips ahead. Where they are further
+ahead of it, steps that follow each other faster than ``dt`` (a loop catches up) are stamped no faster than it runs."""
 MIN_RATE = 0.1
 """[s/s] Stamps rise in every step, by this share of ``dt`` at least."""
 MAX_LEAD = 5.0

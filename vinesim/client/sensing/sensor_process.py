@@ -60,8 +60,8 @@ class SensorProcess:
     ) -> None:
         """Starts the process; :meth:`attach` connects it with a client.
 
-        ``keep_pictures`` renders the first camera even without subscribers, and keeps the picture with the highest
-        ``Client.frame_score`` for :meth:`save_picture`. ``sensor_hz`` replaces the sensors' own rates.
+        ``keep_pictures`` keeps the picture of the first camera with the highest ``Client.frame_score`` for
+        :meth:`save_picture`, and renders it even without subscribers. ``sensor_hz`` replaces the sensors' own rates.
         """
         self.name = name
         self.missed_snapshots = 0
@@ -119,7 +119,7 @@ class SensorProcess:
         self._moved_trees[physics.plants.awake] = self._moved_trees[physics.remotely_posed] = True
         if physics.tick % SNAPSHOT_PERIOD == 0 or self._is_overdue:
             run = self.worker.current()
-            if not self.worker.is_ready or run.shared.wanted["renders"][0]:
+            if not self.worker.is_ready or run.shared.wanted["world"][0]:
                 self._write(client)
 
     def _write(self, client: Client) -> None:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vinesim import allocator
+from vinesim.client.sensing.picture_keeper import PictureKeeper
 from vinesim.client.sensing.rigid_visual_list import VisualListMessage, VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.worker_process import report_ready, serve
@@ -63,7 +64,7 @@ class SensorConfig:
     ros: bool
     """Whether it runs a ROS node."""
     keep_pictures: bool
-    """Whether the first camera renders even without subscribers, and the best picture is kept."""
+    """Whether the best picture of the first camera is kept, which renders it even without subscribers."""
     sensor_hz: float | None
     """Rate of all sensors [Hz]; None: each sensor's own."""
     renderer: str = "warp"
@@ -102,8 +103,8 @@ class SensorChannel:
             },
             context,
         )  # fmt: skip
-        self.wanted = SharedArrays({"renders": ((1,), "?")})
-        """Whether any sensor renders, written by the process."""
+        self.wanted = SharedArrays({"world": ((1,), "?")})
+        """Whether snapshots of the world are wanted, written by the process."""
 
     def close(self) -> None:
         """Release the memory."""
@@ -140,9 +141,8 @@ class SensorWorker:
         """World's time minus simulated time [s]."""
         self._last_number = 0
         self._pose_count = 0
-        self._best_frame: CameraFrame | None = None
-        self._best_score = -1.0
-        self._frame_score = 0.0
+        self._keeper = PictureKeeper() if config.keep_pictures else None
+        self._time = self._frame_score = 0.0  # of the newest snapshot
         self._next_statistics = 0.0
         self._awaits("kernels and scene")
         self.node = self._open_node(stack) if config.ros else None
@@ -194,8 +194,7 @@ class SensorWorker:
             spec = CameraSpec.load(mount.type)
             info = spec.info(mount.frame, size=mount.size)
             camera = Camera(spec, info, mount.name, config.sun, quality=mount.quality, seed=seed, device=device)
-            always = config.keep_pictures and i == 0
-            wanted = self._camera_demand(mount.name, always)
+            wanted = self._camera_demand(mount.name, self._keeper if i == 0 else None)
             rate, present = config.sensor_hz or mount.rate, self._present_rate(mount.name)
             sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, rate, present))
         for mount in config.description.lidars:
@@ -215,11 +214,17 @@ class SensorWorker:
         self.pipe.send(("device", device))
         return device
 
-    def _camera_demand(self, name: str, always: bool) -> Callable[[], CameraOutput]:
-        """The outputs of a camera that its subscribers need now; if ``always``, also a whole picture."""
-        kept = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS if always else CameraOutput.NONE
+    def _camera_demand(self, name: str, keeper: PictureKeeper | None) -> Callable[[], CameraOutput]:
+        """The outputs of a camera that its subscribers need now, and its ``keeper``."""
+        whole = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
         node = self.node
-        return lambda: kept if node is None else kept | node.camera_outputs_wanted(name)
+
+        def demand() -> CameraOutput:
+            is_kept = keeper is not None and keeper.wants(self._time, self._frame_score)
+            wanted = CameraOutput.NONE if node is None else node.camera_outputs_wanted(name)
+            return wanted | whole if is_kept else wanted
+
+        return demand
 
     def _lidar_demand(self, name: str) -> Callable[[], CameraOutput]:
         """Whether a lidar has subscribers now."""
@@ -246,7 +251,8 @@ class SensorWorker:
                     self._awaits()
                     report_ready(self.pipe, NICENESS)
                     allocator.release_free_memory()  # takes 0.1 s, which nothing has to wait for
-            self.channel.wanted["renders"][0] = any(sensor.wanted() for sensor in self.scheduler.sensors)
+            is_rendering = any(sensor.wanted() for sensor in self.scheduler.sensors)
+            self.channel.wanted["world"][0] = is_rendering or self._keeper is not None
             self._report_parameters()
             if time.monotonic() >= self._next_statistics:
                 self._next_statistics = time.monotonic() + STATISTICS_PERIOD
@@ -272,7 +278,7 @@ class SensorWorker:
                 assert isinstance(value, VisualListMessage)
                 self._visuals.take(value)
             elif kind == "save":
-                self._save_best_frame(value)
+                self._save_kept_frame(value)
         return True
 
     def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
@@ -303,7 +309,8 @@ class SensorWorker:
                 )  # fmt: skip
             self._state.bunch_attached[:] = shared["bunch_attached"]
             self._frame_score = float(shared["frame_score"][0])
-            time, tick = float(shared["time"][0]), int(shared["tick"][0])
+            self._time = time = float(shared["time"][0])
+            tick = int(shared["tick"][0])
             self._world_offset = float(shared["world_offset"][0])
             count = int(shared["pose_count"][0])
             rows = np.arange(max(self._pose_count, count - POSE_HISTORY), count) % POSE_HISTORY
@@ -331,22 +338,22 @@ class SensorWorker:
         assert isinstance(frame, CameraFrame)
         if self.node is not None:
             self.node.publish_camera(dataclasses.replace(frame, time=frame.time + self._world_offset))
-        is_kept = self.config.keep_pictures and frame.name == self.scheduler.sensors[0].name
-        if is_kept and self._frame_score >= self._best_score:
-            self._best_score, self._best_frame = self._frame_score, frame
+        keeper = self._keeper if frame.name == self.scheduler.sensors[0].name else None
+        if keeper is not None and keeper.wants(frame.time, self._frame_score):
+            keeper.keep(frame, self._frame_score)
 
     def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
         assert isinstance(scan, LidarScan)
         if self.node is not None:
             self.node.publish_lidar(dataclasses.replace(scan, time=scan.time + self._world_offset))
 
-    def _save_best_frame(self, folder: pathlib.Path) -> None:
+    def _save_kept_frame(self, folder: pathlib.Path) -> None:
         failure = ""
-        if self._best_frame is not None:
+        if self._keeper is not None and self._keeper.frame is not None:
             from vinesim.sensors.export import images
 
             try:
-                images.save_frame(self._best_frame, folder, "")
+                images.save_frame(self._keeper.frame, folder, "")
             except OSError as bad:
                 failure = bad.strerror or str(bad)
         self.pipe.send(("statistics", self._statistics()))
