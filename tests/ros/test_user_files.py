@@ -303,8 +303,8 @@ def test_resets_from_another_process_leave_nothing_behind(robot: StockNode) -> N
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(rows) == 2
     for row in reset_rows(rows, {}):
-        assert row.peer != "bar, at most" or row.value <= row.peer_value, row
-        assert row.peer != "bar, at least" or row.value >= row.peer_value, row
+        assert row.peer != "bar, at most" or row.value <= row.peer_value, (row, rows)
+        assert row.peer != "bar, at least" or row.value >= row.peer_value, (row, rows)
 
 
 # ---------------------------------------------------------------- the folder ros/

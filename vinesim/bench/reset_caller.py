@@ -35,6 +35,8 @@ TRAVEL = 0.1
 """The robot is driven so far from its start before each reset [m]."""
 AT_START = 0.02
 """Farthest from its start after a reset [m]."""
+STANDS = 1e-3
+"""Farthest that a robot that has stopped moves between two looks [m]."""
 
 
 class ResetCaller:
@@ -112,13 +114,19 @@ class ResetCaller:
         return future.result()
 
     def drive_away(self, robot: str, start: np.ndarray) -> None:
-        """Drive until the robot is :data:`TRAVEL` from its start."""
+        """Drive until the robot is :data:`TRAVEL` from its start, and stop.
+
+        Velocities that still wait in a busy robot's queue would move it after the reset.
+        """
         message = TwistStamped()
         message.twist.linear.x = 0.3
         while np.linalg.norm(self.place(robot) - start) < TRAVEL:
             end = time.monotonic() + 0.2
             self.until(lambda end=end: time.monotonic() > end, "", lambda: self._drive.publish(message))
-        self._drive.publish(TwistStamped())
+        before = start
+        while np.linalg.norm((now := self.place(robot)) - before) > STANDS:
+            before, end = now, time.monotonic() + 0.2
+            self.until(lambda end=end: time.monotonic() > end, "", lambda: self._drive.publish(TwistStamped()))
 
 
 def disturb_and_reset(caller: ResetCaller, robot: str, start: np.ndarray, entities: list[str]) -> dict[str, Any]:

@@ -18,8 +18,8 @@ EXIT_TIMEOUT = 1.6
 """Time between SIGINT and SIGKILL when the group is left [s]."""
 START_TIMEOUT = 300.0
 """Longest start of a client; a first run compiles kernels [s]."""
-REPORT_TIMEOUT = 60.0
-"""Longest time in which a process writes its report and ends [s]; a busy machine needs a dozen."""
+REPORT_TIMEOUT = 180.0
+"""Longest time in which a process writes its report and ends [s]; a client waits up to 60 s for its last picture."""
 STDERR_LINES = 40
 """Lines of standard error that are kept."""
 
