@@ -22,7 +22,8 @@ def test_every_check_gives_one_line_and_json_says_the_same():
     )
     report = json.loads(done.stdout)
     assert [each["check"] for each in report["checks"]] == [
-        "python", "packages", "cpu", "gpu", "ros", "page", "certificates", "ports", "shared memory", "clock", "caches",
+        "python", "packages", "cpu", "gpu", "ros", "page", "certificates", "ports", "shared memory", "datagrams",
+        "clock", "caches",
     ]  # fmt: skip
     errors = [each for each in report["checks"] if each["state"] == ERROR]
     assert errors == []  # where the tests run, a client can run
@@ -173,6 +174,24 @@ def test_shared_memory_that_is_small_missing_or_full_of_dead_segments(tmp_path, 
     assert (tmp_path / "fastrtps_1").exists()  # a check changes nothing
     monkeypatch.undo()
     assert machine.shared_memory(tmp_path / "none").state == ERROR
+
+
+def test_datagrams_that_the_system_dropped(tmp_path):
+    def found(dropped: int, buffer: int) -> Finding:
+        (tmp_path / "net").mkdir(exist_ok=True)
+        (tmp_path / "sys/net/core").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "net/snmp").write_text(
+            f"Tcp: InErrs\nTcp: 7\nUdp: InDatagrams NoPorts RcvbufErrors\nUdp: 100000 9 {dropped}\nUdpLite: InErrors\n"
+        )
+        (tmp_path / "sys/net/core/rmem_default").write_text(f"{buffer}\n")
+        return machine.datagrams(tmp_path)
+
+    assert (found(50, 212992).state, found(0, 212992).remedy) == (OK, "")
+    few = found(5000, 212992)
+    assert (few.state, few.found) == (WARNING, "5000 of 105000 dropped since boot; buffers of 213 kB")
+    assert "sysctl -w net.core.rmem_default=4194304" in few.remedy
+    assert "fewer" in found(5000, machine.ADVISED_BUFFER).remedy
+    assert machine.datagrams(tmp_path / "none").state == OK
 
 
 def test_a_clock_that_is_coarse_or_not_synchronised(monkeypatch):

@@ -12,7 +12,7 @@ from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
     software.python, software.packages, machine.cpu, machine.gpu, software.ros, software.page, software.certificates,
-    machine.ports, machine.shared_memory, machine.clock, software.caches,
+    machine.ports, machine.shared_memory, machine.datagrams, machine.clock, software.caches,
 )  # fmt: skip
 
 

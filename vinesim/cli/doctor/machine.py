@@ -1,4 +1,4 @@
-"""Checks of the machine: processor, GPU, shared memory, ports, clock."""
+"""Checks of the machine: processor, GPU, shared memory, ports, datagrams, clock."""
 
 from __future__ import annotations
 
@@ -23,6 +23,12 @@ LEAST_SHARED_MEMORY = 64 << 20
 """[B] One robot: a segment of 32 MiB for its sensors, and the state of the world."""
 ADVISED_SHARED_MEMORY = 256 << 20
 """[B] Several robots with cameras."""
+NETWORK = pathlib.Path("/proc")
+"""Where Linux tells what its network does."""
+MOST_DROPPED = 1e-3
+"""Share of all datagrams that found their socket full; ROS subscribers miss messages of every step then."""
+ADVISED_BUFFER = 4 << 20
+"""[B] Of a socket: holds the messages of a robot for some seconds, where the default holds a fifth of one."""
 RESOLUTION = 1e-3
 """[s] Of the clock: a step takes ten times as long."""
 _UNSYNCHRONISED = 0x0040
@@ -141,6 +147,28 @@ def ports(port: int = PORT) -> Finding:
             f"if that is a server, join it: --connect tcp/127.0.0.1:{port}; else --listen tcp/127.0.0.1:0",
         )  # fmt: skip
     return Finding("ports", OK, f"{port} is free for a server (tcp and udp)")
+
+
+def datagrams(proc: pathlib.Path = NETWORK) -> Finding:
+    """Datagrams that the system dropped as their program read too slowly: by them ROS sends what is small."""
+    try:
+        names, values = (
+            line.split()[1:] for line in (proc / "net/snmp").read_text().splitlines() if line.startswith("Udp:")
+        )
+        buffer = int((proc / "sys/net/core/rmem_default").read_text())
+    except (OSError, ValueError):
+        return Finding("datagrams", OK, f"what is dropped cannot be told on this {platform.system()}")
+    counts = dict(zip(names, map(int, values), strict=True))
+    dropped, arrived = counts.get("RcvbufErrors", 0), counts.get("InDatagrams", 0)
+    found = f"{dropped} of {dropped + arrived} dropped since boot; buffers of {buffer / 1e3:.0f} kB"
+    if dropped <= MOST_DROPPED * (dropped + arrived):
+        return Finding("datagrams", OK, found)
+    if buffer >= ADVISED_BUFFER:
+        return Finding("datagrams", WARNING, found, "programs here read too slowly: run fewer, or on more cores")
+    return Finding(
+        "datagrams", WARNING, found,
+        f"subscribers on a busy machine lose fewer by: sysctl -w net.core.rmem_default={ADVISED_BUFFER}, as root",
+    )  # fmt: skip
 
 
 def clock() -> Finding:
