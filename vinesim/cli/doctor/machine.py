@@ -163,12 +163,10 @@ def datagrams(proc: pathlib.Path = NETWORK) -> Finding:
     found = f"{dropped} of {dropped + arrived} dropped since boot; buffers of {buffer / 1e3:.0f} kB"
     if dropped <= MOST_DROPPED * (dropped + arrived):
         return Finding("datagrams", OK, found)
-    if buffer >= ADVISED_BUFFER:
-        return Finding("datagrams", WARNING, found, "programs here read too slowly: run fewer, or on more cores")
-    return Finding(
-        "datagrams", WARNING, found,
-        f"subscribers on a busy machine lose fewer by: sysctl -w net.core.rmem_default={ADVISED_BUFFER}, as root",
-    )  # fmt: skip
+    remedy = "programs here read too slowly: run fewer, or give subscribers deeper queues"
+    if buffer < ADVISED_BUFFER:
+        remedy += f", and sockets larger buffers: sysctl -w net.core.rmem_default={ADVISED_BUFFER}, as root"
+    return Finding("datagrams", WARNING, found, remedy)
 
 
 def clock() -> Finding:
