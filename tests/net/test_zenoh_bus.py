@@ -100,7 +100,7 @@ def test_subscriptions_take_no_thread(server):
         last = ada.publisher("c/49/0/ada")
         wait(lambda: last.matching, "all subscriptions to be known")
         assert threading.active_count() == before
-    assert zenoh_session._direct <= others  # what the exit of the program waits for
+    wait(lambda: zenoh_session._direct <= others, "what the exit of the program waits for")
 
 
 def test_without_a_subscriber_zenoh_sends_no_byte(server):
@@ -233,6 +233,21 @@ def test_an_oversized_sample_is_dropped(server):
         wait(lambda: bob.bytes_in == messages.MAX_MESSAGE + 6, "both samples")
         assert bob.poll() == [("own/0/0/ada", b"small")]
         assert bob.dropped == 1
+
+
+def test_the_end_of_a_callback_runs_no_python_code():
+    """Else the interpreter may end between its mark, which the exit waits for, and the end of the thread of Zenoh,
+    which aborts the program ("FATAL: exception not rethrown")."""
+    others, seen = set(zenoh_session._direct), []
+    callback = zenoh_session.called_directly(lambda _: None)
+    (mark,) = zenoh_session._direct - others
+    sys.setprofile(lambda frame, event, _: seen.append((event, frame.f_code.co_name)))
+    try:
+        callback.drop()
+    finally:
+        sys.setprofile(None)
+    assert mark not in zenoh_session._direct
+    assert [name for event, name in seen if event == "call"] == []
 
 
 def test_an_open_session_does_not_block_exit(server):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import logging
 import pathlib
@@ -30,6 +31,9 @@ MAX_RECEIVE = 4 * messages.MAX_MESSAGE
 
 CONNECT_TIMEOUT = 2.0
 """Time limit of connecting and of every query [s]."""
+
+EXIT_TIMEOUT = 10.0
+"""How long the exit of a program waits for the last callbacks [s]: they have to get a processor."""
 
 
 class ServerUnreachable(BusError):
@@ -98,7 +102,7 @@ def _close_all() -> None:
     threading.main_thread().join()
     for session in list(_open_sessions):
         close_session(session)
-    deadline = time.monotonic() + CONNECT_TIMEOUT
+    deadline = time.monotonic() + EXIT_TIMEOUT
     while _direct and time.monotonic() < deadline:  # a thread that enters Python while that ends aborts the program
         time.sleep(0.005)
 
@@ -143,10 +147,14 @@ def watch_certificates(folder: pathlib.Path, name: str) -> CertificateWatch | No
 
 
 def called_directly(callback: Callable[[Any], object]) -> zenoh.handlers.Callback:
-    """A callback that the threads of Zenoh call which read the network. It must not wait for anything."""
+    """A callback that the threads of Zenoh call which read the network. It must not wait for anything.
+
+    No Python code runs after its mark is gone: between two instructions the thread may give the interpreter away, which
+    ends then, and aborts the program when the thread wants it back.
+    """
     mark = object()
     _direct.add(mark)
-    return zenoh.handlers.Callback(callback, lambda: _direct.discard(mark), indirect=False)
+    return zenoh.handlers.Callback(callback, functools.partial(_direct.discard, mark), indirect=False)
 
 
 def has_match(entity: zenoh.Publisher | zenoh.Querier) -> bool:
