@@ -12,15 +12,14 @@ from vinesim.cli.client_session import status_line
 from vinesim.client.client import Client
 from vinesim.client.faults import DESCRIPTIONS
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.sensing.robot_processes import loop_status
+from vinesim.client.sensing.robot_processes import loop_status, network_status
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.net.replication.clock_sync import Ping
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
-
-WITHOUT_SENSORS = {"frames_dropped": 0, "messages_dropped": 0, "sound_lost": 0}
 
 
 @pytest.fixture
@@ -85,3 +84,39 @@ def test_what_cannot_be_read_from_another_actor_is_counted(client) -> None:
     client.replicator.counters.malformed += 3
     assert Status(client, RateLoop(0.01)).current()["faults"] == {"messages_refused": 3}
     assert set(client.physics.faults) <= set(DESCRIPTIONS)
+
+
+def test_what_the_network_lost_refused_or_came_under_a_false_name_is_counted(client) -> None:
+    counters = client.replicator.counters
+    counters.lost, counters.foreign, counters.network_failures = 1, 2, 3
+    values = Status(client, RateLoop(0.01)).current()
+    assert values["faults"] == {"messages_lost": 1, "messages_foreign": 2, "network_failures": 3}
+    assert set(values["faults"]) <= set(DESCRIPTIONS)
+    assert status_line(values).endswith("FAULTS: 1 messages lost, 2 messages foreign, 3 network failures")
+
+
+def test_a_server_that_is_gone_is_told_while_it_is_gone(client) -> None:
+    """By status line, status and diagnostics; not only by a line of the log when it went."""
+    status, hub = Status(client, RateLoop(0.01)), client.replicator.bus.hub
+    for hub.down, text in ((False, ""), (True, "the hub is down"), (False, "")):
+        client.tick()
+        values = status.current()
+        assert values["network"] == text
+        assert status_line(values).endswith(f"  alone  NETWORK: {text}" if text else "  alone")
+        shown = network_status(values)
+        assert (shown.name, shown.level, shown.message) == ("network", "warning" if text else "ok", text or "well")
+
+
+def test_the_round_trip_to_the_server_is_shown(client) -> None:
+    status = Status(client, RateLoop(0.01))
+    assert network_status(status.current()).values["round_trip_ms"] is None
+    for sent, received in ((1.0, 1.5), (2.0, 2.25), (3.0, 3.5)):
+        clock = client.replicator._state.peers.clock
+        clock.estimate = clock.estimate.with_ping(Ping(sent, 10.0 + 0.5 * (sent + received), received))
+    assert network_status(status.current()).values["round_trip_ms"] == 250.0
+
+
+def test_processes_that_were_started_again_are_shown(client) -> None:
+    restarts = {"sensor_restarts": 2, "ros_restarts": 1}
+    values = Status(client, RateLoop(0.01), sensors=lambda: restarts).current()
+    assert status_line(values).endswith("  alone  restarted: 2 sensor processes, 1 ROS processes")

@@ -235,6 +235,11 @@ def status_line(values: dict[str, Any]) -> str:
         f"out {1e-3 * values['bytes_out']:.1f} kB",
         f"with {', '.join(values['others'])}" if values["others"] else "alone",
     ]
+    if values["network"]:
+        parts.append(f"NETWORK: {values['network']}")
+    restarts = {"sensor processes": values["sensor_restarts"], "ROS processes": values["ros_restarts"]}
+    if restarted := ", ".join(f"{count} {kind}" for kind, count in restarts.items() if count):
+        parts.append(f"restarted: {restarted}")
     if dropped := ", ".join(f"{count} {kind}" for kind, count in counts.items() if count):
         parts.append(f"dropped: {dropped}")
     if faults := ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in values["faults"].items()):

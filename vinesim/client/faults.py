@@ -19,6 +19,9 @@ DESCRIPTIONS = {
     "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",
     "couplings_refused": "forces of other actors on plants were refused, as too many bodies of plants were held",
     "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",
+    "messages_lost": "messages of other actors were lost here, as they were too many to be read, or too large",
+    "messages_foreign": "messages were dropped, as their session does not hold the name that they came under",
+    "network_failures": "messages could not be sent, as the network refused them or too many waited already",
     "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
     "meshes_refused": "meshes of other clients were refused, as they were corrupt or too many: they stay boxes",
     "meshes_not_taken": "meshes of robots here were not taken by the server: others see boxes in their place",
@@ -34,6 +37,9 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
     physics = client.physics.faults | {"couplings_refused": client.couplings.refused}
     counts = dict(client.earlier_faults + collections.Counter(physics)) | {
         "messages_refused": sum(one.malformed for one in counters),
+        "messages_lost": sum(one.lost for one in counters),
+        "messages_foreign": sum(one.foreign for one in counters),
+        "network_failures": sum(one.network_failures for one in counters),
         "wrenches_refused": sum(one.wrenches_refused for one in counters),
         "meshes_refused": client.meshes.refused_count,
         "meshes_not_taken": client.meshes.refused_offers,

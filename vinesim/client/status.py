@@ -77,6 +77,8 @@ class Status:
             "environment_bytes_out": traffic.environment.bytes_out,
             "faults": faults,
             "recent_faults": recent_faults,
+            "network": network_trouble(client),
+            "round_trip_ms": None if (trip := client.replicator.round_trip) is None else 1e3 * trip,
             "sound_dropped": client.sound.dropped,
             "bunches_picked": int((~client.physics.state.bunch_attached).sum()),
             "phase": "" if self._task is None else self._task.phase,
@@ -104,3 +106,8 @@ class Status:
             values["force_peak_n"] = float(np.linalg.norm(rows.force, axis=1).max(initial=0.0))
             values["displacement_peak_mm"] = 1e3 * float(np.linalg.norm(rows.displacement, axis=1).max(initial=0.0))
         return values
+
+
+def network_trouble(client: Client) -> str:
+    """Why the first of the client's actors that is cut off has no network now; empty if all have it."""
+    return next((text for one in client.replicators.values() if (text := one.bus.status_message)), "")

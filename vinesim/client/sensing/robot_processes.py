@@ -22,8 +22,10 @@ log = logging.getLogger(__name__)
 
 BEHIND = 0.95
 """A loop that has done a smaller share than this of the steps that were due since the last status is behind."""
-_LOOP_VALUES = ("tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "bytes_in", "bytes_out")
-"""Values of a client's status that /diagnostics shows."""
+_LOOP_VALUES = ("tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "sound_dropped")
+"""Values of a client's status that /diagnostics shows with the loop."""
+_NETWORK_VALUES = ("others", "round_trip_ms", "bytes_in", "bytes_out")
+"""The same with the network."""
 
 
 class RobotProcesses:
@@ -108,11 +110,12 @@ class RobotProcesses:
         """Publish a client's status on /diagnostics, with that of the sensors."""
         if self.ros is None:
             return
-        report, awaited = self.report(), self.sensors.awaited()
+        report, awaited = self.report() | {"sound_lost": self.ros.sound_lost}, self.sensors.awaited()
         self.ros.publish_diagnostics(
             status["world_time"],
             [
                 loop_status(status),
+                network_status(status),
                 ComponentStatus(
                     "sensors", "error" if awaited else "ok", f"not ready: {awaited[0]}" if awaited else "well", report
                 ),
@@ -145,3 +148,10 @@ def loop_status(status: dict[str, Any]) -> ComponentStatus:
     trouble += [name.replace("_", " ") for name in status["recent_faults"]]
     values = {key: status[key] for key in _LOOP_VALUES} | status["faults"]
     return ComponentStatus("simulation", "warning" if trouble else "ok", ", ".join(trouble) or "well", values)
+
+
+def network_status(status: dict[str, Any]) -> ComponentStatus:
+    """A client's network for /diagnostics: a warning while its server is gone or rejects it."""
+    trouble = status["network"]
+    values = {key: status[key] for key in _NETWORK_VALUES}
+    return ComponentStatus("network", "warning" if trouble else "ok", trouble or "well", values)

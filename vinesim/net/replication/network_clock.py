@@ -39,6 +39,11 @@ class NetworkClock:
         return self._now + self.estimate.offset
 
     @property
+    def round_trip(self) -> float | None:
+        """Shortest of the last pings to the server and back [s]; None without a reply."""
+        return min((ping.round_trip for ping in self.estimate.pings), default=None)
+
+    @property
     def is_settled(self) -> bool:
         """The server has replied, or has not within :data:`SETTLE_TIMEOUT`."""
         assert self._now is not None

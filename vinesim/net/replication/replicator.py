@@ -125,6 +125,11 @@ class Replicator:
         """Whether a server has told its clock, so that network time is its time."""
         return bool(self._state.peers.clock.estimate.pings)
 
+    @property
+    def round_trip(self) -> float | None:
+        """Shortest of the last pings to the server and back [s]; None without a reply."""
+        return self._state.peers.clock.round_trip
+
     def receive(self, now: float, link_centre: LinkCentre | None = None) -> Inbox:
         """Everything that arrived since the last call.
 
