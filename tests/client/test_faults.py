@@ -86,6 +86,17 @@ def test_what_cannot_be_read_from_another_actor_is_counted(client) -> None:
     assert set(client.physics.faults) <= set(DESCRIPTIONS)
 
 
+def test_what_the_parts_of_a_client_count_is_added_up(client) -> None:
+    """Commands that were refused, of each robot; and none is shown as long as there is none."""
+    counts = [0, 0]
+    client.faults_elsewhere += [lambda: {"commands_refused": counts[0]}, lambda: {"commands_refused": counts[1]}]
+    status = Status(client, RateLoop(0.01))
+    assert status.current()["faults"] == {}
+    counts[:] = 2, 3
+    assert status.current()["faults"] == {"commands_refused": 5}
+    assert "commands_refused" in DESCRIPTIONS
+
+
 def test_what_the_network_lost_refused_or_came_under_a_false_name_is_counted(client) -> None:
     counters = client.replicator.counters
     counters.lost, counters.foreign, counters.network_failures = 1, 2, 3

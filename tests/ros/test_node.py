@@ -31,7 +31,8 @@ from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tests.support.stock_node import TIMEOUT, StockNode, wait_until
-from vinesim.ros.commands.types import BaseVelocity, ForwardCommand
+from vinesim.ros.commands.subscriptions import MAX_QUEUED, CommandQueue
+from vinesim.ros.commands.types import BaseVelocity, CancelGoal, ForwardCommand
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
 from vinesim.ros.robot_node import RobotNode
 from vinesim.ros.sensor_node import SensorNode
@@ -223,6 +224,22 @@ def test_every_topic_is_heard_with_its_official_type():
     assert received["/tf"]["type_hash"] == "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 
 
+def test_a_second_of_every_step_waits_for_a_subscriber_and_five_pictures_or_clouds():
+    """As docs/ros.md says: keep last, 100 messages of every step."""
+    steps = (
+        "joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "base_imu", "wrist/wrench", "see/k/state",
+    )  # fmt: skip
+    elastic = ControllerSpec("see", ControllerKind.SERIES_ELASTIC, ("k",))
+    with (
+        RobotNode("vinebot", URDF, imus=["base_imu"], wrenches=["wrist"], controllers=[elastic]) as robot,
+        SensorNode("vinebot_sensors", cameras=["camera"], lidars=["lidar"]) as sensors,
+    ):
+        depths = {name: topic.publisher.qos_profile.depth for name, topic in robot._topics.items()}
+        assert {name: depths[name] for name in steps} == dict.fromkeys(steps, 100)
+        pictures = [topic for name, topic in sensors._topics.items() if name != "camera/label_info"]
+        assert {topic.publisher.qos_profile.depth for topic in pictures} == {5}
+
+
 LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static", "human_intention",
            "audio_info", "indicator_lights/markers")  # fmt: skip
 TYPES = {
@@ -343,6 +360,15 @@ def test_a_set_point_replaces_the_older_and_nonsense_is_refused():
         wait_until(lambda: node._commands.rejected)  # the last one: all others have come before it
         commands = node.commands()
         assert [c.linear[0] for c in commands if isinstance(c, BaseVelocity)] == [1.0]
+
+
+def test_commands_that_nobody_takes_are_counted():
+    queue = CommandQueue()
+    for number in range(MAX_QUEUED + 3):
+        queue.put(CancelGoal(number.to_bytes(16, "big")))
+    assert queue.rejected == 3
+    assert queue.drain()[0] == CancelGoal((3).to_bytes(16, "big"))
+    assert queue.drain() == []
 
 
 def test_two_robots_in_one_process_under_namespaces():

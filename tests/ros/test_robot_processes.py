@@ -25,6 +25,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image, JointState, PointCloud2
+from std_msgs.msg import Float64MultiArray
 
 from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
@@ -153,6 +154,10 @@ def test_pictures_and_clouds_come_and_killed_processes_come_back_and_diagnostics
         set_parameter(robot, node, name, value)
     workers = robot.processes.ros, robot.processes.sensors
     robot.run_until(lambda: all(one._parameters for one in workers))
+    commands = robot.peer.node.create_publisher(Float64MultiArray, "/forward_position_controller/commands", 10)
+    robot.run_until(commands.get_subscription_count)
+    commands.publish(Float64MultiArray(data=[1.0, 2.0]))  # it has more joints
+    robot.run_until(lambda: robot.status.current()["faults"].get("commands_refused") == 1)
     os.kill(robot.processes.sensors.worker.current().process.pid, signal.SIGKILL)
     robot.run_until(lambda: level_of_sensors() == DiagnosticStatus.ERROR)
     assert not robot.status.current()["sensors_ready"]
@@ -167,6 +172,7 @@ def test_pictures_and_clouds_come_and_killed_processes_come_back_and_diagnostics
     robot.run_until(lambda: len(joints) > seen[0] + 20 and len(diagnostics) > seen[1])
     for node, (name, value) in values.items():
         assert get_parameter(robot, node, name) == value, "parameters that were set hold for the new process"
+    assert robot.status.current()["faults"]["commands_refused"] == 1, "what the killed process refused is not forgotten"
 
 
 def test_of_a_process_that_stops_for_a_while_every_step_is_sent_or_counted_as_lost(robot):
@@ -246,7 +252,7 @@ class RecordingNode:
     """Takes the place of the robot's node, and notes what it is told, in order."""
 
     set_parameters: dict[str, Any] = {}  # noqa: RUF012 (constant)
-    has_goals, environment_rate = False, 10.0
+    has_goals, environment_rate, refused_commands = False, 10.0, 0
 
     def __init__(self, *_, **__) -> None:
         self.told: list[tuple[str, Any]] = []

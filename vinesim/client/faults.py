@@ -25,6 +25,7 @@ DESCRIPTIONS = {
     "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
     "meshes_refused": "meshes of other clients were refused, as they were corrupt or too many: they stay boxes",
     "meshes_not_taken": "meshes of robots here were not taken by the server: others see boxes in their place",
+    "commands_refused": "commands from ROS were refused, as they contradict themselves or what the robot has",
     "page_messages_refused": "messages of pages were refused, as they were malformed or cannot be true",
     "deadlines_dropped": "steps were skipped after the process had stood still",
 }
@@ -35,7 +36,8 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
     """How often each fault of :data:`DESCRIPTIONS` occurred; faults that did not are left out."""
     counters = [replicator.counters for replicator in client.replicators.values()]
     physics = client.physics.faults | {"couplings_refused": client.couplings.refused}
-    counts = dict(client.earlier_faults + collections.Counter(physics)) | {
+    counts = client.earlier_faults + collections.Counter(physics)
+    counts.update({
         "messages_refused": sum(one.malformed for one in counters),
         "messages_lost": sum(one.lost for one in counters),
         "messages_foreign": sum(one.foreign for one in counters),
@@ -44,9 +46,9 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
         "meshes_refused": client.meshes.refused_count,
         "meshes_not_taken": client.meshes.refused_offers,
         "deadlines_dropped": deadlines_dropped,
-    }
+    })  # fmt: skip
     for others in client.faults_elsewhere:
-        counts |= others()
+        counts.update(others())
     return {name: count for name, count in counts.items() if count}
 
 

@@ -201,7 +201,7 @@ class RobotNode(Node):
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
         """Publish the states of parts of the client; the node adds its own. 1 Hz will do."""
-        own = {"refused_commands": self._commands.rejected}
+        own = {"refused_commands": self.refused_commands}
         prefix = self._node.get_fully_qualified_name()
         statuses = [*components, ComponentStatus("ros", values=own)]
         self._send([(self._diagnostics, lambda: convert.diagnostics(time, prefix, statuses))])
@@ -209,6 +209,11 @@ class RobotNode(Node):
     def commands(self) -> list[Command]:
         """Commands that arrived since the last call, in order."""
         return self._commands.drain()
+
+    @property
+    def refused_commands(self) -> int:
+        """Messages and goals so far that contradicted themselves, or that nobody took in time."""
+        return self._commands.rejected
 
     @property
     def has_goals(self) -> bool:

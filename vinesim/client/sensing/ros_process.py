@@ -56,7 +56,9 @@ class RosProcess:
         self._sent_before: collections.Counter[str] = collections.Counter()
         self._dropped_before: collections.Counter[str] = collections.Counter()
         """Counts of the runs of the process before this one."""
-        self._sound_lost = self._sound_lost_before = 0
+        self._losses: collections.Counter[str] = collections.Counter()
+        self._losses_before: collections.Counter[str] = collections.Counter()
+        """Frames of sound and commands that were lost or refused in this run of the process, and in those before."""
         self._contacts_left_out = 0
         self._is_restarted = False
         self._leads = clock
@@ -108,6 +110,7 @@ class RosProcess:
             self.robot, self._take_commands, self._finish, client.world_time,
             lambda pcm: client.sound.play(self.robot.name, pcm),
         )  # fmt: skip
+        client.faults_elsewhere.append(lambda: {"commands_refused": self.commands_refused})
         client.sound.listen(self.robot.name, _Microphone(self))
         client.pre_step.insert(0, self._control)
         client.after_reset.append(self._begin_anew)
@@ -223,14 +226,15 @@ class RosProcess:
         elif kind == "simulation" and self._simulation is not None:
             self._simulation.put(value)
         elif kind == "statistics":
-            self._sent, self._dropped, self._sound_lost = value["sent"], value["dropped"], value["sound_lost"]
+            self._sent, self._dropped = value["sent"], value["dropped"]
+            self._losses = collections.Counter({kind: value[kind] for kind in ("sound_lost", "commands_refused")})
         elif kind == "parameters":
             self._parameters.update(value)
         elif kind == "restarted":
             self._is_restarted = True
             self._sent_before.update(self._sent)
             self._dropped_before.update(self._dropped)
-            self._sound_lost_before, self._sound_lost = self.sound_lost, 0
+            self._losses_before, self._losses = self._losses_before + self._losses, collections.Counter()
             self._sent, self._dropped = dict.fromkeys(self._sent, 0), {}
 
     def sent_messages(self) -> dict[str, int]:
@@ -248,7 +252,13 @@ class RosProcess:
     @property
     def sound_lost(self) -> int:
         """Frames of voices that the microphone missed: lost on the network, too late, or not decoded."""
-        return self._sound_lost_before + self._sound_lost
+        return self._losses_before["sound_lost"] + self._losses["sound_lost"]
+
+    @property
+    def commands_refused(self) -> int:
+        """Commands that contradicted themselves, or what the robot has."""
+        kind = "commands_refused"
+        return self._losses_before[kind] + self._losses[kind] + self.handler.rejected_count
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
         """Publish states of parts of the client on /diagnostics at simulation time ``time`` [s]."""

@@ -240,6 +240,7 @@ class RosWorker:
     def _send_statistics(self) -> None:
         statistics: dict[str, Any] = {
             "sent": self.node.sent, "dropped": self.node.dropped, "sound_lost": self._microphone.missed,
+            "commands_refused": self.node.refused_commands,
         }  # fmt: skip
         self.pipe.send(("statistics", statistics))
 

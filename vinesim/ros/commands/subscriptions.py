@@ -42,7 +42,7 @@ class CommandQueue:
         self._lock = threading.Lock()
         self._queue: deque[Command] = deque(maxlen=MAX_QUEUED)
         self.rejected = 0
-        """Messages and goals that contradicted themselves."""
+        """Messages and goals that contradicted themselves, or that nobody took before too many others came."""
 
     def drain(self) -> list[Command]:
         """Take all commands that arrived since the last call, in order of arrival."""
@@ -58,11 +58,13 @@ class CommandQueue:
             if key is not None:
                 for older in [c for c in self._queue if _setpoint_key(c) == key]:
                     self._queue.remove(older)
+            self.rejected += len(self._queue) == MAX_QUEUED
             self._queue.append(command)
 
     def refuse(self, error: convert.CommandError) -> None:
         """Count a command that contradicts itself."""
-        self.rejected += 1
+        with self._lock:
+            self.rejected += 1
         log.warning("refused a command: %s", error)
 
 
