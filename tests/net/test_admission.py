@@ -188,6 +188,20 @@ def test_a_server_that_came_before_its_predecessor_went_admits_again():
     assert (admission.is_served, admission.count) == (True, count + 1)
 
 
+def test_a_server_that_goes_before_it_could_reply_is_missed_whatever_the_order_of_reports():
+    session = _SlowlyRouted(lost=1000)
+    session.matching_status.matching = False
+    admission, tasks = start_admission(session)
+    do_all(tasks)
+    admission.watch()
+    assert admission.is_served, "there was none yet"
+    for matching in (False, True):  # in this order, although the server is gone now
+        session.on_matching(types.SimpleNamespace(matching=matching))
+    do_all(tasks)
+    admission.watch()
+    assert not admission.is_served
+
+
 def test_a_server_that_goes_while_its_reply_is_on_the_way_is_missed():
     session = _SlowlyRouted(lost=1)
     admission, tasks = start_admission(session)

@@ -47,6 +47,8 @@ class ServerAdmission:
         self._declared: list[object] = []
         self._querier: zenoh.Querier | None = None
         """Knows whether a server is announced; None before the first hello."""
+        self._was_announced = False
+        """Whether there was ever a server, though perhaps none of its replies arrived."""
         self._hello = b""
         self._is_join_submitted = False
 
@@ -71,11 +73,13 @@ class ServerAdmission:
             log.warning("%s: %d servers keep world %r; link all but one to it with --connect", self._name,
                         len(welcomes), self._world)  # fmt: skip
         self.count += bool(welcomes)
+        self._was_announced = bool(welcomes)
         querier = self._session.declare_querier(self._key)
         self._querier, self._hello = querier, hello
 
         def on_matching(status: zenoh.MatchingStatus) -> None:
             self.is_served = status.matching
+            self._was_announced |= status.matching
             self._submit_join()
 
         self._declared.append(querier.declare_matching_listener(on_matching))
@@ -86,13 +90,13 @@ class ServerAdmission:
         """Called from time to time: mend what Zenoh's threads reported late or in another order.
 
         A server may be reported as gone before the reply in which it admitted this actor is read, or after its
-        successor was reported: then the present state of the querier counts.
+        successor was reported, or before it is reported itself: then the present state of the querier counts.
         """
         if self._querier is None:
             return
         if not self.is_served:
             self._submit_join()
-        elif self._servers and not has_match(self._querier):
+        elif self._was_announced and not has_match(self._querier):
             self.is_served = False
 
     def _submit_join(self) -> None:
@@ -110,6 +114,7 @@ class ServerAdmission:
         self._is_join_submitted = False
         if self._querier is None or not has_match(self._querier):
             return
+        self._was_announced = True
         welcomes = self._query(self._hello)
         if not welcomes:
             time.sleep(RETRY_PERIOD)
