@@ -18,6 +18,7 @@ if middleware.unavailable_reason() is not None:
 
 from action_msgs.msg import GoalStatus
 from rclpy.action import ActionClient
+from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tests.support.contact_scenes import cane
@@ -186,6 +187,41 @@ def test_tolerances_and_velocities_are_honoured(world: RobotInRos, head: ActionC
     assert world.result(handle)[0] == GoalStatus.STATUS_SUCCEEDED
     assert max(speeds) > 0.35  # a straight line from 0 to 0.2 would never ask for more than 0.4 after standing still
     assert min(speeds) < -0.05  # the spline first swings back, to be at 0 with 0.4 rad/s
+
+
+def test_forward_controllers_move_joints_by_position_velocity_and_effort(world: RobotInRos) -> None:
+    """F83 over ROS: one value a joint in the order of joint_states, NaN leaves the others alone; a joint obeys the
+    controller that was commanded last."""
+    robot = world.client.robot
+    count, head = len(robot.description.joints), robot.joint_indices(HEAD)[0]
+    publishers = {
+        kind: world.peer.node.create_publisher(Float64MultiArray, f"/forward_{kind}_controller/commands", 10)
+        for kind in ("position", "velocity", "effort")
+    }
+    world.wait(lambda: all(one.get_subscription_count() for one in publishers.values()), "three controllers")
+
+    def command(kind: str, value: float) -> None:
+        values = np.full(count, np.nan)
+        values[head] = value
+        publishers[kind].publish(Float64MultiArray(data=values.tolist()))
+
+    def moved(least: float, most: float):
+        return lambda: least < world.head()[0] < most
+
+    others = robot.rigid.joint_measurements(robot.name)[0].copy()
+    command("position", 0.3)
+    world.wait(moved(0.29, 0.31), "the position")
+    command("velocity", -0.5)
+    world.wait(moved(-np.inf, 0.1), "a motion back")
+    velocity = robot.rigid.joint_measurements(robot.name)[1][head]
+    assert velocity == pytest.approx(-0.5, abs=0.05)
+    command("effort", 2.0)
+    world.wait(lambda: robot.rigid.joint_measurements(robot.name)[1][head] > 0.1, "the effort to turn it round")
+    command("position", 0.0)
+    world.wait(moved(-0.01, 0.01), "the position again")
+    after = robot.rigid.joint_measurements(robot.name)[0]
+    rest = [i for i, name in enumerate(robot.description.joints) if name not in HEAD]
+    np.testing.assert_allclose(after[rest], others[rest], atol=0.01)
 
 
 def test_gripper_and_cutter(world: RobotInRos) -> None:

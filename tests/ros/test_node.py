@@ -24,14 +24,16 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 import rclpy
-from geometry_msgs.msg import TwistStamped
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Twist, TwistStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from tests.support.stock_node import TIMEOUT, StockNode, wait_until
-from vinesim.ros.commands.subscriptions import MAX_QUEUED, CommandQueue
+from vinesim.ros.commands.convert import CommandError
+from vinesim.ros.commands.subscriptions import MAX_LOGGED, MAX_QUEUED, CommandQueue
 from vinesim.ros.commands.types import BaseVelocity, CancelGoal, ForwardCommand
 from vinesim.ros.commands.types import JointTrajectory as Trajectory
 from vinesim.ros.robot_node import RobotNode
@@ -362,6 +364,37 @@ def test_a_set_point_replaces_the_older_and_nonsense_is_refused():
         assert [c.linear[0] for c in commands if isinstance(c, BaseVelocity)] == [1.0]
 
 
+def test_a_command_of_another_type_is_told_of_once_with_the_remedy(caplog):
+    """As teleop_twist_keyboard and Nav2 publish it by default; DDS delivers nothing of it and says nothing."""
+    diagnostics: list[DiagnosticArray] = []
+    with RobotNode("vinebot", URDF, namespace="farm", controllers=CONTROLLERS) as node, StockNode() as peer:
+        peer.node.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
+
+        def level(part: str = "/farm/vinebot: ros") -> bytes | None:
+            node.publish_diagnostics(0.0, [])
+            peer.spin()
+            return next((one.level for array in diagnostics[-1:] for one in array.status if one.name == part), None)
+
+        wait_until(lambda: level() == DiagnosticStatus.OK)
+        wrong = peer.node.create_publisher(Twist, "/farm/mobile_base_controller/cmd_vel", 10)
+        wait_until(lambda: level() == DiagnosticStatus.WARN)
+        assert diagnostics[-1].status[0].message == (
+            "/farm/mobile_base_controller/cmd_vel is published as geometry_msgs/msg/Twist"
+        )
+        peer.node.destroy_publisher(wrong)
+        wait_until(lambda: level() == DiagnosticStatus.OK)
+        other = peer.node.create_publisher(String, "/farm/forward_position_controller/commands", 10)
+        wait_until(lambda: level() == DiagnosticStatus.WARN)
+        peer.node.destroy_publisher(other)
+    assert [record.getMessage() for record in caplog.records] == [
+        "/farm/mobile_base_controller/cmd_vel is published as geometry_msgs/msg/Twist, of which nothing arrives; "
+        "publish geometry_msgs/msg/TwistStamped "
+        "(teleop_twist_keyboard: -p stamped:=true; Nav2: enable_stamped_cmd_vel: true)",
+        "/farm/forward_position_controller/commands is published as std_msgs/msg/String, of which nothing arrives; "
+        "publish std_msgs/msg/Float64MultiArray",
+    ]
+
+
 def test_commands_that_nobody_takes_are_counted():
     queue = CommandQueue()
     for number in range(MAX_QUEUED + 3):
@@ -369,6 +402,16 @@ def test_commands_that_nobody_takes_are_counted():
     assert queue.rejected == 3
     assert queue.drain()[0] == CancelGoal((3).to_bytes(16, "big"))
     assert queue.drain() == []
+
+
+def test_a_stream_of_bad_commands_does_not_fill_the_log(caplog):
+    queue = CommandQueue()
+    for number in range(3 * MAX_LOGGED):
+        queue.refuse(CommandError("always the same"))
+        queue.refuse(CommandError(f"with the value {number}"))
+    assert queue.rejected == 6 * MAX_LOGGED
+    assert len(caplog.records) == MAX_LOGGED
+    assert len({record.getMessage() for record in caplog.records}) == MAX_LOGGED
 
 
 def test_two_robots_in_one_process_under_namespaces():

@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import String
 
 from vinesim.ros.commands.actions import ControllerActions
-from vinesim.ros.commands.subscriptions import CommandQueue, CommandSubscriptions
+from vinesim.ros.commands.subscriptions import BASE_COMMAND, CommandQueue, CommandSubscriptions
 from vinesim.ros.commands.types import Command, GoalResult
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.node import Node
@@ -40,7 +40,8 @@ FEEDBACK_PERIOD = 5
 MAP_TO_ODOM, TRUTH, ENVIRONMENT_RATE = "publish_map_to_odom", "publish_truth", "environment_rate"
 """Names of parameters."""
 LOOK_PERIOD = 1.0
-"""Wall time between two looks for another robot under the same names [s]."""
+"""Wall time between two looks for another robot under the same names, and for commands of another type [s]."""
+STAMPED_REMEDY = " (teleop_twist_keyboard: -p stamped:=true; Nav2: enable_stamped_cmd_vel: true)"
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
 """The name of a node, to rmw, that has not introduced itself yet."""
 OWN_MESSAGES = ("tf2_msgs", "control_msgs", "audio_common_msgs")
@@ -82,6 +83,8 @@ class RobotNode(Node):
         self._steps = 0
         self._next_look = 0.0
         self._shares_topics = False
+        self._foreign_types: dict[str, list[str]] = {}
+        self._warned_topics: set[str] = set()
         names = [spec.name for spec in controllers]
         super().__init__(name, namespace, [*names, *imus, *wrenches], params_file, parameters)
 
@@ -103,7 +106,7 @@ class RobotNode(Node):
         numbers = {link.get("name", ""): number for number, link in enumerate(links)}
         self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers)
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
-        CommandSubscriptions(self._node, self._controllers, self._commands, AudioData)
+        self._subscriptions = CommandSubscriptions(self._node, self._controllers, self._commands, AudioData)
 
         self._declare_parameters()
 
@@ -145,9 +148,11 @@ class RobotNode(Node):
     def _look_around(self) -> None:
         if self._clock is not None:
             self._clock.update()
-        if not self._shares_topics and wall.monotonic() >= self._next_look:
+        if wall.monotonic() >= self._next_look:
             self._next_look = wall.monotonic() + LOOK_PERIOD
-            self._warn_if_shared()
+            if not self._shares_topics:
+                self._warn_if_shared()
+            self._warn_of_types()
 
     def _warn_if_shared(self) -> None:
         """Say once that another robot has this one's names."""
@@ -160,6 +165,18 @@ class RobotNode(Node):
                 "%s and %s publish %s: frames, joints and commands of two robots mix; give each client a --namespace "
                 "of its own", own, ", ".join(sorted(others)), topic,
             )  # fmt: skip
+
+    def _warn_of_types(self) -> None:
+        """Say once of each topic of commands that it is published as a type that this robot does not take."""
+        self._foreign_types = self._subscriptions.foreign_types()
+        for topic, types in self._foreign_types.items():
+            if topic not in self._warned_topics:
+                self._warned_topics.add(topic)
+                is_base = topic.endswith(BASE_COMMAND)
+                log.warning(
+                    "%s is published as %s, of which nothing arrives; publish %s%s", topic, ", ".join(types),
+                    self._subscriptions.types[topic], STAMPED_REMEDY if is_base else "",
+                )  # fmt: skip
 
     def publish_clock(self, time: float) -> None:
         """Publish /clock at ``time`` [s], if this node is the one that does; for every step."""
@@ -203,7 +220,9 @@ class RobotNode(Node):
         """Publish the states of parts of the client; the node adds its own. 1 Hz will do."""
         own = {"refused_commands": self.refused_commands}
         prefix = self._node.get_fully_qualified_name()
-        statuses = [*components, ComponentStatus("ros", values=own)]
+        trouble = [f"{topic} is published as {', '.join(types)}" for topic, types in self._foreign_types.items()]
+        level = "warning" if trouble else "ok"
+        statuses = [*components, ComponentStatus("ros", level, "; ".join(trouble) or "well", own)]
         self._send([(self._diagnostics, lambda: convert.diagnostics(time, prefix, statuses))])
 
     def commands(self) -> list[Command]:

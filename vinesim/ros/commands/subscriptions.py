@@ -31,8 +31,13 @@ from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
 
 log = logging.getLogger(__name__)
 
+BASE_COMMAND = "mobile_base_controller/cmd_vel"
+"""Topic."""
 MAX_QUEUED = 256
 """Largest number of queued commands; a client that takes them after every step never loses the oldest."""
+
+MAX_LOGGED = 32
+"""Largest number of reasons in the log: some name values, and differ with each message."""
 
 
 class CommandQueue:
@@ -41,6 +46,8 @@ class CommandQueue:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._queue: deque[Command] = deque(maxlen=MAX_QUEUED)
+        self._logged: set[str] = set()
+        """Reasons that the log has."""
         self.rejected = 0
         """Messages and goals that contradicted themselves, or that nobody took before too many others came."""
 
@@ -62,10 +69,12 @@ class CommandQueue:
             self._queue.append(command)
 
     def refuse(self, error: convert.CommandError) -> None:
-        """Count a command that contradicts itself."""
+        """Count a command that contradicts itself; the log has each reason once."""
         with self._lock:
             self.rejected += 1
-        log.warning("refused a command: %s", error)
+        if (reason := str(error)) not in self._logged and len(self._logged) < MAX_LOGGED:
+            self._logged.add(reason)
+            log.warning("refused a command, further ones for this reason are only counted: %s", reason)
 
 
 def _setpoint_key(command: Command) -> tuple[str, ...] | None:
@@ -91,7 +100,9 @@ class CommandSubscriptions:
         self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue, audio_data: type
     ) -> None:  # fmt: skip
         self._node, self._queue = node, queue
-        self._subscribe(TwistStamped, "mobile_base_controller/cmd_vel", convert.base_velocity)
+        self.types: dict[str, str] = {}
+        """By full name of each topic: the type that is taken, ``package/msg/Name``."""
+        self._subscribe(TwistStamped, BASE_COMMAND, convert.base_velocity)
         self._subscribe(String, "indicator_lights/command", convert.lights_pattern)
         self._subscribe(ColorRGBA, "indicator_lights/color", convert.lights_color)
         self._subscribe(Bool, "indicator_lights/sound", lambda message: LightsSound(message.data))
@@ -117,6 +128,17 @@ class CommandSubscriptions:
 
     def _subscribe(self, message: type, topic: str, take: Callable[[Any], Command]) -> None:
         self._node.create_subscription(message, topic, partial(self._receive, take), RELIABLE)
+        package, name = message.__module__.partition(".")[0], message.__name__
+        self.types[self._node.resolve_topic_name(topic)] = f"{package}/msg/{name}"
+
+    def foreign_types(self) -> dict[str, list[str]]:
+        """Topics that somebody publishes as another type, and those types: DDS delivers nothing of it, in silence."""
+        known = self._node.get_topic_names_and_types()
+        return {
+            topic: others
+            for topic, types in known
+            if topic in self.types and (others := sorted(set(types) - {self.types[topic]}))
+        }
 
     def _receive(self, take: Callable[[Any], Command], message: Any) -> None:
         try:
