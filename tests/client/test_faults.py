@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import types
 
 import numpy as np
 import pytest
 
 from tests.support.contact_scenes import cane
 from vinesim.cli.client_session import status_line
+from vinesim.cli.robot_client import complete_report
 from vinesim.client.client import Client
 from vinesim.client.faults import DESCRIPTIONS
 from vinesim.client.rate_loop import RateLoop
@@ -125,6 +127,22 @@ def test_the_round_trip_to_the_server_is_shown(client) -> None:
         clock = client.replicator._state.peers.clock
         clock.estimate = clock.estimate.with_ping(Ping(sent, 10.0 + 0.5 * (sent + received), received))
     assert network_status(status.current()).values["round_trip_ms"] == 250.0
+
+
+def test_the_report_of_several_robots_has_the_losses_of_each() -> None:
+    lost = {"picker_1": {}, "picker_2": {"/picker_2/tf": 3}}
+    processes = {
+        name: types.SimpleNamespace(report=lambda dropped=dropped: {
+            "frames": {}, "ros_dropped": dropped, "sensor_restarts": len(dropped), "ros_restarts": 1,
+        })
+        for name, dropped in lost.items()
+    }  # fmt: skip
+    report = complete_report({"faults": {}, "sensor_restarts": 0, "ros_restarts": 0}, processes)
+    assert (report["sensor_restarts"], report["ros_restarts"], report["ros_dropped"]) == (1, 2, {})
+    assert {name: one["ros_dropped"] for name, one in report["robots"].items()} == lost
+    alone = complete_report({"faults": {}}, {"picker": processes["picker_1"]})
+    assert "robots" not in alone
+    assert alone["ros_restarts"] == 1
 
 
 def test_processes_that_were_started_again_are_shown(client) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -51,8 +52,9 @@ def run(options: ClientOptions) -> int:
             publish=lambda values: [one.publish_diagnostics(values) for one in sensors],
         )  # fmt: skip
         if options.out is not None:
-            sensors[0].close_ros()
-            report = status.report() | sensors[0].report()
+            for process in sensors:
+                process.close_ros()
+            report = complete_report(status.report(), dict(zip(names, sensors, strict=True)))
             if task is not None:
                 report["job"] = task.report()
             save_report(options.out, report)
@@ -77,6 +79,17 @@ def _start_sensors(
         )  # fmt: skip
         processes.append(session.enter(process))
     return processes
+
+
+def complete_report(report: dict[str, Any], processes: Mapping[str, RobotProcesses]) -> dict[str, Any]:
+    """A client's report with that of the first robot's processes; of several robots, those of each under its name."""
+    reports = {name: one.report() for name, one in processes.items()}
+    complete = report | next(iter(reports.values()))
+    if len(reports) > 1:
+        complete["robots"] = reports
+        for key in ("sensor_restarts", "ros_restarts"):
+            complete[key] = sum(one[key] for one in reports.values())
+    return complete
 
 
 def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
