@@ -13,6 +13,7 @@ from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.bench.sound_delay import AS_WAVEFORM, LIGHT, TONE_OF_LIGHTS, VOICE, sound
 from vinesim.bench.support.ear import Ear
 from vinesim.client.client import Client
+from vinesim.client.sound.exchange import MAX_WAITING
 from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
@@ -131,6 +132,18 @@ def test_a_page_that_stood_still_is_not_heard_twice_at_once():
     assert 0.4 < np.abs(heard).max() < 0.51
     assert np.mean(np.abs(heard) > 0.01) < 0.25, "what was too much was dropped"
     assert world.clients["anna"].sound.dropped >= 14
+
+
+def test_sound_that_a_loudspeaker_or_a_client_that_stands_still_has_no_room_for_is_counted():
+    world = World(bot=("robot", 0.0))
+    exchange, second = world.clients["bot"].sound, bytes(2 * SAMPLE_RATE)
+    exchange.play("bot", 29 * second)
+    assert exchange.dropped == 0
+    exchange.play("bot", 2 * second)
+    assert exchange.dropped == round(1.0 / FRAME), "it has 30 s to play"
+    for _ in range(MAX_WAITING + 3):
+        exchange.speak("bot", Codec.PCM16, bytes(2 * FRAME_SAMPLES))
+    assert exchange.dropped == round(1.0 / FRAME) + 3
 
 
 def test_an_alarm_is_heard_with_its_light_and_a_voice_later_than_states_but_within_its_budget():

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from vinesim.audio.frame import FRAME, Codec
+from vinesim.audio.frame import FRAME, FRAME_SAMPLES, Codec
 from vinesim.audio.loudspeaker import Loudspeaker
 from vinesim.audio.permission import may_hear
 from vinesim.net.codec.voice import VoiceFrame
@@ -120,8 +121,7 @@ class SoundExchange:
         self._speakers: dict[str, _Speaker] = {}
         self._loudspeakers: dict[str, Loudspeaker] = {}
         self._voices: dict[str, Voice] = {}
-        self.dropped = 0
-        """Frames of pages that came all at once."""
+        self._dropped = 0
         client.post_step.append(lambda _: self._exchange())
 
     # ------------------------------------------------------------------ from any thread
@@ -134,9 +134,17 @@ class SoundExchange:
         """Hand nothing to a listener any more."""
         self._listeners = [one for one in self._listeners if one[1] is not listener]
 
+    @property
+    def dropped(self) -> int:
+        """Frames that came all at once, of pages, or for loudspeakers that have enough to play."""
+        refused = [one.refused for one in list(self._loudspeakers.values())]
+        return self._dropped + sum(math.ceil(size / (2 * FRAME_SAMPLES)) for size in refused)
+
     def speak(self, actor: str, codec: Codec, data: bytes, *, is_main: bool = True) -> None:
         """Say 20 ms that a local actor has just said; see :meth:`vinesim.net.replication.voices.VoiceSync.say`."""
-        self._speaker(actor).waiting.append((codec, data, is_main))
+        waiting = self._speaker(actor).waiting
+        self._dropped += len(waiting) == MAX_WAITING
+        waiting.append((codec, data, is_main))
 
     def play(self, robot: str, pcm: bytes) -> None:
         """Play PCM16 of any length at the loudspeaker of a local robot, behind what it plays."""
@@ -192,7 +200,7 @@ class SoundExchange:
             for _ in range(len(speaker.waiting)):
                 codec, data, is_main = speaker.waiting.popleft()
                 if (time := speaker.stamp(now, is_main)) is None:
-                    self.dropped += 1
+                    self._dropped += 1
                     continue
                 voices.say(time, codec, data, is_main=is_main)
                 if is_main and len(self._client.replicators) > 1:
