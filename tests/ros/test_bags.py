@@ -39,7 +39,7 @@ def test_a_recording_holds_messages_definitions_and_qos_and_plays(tmp_path):
     """Messages to the byte, a latched one that came before the recorder; played, a late node receives it, too."""
     path = tmp_path / "run.mcap"
     with StockNode() as peer:
-        joints = peer.node.create_publisher(JointState, "/joint_states", 10)
+        joints = peer.node.create_publisher(JointState, "/joint_states", 100)  # all wait for a recorder that is late
         text = peer.node.create_publisher(String, "/robot_description", LATCHED)
         text.publish(String(data="<robot/>"))
         with BagRecorder(path) as recorder:

@@ -265,8 +265,7 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
             return turned(yaw(others[-1]["odom"].rotation), -yaw(own[-1]["base_footprint"].rotation))
 
         wait_until(lambda: counted() > 1.0, lambda: drive(0.0, 0.4))
-        for _ in range(20):
-            drive(0.0, 0.0)
+        wait_until(lambda: abs(odometry[-1].twist.twist.angular.z) < 1e-3, lambda: drive(0.0, 0.0), "rest")
         truth = turned(true_yaw(), before)
         # what was sent while it turned may still wait; then both hold
         wait_until(lambda: abs(turned(found(), truth)) < 0.04, lambda: drive(0.0, 0.0), f"a turn of {truth:.2f} rad")
