@@ -590,6 +590,23 @@ def test_more_than_ten_thousand_contacts_are_counted_and_the_deepest_stay():
     assert run()[4] == result
 
 
+def test_islands_that_end_at_the_largest_number_of_sweeps_are_counted():
+    """With one sweep no island of coupled contacts is solved to its tolerance, with the usual number all are."""
+    unfinished = []
+    for parameters in (PhysicsParameters(), PhysicsParameters(solver_sweeps=1)):
+        physics = Physics(scenes.cane_row(8), parameters=parameters)
+        physics.add_robot(scenes.combs("combs", 4, 8))
+        touched = 0
+        for tick in range(40):
+            physics.rigid.command("combs", np.full(2, 0.005 * min(1.0, tick / 20)))
+            physics.step()
+            touched += bool(physics.contacts)
+        assert touched > 5
+        unfinished.append(physics.contact_solver.impulses.unfinished)
+    assert unfinished[0] == 0
+    assert unfinished[1] > 5
+
+
 def test_two_hundred_contacts_of_one_island_converge_within_the_allowed_sweeps():
     """Combs that bend 40 canes by 5 mm: a body shared by all contacts."""
     physics = Physics(scenes.cane_row(40))

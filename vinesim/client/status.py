@@ -75,6 +75,7 @@ class Status:
             "bytes_out": sum(family.bytes_out for family in families),
             "environment_bytes_in": traffic.environment.bytes_in,
             "environment_bytes_out": traffic.environment.bytes_out,
+            "unfinished_solves": client.physics.contact_solver.impulses.unfinished,
             "faults": faults,
             "recent_faults": recent_faults,
             "network": network_trouble(client),

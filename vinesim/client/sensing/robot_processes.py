@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 BEHIND = 0.95
 """A loop that has done a smaller share than this of the steps that were due since the last status is behind."""
-_LOOP_VALUES = ("tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "sound_dropped")
+_LOOP_VALUES = ("tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "unfinished_solves", "sound_dropped")
 """Values of a client's status that /diagnostics shows with the loop."""
 _NETWORK_VALUES = ("others", "round_trip_ms", "bytes_in", "bytes_out")
 """The same with the network."""

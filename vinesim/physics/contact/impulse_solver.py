@@ -71,6 +71,8 @@ class ImpulseSolver:
         """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
         self.island_count = 0
         """Islands of the last solve."""
+        self.unfinished = 0
+        """How often an island of a solve ended at the largest number of sweeps, perhaps not within its tolerance."""
 
     def set_rigid_world(
         self, rigid_arrays: RigidArrays, detection: ContactDetection, previous: RigidArrays | None
@@ -162,6 +164,7 @@ class ImpulseSolver:
         self._assemble_delassus(n)
         self._solve_islands(island_count)
         self.island_count = island_count
+        self.unfinished += int(np.count_nonzero(self.islands.sweeps[:island_count] >= self.parameters.solver_sweeps))
 
         self.warm_start.count[0] = n
         self._store_warm_start(n)
