@@ -6,7 +6,7 @@ import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
 import { ARM, Hand } from "./hand.js";
 import { Headset } from "./headset.js";
-import { Absence, say } from "./notices.js";
+import { Absence, isUnusual, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { LateHands } from "./late.js";
 import { Pace, WalkingEyes } from "./person.js";
@@ -204,6 +204,7 @@ class Viewer {
     const now = performance.now(), passed = (now - this.lastFrame) / 1000;
     if (passed < this.shortest && !this.headset.isWorn) return;
     const seconds = this.isPerson ? this.pace.spend(passed) : Math.min(passed, LONGEST);
+    const wasHidden = isUnusual(passed, this.frame);
     this.lastFrame = now;
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
     const actors = this.actors();
@@ -244,7 +245,8 @@ class Viewer {
       const rate = 1 / this.frame;
       const said = `${this.world.header.scene}  ${this.newest.time.toFixed(1)} s  ${rate.toFixed(rate < 10 ? 1 : 0)} frames/s`;
       element("state").textContent = said;
-      const isKnown = this.newest.rigid === this.world.rigidVersion;
+      // the first picture after a hidden tab shows a state from when it was hidden
+      const isKnown = this.newest.rigid === this.world.rigidVersion && !wasHidden;
       this.absence.drawn(this.newest.time, this.world.picked, isKnown ? actors.map(({ name }) => name) : null);
       this.adviseOnce(actors, rate);
       this.newest = null;
