@@ -46,6 +46,7 @@ MISPLACED = """
   return wrong;
 })()
 """
+LONG_STATE = "document.getElementById('state').textContent = 'no news for 100 s: the client pauses, or does not answer'"
 SEEN_CUT = """
 (viewer, cut) => {
   const { world, camera } = viewer, [, mark] = viewer.shears.marks;
@@ -74,6 +75,15 @@ IS_LONG = """
 })
 """
 """Whether a hidden page would miss much more than the usual time between two pictures, by both clocks."""
+WRIST = """
+(({ wrist, headset }) => {
+  const left = headset.sources.findIndex((source) => source?.handedness === "left");
+  const place = (one) => one.getWorldPosition(headset.rig.position.clone());
+  const away = place(wrist.panel).distanceTo(place(headset.rays[left]));
+  return { visible: wrist.panel.visible, lines: wrist.lines, away };
+})(vinesim.viewer)
+"""
+"""What a person in a headset reads, whether it is seen, and how far it is from the left hand [m]."""
 CONTROLS = "[...document.querySelectorAll('button, input, select, summary')].filter((one) => one.checkVisibility())"
 
 
@@ -478,6 +488,20 @@ def test_a_headset_moves_head_and_hands(page):
                 lambda: page.run(f"vinesim.viewer.world.place({hand}).z") == pytest.approx(z + 0.2, abs=0.01),
                 "the page draws the hand where the controller is, while the client stands still",
             )
+        assert not page.run(WRIST)["visible"]
+        for intention in INTENTIONS[1:3]:
+            page.run("device.controllers.right.updateAxes('thumbstick', 0, 1), 0")
+            wait(lambda what=intention: human.intention == what, "pulling the right stick back chooses the next one")
+            page.run("device.controllers.right.updateAxes('thumbstick', 0, 0), 0")
+            is_drawn_anew(page)
+        wrist = page.run(WRIST)
+        assert wrist["visible"]
+        assert [line for line, is_chosen in wrist["lines"] if is_chosen] == [INTENTIONS[2]]
+        assert [line for line, _ in wrist["lines"][1 : len(INTENTIONS)]] == list(INTENTIONS[1:])
+        assert wrist["away"] < 0.25, "it is at the left hand [m]"
+        page.run("vinesim.viewer.shears.told.length = 0, document.getElementById('notices').replaceChildren()")
+        page.run("import('/notices.js').then(({ say }) => say('A bunch was cut.')).then(() => 0)")
+        wait(lambda: page.run(WRIST)["lines"][-1] == ["A bunch was cut.", False], "sentences are read at the wrist")
         page.run("device.primaryInputMode = 'hand', device.hands.right.position.set(0.2, 1.3, -0.5), 0")
         page.run("device.hands.right.quaternion.set(0, 0, 0, 1), 0")
         wrist = np.array([*(start[:2] + 0.5 * ahead + 0.2 * right), 1.3])
@@ -609,6 +633,7 @@ def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_pe
             page.resize(width, height)
             wait(lambda width=width: page.run("innerWidth") == width, "the page has this size")
             assert page.run(MISPLACED) == [], (width, height)
+            assert page.run(f"{LONG_STATE}, {MISPLACED}") == [], (width, height, "with a long sentence")
         controls = page.run(f"{CONTROLS}.length")
         folded = page.run("[...document.querySelectorAll('details')].filter((one) => one.checkVisibility()).length")
         assert folded == 1 + is_person, "overlays and intentions"

@@ -14,6 +14,7 @@ import { Shears } from "./shears.js";
 import { Timeline } from "./timeline.js";
 import { Voice } from "./voice.js";
 import { World } from "./world.js";
+import { Wrist } from "./wrist.js";
 
 const RETRY = 1000; // ms
 const SILENCE = 3; // s
@@ -50,7 +51,9 @@ class Viewer {
     this.rig = new THREE.Group();
     this.scene.add(this.rig);
     this.shears = new Shears(mouth, world.group);
-    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons, (side) => this.shears.toggle(side));
+    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons,
+      (side) => this.shears.toggle(side), () => this.indicate(this.wrist.after(this.intention)));
+    this.wrist = new Wrist(this.headset.wrist, world.header.intentions);
     this.offerHeadset();
     this.absence = new Absence();
     this.overlays = new Overlays(world);
@@ -88,20 +91,27 @@ class Viewer {
   /** One button for each thing that a person may indicate to do; a second click ends it. */
   offerIntentions(intentions) {
     const panel = element("intentions");
-    const summary = panel.querySelector("summary"), asks = summary.textContent;
+    this.asks = panel.querySelector("summary").textContent;
     panel.hidden = intentions.length === 0;
     for (const intention of intentions) {
       const button = panel.appendChild(document.createElement("button"));
       button.textContent = intention;
       button.setAttribute("aria-pressed", "false");
       button.addEventListener("click", () => {
-        this.intention = this.intention === intention ? "" : intention;
-        for (const other of panel.querySelectorAll("button"))
-          other.setAttribute("aria-pressed", String(other.textContent === this.intention));
-        summary.textContent = `${asks} ${this.intention}`;
+        this.indicate(this.intention === intention ? "" : intention);
         button.blur(); // keys go on to move
       });
     }
+  }
+
+  /** What the person is going to do from now on; empty: nothing. */
+  indicate(intention) {
+    if (!this.isPerson) return;
+    this.intention = intention;
+    const panel = element("intentions");
+    for (const button of panel.querySelectorAll("button"))
+      button.setAttribute("aria-pressed", String(button.textContent === intention));
+    panel.querySelector("summary").textContent = `${this.asks} ${intention}`;
   }
 
   async offerHeadset() {
@@ -214,8 +224,10 @@ class Viewer {
       const { carrier } = actors[this.followed];
       this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
     }
-    if (this.headset.isWorn) this.headset.update(frame, seconds);
-    else this.look(this.eyes.pose);
+    if (this.headset.isWorn) {
+      this.headset.update(frame, seconds);
+      this.wrist.show(this.intention, element("notices").lastElementChild?.textContent ?? "");
+    } else this.look(this.eyes.pose);
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
     const eye = new THREE.Vector3(...pose.slice(0, 3));
     page.voice.listen(pose);
