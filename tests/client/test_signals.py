@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -10,16 +11,18 @@ import pytest
 from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
 from vinesim import frames
+from vinesim.avatar.gestures import GESTURES
 from vinesim.client.client import Client
-from vinesim.client.signals import IntentionLog
+from vinesim.client.signals import GestureLog, IntentionLog
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import Intention, LightPattern, Lights
+from vinesim.scene.values import HandGestures, Intention, LightPattern, Lights
 from vinesim.scene.values.signals import UNLIT
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
@@ -101,6 +104,22 @@ def test_other_clients_see_the_lights_and_know_the_intentions():
     assert colors >= {UNLIT, (255, 0, 0)}
     with pytest.raises(ValueError, match="no intention 'fly'"):
         eva.humans["eva"].indicate("fly")
+
+
+def test_what_hands_show_is_named_and_told_when_it_changes():
+    standing = standing_pose(frames.pose(np.zeros(3)))
+    anna, bert = (dataclasses.replace(standing, right_fingers=GESTURES[name]) for name in ("point", "fist"))
+    log = GestureLog()
+    assert not log.update({})
+    assert log.update({"bert": bert, "anna": anna})
+    assert log.gestures == (HandGestures("anna", "open_hand", "point"), HandGestures("bert", "open_hand", "fist"))
+    nearly = dataclasses.replace(anna, right_fingers=(0.9, 0.1, 0.8, 1.0, 0.7))
+    assert not log.update({"anna": nearly, "bert": bert}), "fingers are never quite where they were"
+    odd = dataclasses.replace(anna, left_fingers=(0.5,) * 5)
+    assert log.update({"anna": odd, "bert": bert})
+    assert log.gestures[0] == HandGestures("anna", "", "point")
+    assert log.update({"anna": odd})
+    assert [one.person for one in log.gestures] == ["anna"]
 
 
 def test_intentions_have_a_start_and_an_end():

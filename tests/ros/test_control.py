@@ -32,7 +32,7 @@ from vinesim.robot.description.loader import load_description
 from vinesim.ros.robot_node import RobotNode
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import Intention, LightPattern, Lights
+from vinesim.scene.values import HandGestures, Intention, LightPattern, Lights
 
 GOAL = 0.4
 """Of the head's first joint [rad]."""
@@ -140,10 +140,16 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
         assert (facts[0].channels, facts[0].sample_rate, facts[0].sample_format) == (1, 16_000, "S16LE")
 
         node.publish_intentions([Intention("anna", "pick", 2.0)])
+        node.publish_gestures(2.5, [HandGestures("anna", "open_hand", "point")])
         heard: list[String] = []
+        shown: list[String] = []
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         peer.node.create_subscription(String, "/human_intention", heard.append, latched)
-        wait_until(lambda: heard, step, "the latched intention")
+        peer.node.create_subscription(String, "/human_gesture", shown.append, latched)
+        wait_until(lambda: heard and shown, step, "the latched intention and gesture")
+        assert json.loads(shown[0].data) == {
+            "time": 2.5, "people": [{"person": "anna", "left": "open_hand", "right": "point"}]
+        }  # fmt: skip
         assert json.loads(heard[0].data) == {
             "people": [{"person": "anna", "intention": "pick", "start": 2.0, "end": None}]
         }

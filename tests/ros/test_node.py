@@ -187,6 +187,7 @@ def test_every_topic_is_heard_with_its_official_type():
     ):
         robot.publish_environment_static(("pole_0",), poses[:1])
         robot.publish_intentions(())
+        robot.publish_gestures(0.0, ())
         robot.publish_lights(None)
         ticks = iter(range(10**6))
 
@@ -243,7 +244,7 @@ def test_a_second_of_every_step_waits_for_a_subscriber_and_five_pictures_or_clou
 
 
 LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static", "human_intention",
-           "audio_info", "indicator_lights/markers")  # fmt: skip
+           "human_gesture", "audio_info", "indicator_lights/markers")  # fmt: skip
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/robot_description": "std_msgs/msg/String",
@@ -251,6 +252,7 @@ TYPES = {
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/human_intention": "std_msgs/msg/String",
+    "/human_gesture": "std_msgs/msg/String",
     "/indicator_lights/markers": "visualization_msgs/msg/MarkerArray",
     "/audio": "audio_common_msgs/msg/AudioData",
     "/audio_stamped": "audio_common_msgs/msg/AudioDataStamped",

@@ -185,6 +185,11 @@ def check_intentions(message: dict[str, Any]) -> None:
     assert json.loads(message["data"]) == {"people": []}
 
 
+def check_gestures(message: dict[str, Any]) -> None:
+    assert json.loads(message["data"]).keys() == {"time", "people"}
+    assert json.loads(message["data"])["people"] == []
+
+
 def check_no_markers(message: dict[str, Any]) -> None:
     delete_all = 3  # visualization_msgs/Marker
     assert [one["action"] for one in message["markers"]] == [delete_all]
@@ -328,6 +333,7 @@ TABLE: dict[str, tuple[str, Callable[[dict[str, Any]], None]]] = {
     "/tf_environment_static": (TF, partial(check_truth, child="pole_")),
     "/mobile_base_controller/odom": ("nav_msgs/msg/Odometry", check_odometry),
     "/human_intention": ("std_msgs/msg/String", check_intentions),
+    "/human_gesture": ("std_msgs/msg/String", check_gestures),
     "/indicator_lights/markers": ("visualization_msgs/msg/MarkerArray", check_no_markers),
     "/audio": ("audio_common_msgs/msg/AudioData", check_sound),
     "/audio_stamped": ("audio_common_msgs/msg/AudioDataStamped", check_stamped_sound),
@@ -373,8 +379,8 @@ TABLE: dict[str, tuple[str, Callable[[dict[str, Any]], None]]] = {
         frame=OPTICAL, fields="x y z u v seen bunch berries berries_seen pixels amodal_pixels", least=1)),
 }  # fmt: skip
 """Type and check of every topic that a client with one vinebot publishes."""
-LATCHED = {"/robot_description", "/tf_static", "/tf_environment_static", "/human_intention", "/audio_info",
-           "/indicator_lights/markers", f"{CAMERA}/label_info"}  # fmt: skip
+LATCHED = {"/robot_description", "/tf_static", "/tf_environment_static", "/human_intention", "/human_gesture",
+           "/audio_info", "/indicator_lights/markers", f"{CAMERA}/label_info"}  # fmt: skip
 ROWS = [(topic, qos) for topic in TABLE for qos in (("latched",) if topic in LATCHED else ("default", "sensor"))]
 
 

@@ -1,13 +1,15 @@
-"""Signals by the time of the world: indicator lights of robots, alike on all clients, and what people intend."""
+"""Signals by the time of the world: indicator lights of robots, alike on all clients; what people intend, and what
+their hands show."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
 
+from vinesim.avatar.gestures import Gestures
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.robot.drives.robot_instance import RobotInstance
-from vinesim.scene.values import Intention
+from vinesim.scene.values import HandGestures, HumanPose, Intention
 
 
 def show_lights(actors: Iterable[RobotInstance | RemoteHuman], time: float) -> None:
@@ -44,3 +46,23 @@ class IntentionLog:
                 self._known[name] = dataclasses.replace(known, end=time)
             has_changed = True
         return has_changed
+
+
+class GestureLog:
+    """What the hands of all people show: the six gestures, by name."""
+
+    def __init__(self) -> None:
+        self._known = Gestures()
+        self._fingers: list[tuple[str, tuple[float, ...], tuple[float, ...]]] = []
+        self.gestures: tuple[HandGestures, ...] = ()
+        """Sorted by the person's name."""
+
+    def update(self, people: Mapping[str, HumanPose]) -> bool:
+        """Take the poses of all people by name; whether what any hand shows has changed."""
+        fingers = [(name, people[name].left_fingers, people[name].right_fingers) for name in sorted(people)]
+        if fingers == self._fingers:
+            return False
+        self._fingers, before = fingers, self.gestures
+        name_of = self._known.name_of
+        self.gestures = tuple(HandGestures(name, name_of(left), name_of(right)) for name, left, right in fingers)
+        return self.gestures != before

@@ -30,7 +30,7 @@ from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
 from vinesim.ros.publishers.robot import ODOMETRY, RobotPublisher
 from vinesim.ros.publishers.sound import SoundPublisher
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage
-from vinesim.scene.values import ComponentStatus, ControllerSpec, Intention, RobotSample
+from vinesim.scene.values import ComponentStatus, ControllerSpec, HandGestures, Intention, RobotSample
 from vinesim.scene.values.signals import Color
 
 log = logging.getLogger(__name__)
@@ -98,6 +98,7 @@ class RobotNode(Node):
         self._sound = SoundPublisher(self._advertise)
         self._send(self._sound.pending_info(), always=True)
         self._intentions = self._advertise(String, "human_intention", TRANSIENT_LOCAL)
+        self._gestures = self._advertise(String, "human_gesture", TRANSIENT_LOCAL)
         self._lights = LightsPublisher(self._advertise, self._urdf)
         self._diagnostics = self._advertise(DiagnosticArray, "/diagnostics", RELIABLE)
         self._proprioception = ProprioceptionPublisher(self._advertise, self._imus, self._wrenches)
@@ -207,6 +208,11 @@ class RobotNode(Node):
     def publish_intentions(self, intentions: Sequence[Intention]) -> None:
         """Publish what people indicate, when it changes; late subscribers receive the last message, too."""
         self._send([(self._intentions, lambda: convert.intentions(intentions))], always=True)
+
+    def publish_gestures(self, time: float, gestures: Sequence[HandGestures]) -> None:
+        """Publish what the hands of people show since a ``time`` of the world [s]; late subscribers receive the last
+        message, too."""
+        self._send([(self._gestures, lambda: convert.gestures(time, gestures))], always=True)
 
     def publish_lights(self, color: Color | None) -> None:
         """Publish what the indicator lights show, when it changes: UNLIT between flashes, None when they are off."""

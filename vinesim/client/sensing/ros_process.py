@@ -13,6 +13,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.audio import opus
+from vinesim.avatar.local_human import LocalHuman
 from vinesim.client.client import Client
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
@@ -20,7 +21,7 @@ from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, run_ros_wor
 from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
 from vinesim.client.sensing.worker_process import Run, WorkerProcess
-from vinesim.client.signals import IntentionLog
+from vinesim.client.signals import GestureLog, IntentionLog
 from vinesim.client.sound.exchange import SoundStep
 from vinesim.client.sound.microphone_step import at_place
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
@@ -65,8 +66,9 @@ class RosProcess:
         self._simulation: SimulationControl | None = None
         self._missed_truth = 0
         self._intentions = IntentionLog()
+        self._gestures = GestureLog()
         self._told_run: Run[RosChannel] | None = None
-        """The run of the process that knows :attr:`_intentions`."""
+        """The run of the process that knows :attr:`_intentions` and :attr:`_gestures`."""
         self._told_lights: tuple[Run[RosChannel], Color | None] | None = None
         """The run of the process that knows what the indicator lights show, and that."""
         poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
@@ -157,21 +159,24 @@ class RosProcess:
                 else:
                     now = physics.time + client.world_time.offset
                     self._contacts_left_out += self._records.write(record, now, sample)
-        self._tell_intentions(client)
+        self._tell_of_people(client)
         self._tell_lights()
         truth_period = float(channel.wanted["truth_period"][0])
         if truth_period and physics.tick % max(round(truth_period / physics.dt), 1) == 0:
             self._write_truth(client)
 
-    def _tell_intentions(self, client: Client) -> None:
-        """Pass what people indicate to the process when it changes; a new run is told what it does not know."""
-        people = {name: human.intention for name, human in client.humans.items()}
-        people |= {name: one.intention for name, one in client.remote_actors.items() if isinstance(one, RemoteHuman)}
+    def _tell_of_people(self, client: Client) -> None:
+        """Pass what people indicate and what their hands show to the process when it changes; a new run is told what it
+        does not know."""
+        now = client.physics.time + client.world_time.offset
+        people: dict[str, LocalHuman | RemoteHuman] = dict(client.humans)
+        people |= {name: one for name, one in client.remote_actors.items() if isinstance(one, RemoteHuman)}
         run = self.worker.current()
-        has_changed = self._intentions.update(people, client.physics.time + client.world_time.offset)
-        if has_changed or run is not self._told_run:
-            self._told_run = run
+        is_new, self._told_run = run is not self._told_run, run
+        if self._intentions.update({name: one.intention for name, one in people.items()}, now) or is_new:
             run.send("intentions", self._intentions.intentions)
+        if self._gestures.update({name: one.pose for name, one in people.items() if one.pose is not None}) or is_new:
+            run.send("gestures", (now, self._gestures.gestures))
 
     def _tell_lights(self) -> None:
         """Pass what the indicator lights show to the process when it changes, and to a new run."""

@@ -188,6 +188,8 @@ class RosWorker:
                 self._record(value)
             elif kind == "intentions":
                 self.node.publish_intentions(value)
+            elif kind == "gestures":
+                self.node.publish_gestures(*value)
             elif kind == "lights":
                 self.node.publish_lights(value)
             elif kind == "truth":

@@ -40,6 +40,7 @@ from vinesim.scene.values import (
     CameraInfo,
     ComponentStatus,
     ElasticSample,
+    HandGestures,
     Imu,
     Intention,
     JointSample,
@@ -153,6 +154,12 @@ def intentions(known: Iterable[Intention]) -> String:
     """What people indicate to do, as JSON; times are those of the world [s]."""
     people = [{"person": one.person, "intention": one.what, "start": one.start, "end": one.end} for one in known]
     return String(data=json.dumps({"people": people}))
+
+
+def gestures(time: float, shown: Iterable[HandGestures]) -> String:
+    """What the hands of people show since a ``time`` of the world [s], as JSON."""
+    people = [{"person": one.person, "left": one.left, "right": one.right} for one in shown]
+    return String(data=json.dumps({"time": time, "people": people}))
 
 
 def elastic_state(sample: ElasticSample, joint: int) -> JointState:

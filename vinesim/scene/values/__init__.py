@@ -32,7 +32,7 @@ from vinesim.scene.values.sensors import (
     LevelLaser,
     LidarScan,
 )
-from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, Intention, LightPattern, Lights
+from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, HandGestures, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
 from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
 
@@ -56,6 +56,7 @@ __all__ = [
     "Drive",
     "ElasticSample",
     "GripperState",
+    "HandGestures",
     "HandSample",
     "Haptic",
     "HumanPose",

@@ -77,3 +77,12 @@ class Intention:
     """[s] of the world"""
     end: float | None = None
     """[s] of the world; None: it goes on."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class HandGestures:
+    """What the hands of a person show (CANOPIES D6.4, section 3.4): names of finger poses, empty for any other."""
+
+    person: str
+    left: str
+    right: str

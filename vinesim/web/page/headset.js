@@ -12,6 +12,7 @@ const FORWARD = new THREE.Quaternion(-0.5, 0.5, 0.5, 0.5);
 const FINGERS = ["thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"];
 /** Angles [rad] between the first and the last bone of a finger that is bent all the way; the thumb has one joint less. */
 const FULL_BEND = [1.6, 3.8, 3.8, 3.8, 3.8];
+const CLICK = [0.3, 30]; // amplitude and ms of the pulse for a choice
 const STICK = 3; // number of the button under a stick, by the standard mapping of WebXR
 const PINCH = 0.025, CLOSED = 0.5; // m between the tips, mean bend of the fingers
 /** A palm is at the hip so far below the eyes and so far beside them [m]. GUESSED. */
@@ -20,11 +21,15 @@ const HIP = { above: 0.45, below: 0.9, beside: 0.3 };
 export class Headset {
   /**
    * `rig` carries camera and controllers: the floor that the person stands on. `poses`: finger poses of the buttons a
-   * and b; `press(side)` is called when a stick is pressed, or a hand without a controller closes at the hip.
+   * and b; `press(side)` is called when a stick is pressed, or a hand without a controller closes at the hip, `choose()`
+   * when the right stick is pulled back.
    */
-  constructor(renderer, rig, camera, poses, press) {
+  constructor(renderer, rig, camera, poses, press, choose) {
     this.poses = poses;
     this.press = press;
+    this.choose = choose;
+    this.wrist = new THREE.Group(); // goes with the left hand
+    this.pulled = false;
     this.pressed = [false, false];
     this.renderer = renderer;
     this.rig = rig;
@@ -39,7 +44,10 @@ export class Headset {
     this.closed = [false, false]; // as last seen
     this.closedAtHip = [false, false]; // and not opened since
     this.rays.forEach((ray, k) => {
-      ray.addEventListener("connected", (event) => { this.sources[k] = event.data; });
+      ray.addEventListener("connected", (event) => {
+        this.sources[k] = event.data;
+        if (event.data.handedness === "left") ray.add(this.wrist);
+      });
       ray.addEventListener("disconnected", () => { this.sources[k] = null; });
     });
   }
@@ -55,7 +63,8 @@ export class Headset {
     await this.renderer.xr.setSession(session);
   }
 
-  /** Of one XRFrame: where the head is; sticks: left walks where the head looks, right turns by 30 degrees. */
+  /** Of one XRFrame: where the head is; sticks: left walks where the head looks, right turns by 30 degrees to a side,
+   * and chooses when it is pulled back. */
   update(frame, seconds) {
     const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
     if (viewer) this.viewer.fromArray(viewer.transform.matrix);
@@ -76,6 +85,11 @@ export class Headset {
       if (source?.handedness === "right") {
         if (Math.abs(x) > 0.7 && !this.turned) this.turn(-Math.sign(x) * TURN);
         this.turned = Math.abs(x) > 0.7 || (this.turned && Math.abs(x) > DEAD);
+        if (y > 0.7 && !this.pulled) {
+          this.choose();
+          source.gamepad.hapticActuators?.[0]?.pulse(...CLICK);
+        }
+        this.pulled = y > 0.7 || (this.pulled && y > DEAD);
       }
     }
   }

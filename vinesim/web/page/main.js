@@ -6,7 +6,7 @@ import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
 import { ARM, Hand } from "./hand.js";
 import { Headset } from "./headset.js";
-import { Absence, say } from "./notices.js";
+import { Absence, isUnusual, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { LateHands } from "./late.js";
 import { Pace, WalkingEyes } from "./person.js";
@@ -14,6 +14,7 @@ import { Shears } from "./shears.js";
 import { Timeline } from "./timeline.js";
 import { Voice } from "./voice.js";
 import { World } from "./world.js";
+import { Wrist } from "./wrist.js";
 
 const RETRY = 1000; // ms
 const SILENCE = 3; // s
@@ -50,7 +51,9 @@ class Viewer {
     this.rig = new THREE.Group();
     this.scene.add(this.rig);
     this.shears = new Shears(mouth, world.group);
-    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons, (side) => this.shears.toggle(side));
+    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons,
+      (side) => this.shears.toggle(side), () => this.indicate(this.wrist.after(this.intention)));
+    this.wrist = new Wrist(this.headset.wrist, world.header.intentions);
     this.offerHeadset();
     this.absence = new Absence();
     this.overlays = new Overlays(world);
@@ -88,20 +91,27 @@ class Viewer {
   /** One button for each thing that a person may indicate to do; a second click ends it. */
   offerIntentions(intentions) {
     const panel = element("intentions");
-    const summary = panel.querySelector("summary"), asks = summary.textContent;
+    this.asks = panel.querySelector("summary").textContent;
     panel.hidden = intentions.length === 0;
     for (const intention of intentions) {
       const button = panel.appendChild(document.createElement("button"));
       button.textContent = intention;
       button.setAttribute("aria-pressed", "false");
       button.addEventListener("click", () => {
-        this.intention = this.intention === intention ? "" : intention;
-        for (const other of panel.querySelectorAll("button"))
-          other.setAttribute("aria-pressed", String(other.textContent === this.intention));
-        summary.textContent = `${asks} ${this.intention}`;
+        this.indicate(this.intention === intention ? "" : intention);
         button.blur(); // keys go on to move
       });
     }
+  }
+
+  /** What the person is going to do from now on; empty: nothing. */
+  indicate(intention) {
+    if (!this.isPerson) return;
+    this.intention = intention;
+    const panel = element("intentions");
+    for (const button of panel.querySelectorAll("button"))
+      button.setAttribute("aria-pressed", String(button.textContent === intention));
+    panel.querySelector("summary").textContent = `${this.asks} ${intention}`;
   }
 
   async offerHeadset() {
@@ -204,6 +214,7 @@ class Viewer {
     const now = performance.now(), passed = (now - this.lastFrame) / 1000;
     if (passed < this.shortest && !this.headset.isWorn) return;
     const seconds = this.isPerson ? this.pace.spend(passed) : Math.min(passed, LONGEST);
+    const wasHidden = isUnusual(passed, this.frame);
     this.lastFrame = now;
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
     const actors = this.actors();
@@ -213,8 +224,10 @@ class Viewer {
       const { carrier } = actors[this.followed];
       this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
     }
-    if (this.headset.isWorn) this.headset.update(frame, seconds);
-    else this.look(this.eyes.pose);
+    if (this.headset.isWorn) {
+      this.headset.update(frame, seconds);
+      this.wrist.show(this.intention, element("notices").lastElementChild?.textContent ?? "");
+    } else this.look(this.eyes.pose);
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
     const eye = new THREE.Vector3(...pose.slice(0, 3));
     page.voice.listen(pose);
@@ -244,7 +257,8 @@ class Viewer {
       const rate = 1 / this.frame;
       const said = `${this.world.header.scene}  ${this.newest.time.toFixed(1)} s  ${rate.toFixed(rate < 10 ? 1 : 0)} frames/s`;
       element("state").textContent = said;
-      const isKnown = this.newest.rigid === this.world.rigidVersion;
+      // the first picture after a hidden tab shows a state from when it was hidden
+      const isKnown = this.newest.rigid === this.world.rigidVersion && !wasHidden;
       this.absence.drawn(this.newest.time, this.world.picked, isKnown ? actors.map(({ name }) => name) : null);
       this.adviseOnce(actors, rate);
       this.newest = null;

@@ -2,7 +2,10 @@
 
 const SHOWN_FOR = 12_000; // ms
 const FIRST = 5; // pictures in which a browser compiles shaders, however long that takes
-const TIMES = 5; // an absence is so many times the usual time between two pictures, for slow machines
+const TIMES = 5;
+
+/** Whether a time between two pictures is much longer than the usual one: an absence, also on slow machines. */
+export function isUnusual(passed, usual) { return passed > TIMES * usual; }
 
 /** Show a sentence for a while, or until it is clicked; one that is shown already comes once more. */
 export function say(text, { stays = false } = {}) {
@@ -30,10 +33,11 @@ export class Absence {
   /** The next jump of time was asked for. */
   expect() { this.known = null; }
 
-  /** A picture was drawn at a time of the world [s]; `picked` bunches and names of `actors`, null: not known yet. */
+  /** A picture was drawn at a time of the world [s]; `picked` bunches and names of `actors`, null: not known yet, the
+   * next picture tells. */
   drawn(time, picked, actors) {
     const { known } = this, passed = known === null ? 0 : time - known.time;
-    const isAbsence = passed < 0 || (++this.pictures > FIRST && passed > Math.max(this.long, TIMES * this.usual));
+    const isAbsence = passed < 0 || (++this.pictures > FIRST && passed > this.long && isUnusual(passed, this.usual));
     if (isAbsence && this.before === null) this.before = { ...known };
     if (!isAbsence) this.usual += 0.2 * (passed - this.usual);
     if (actors === null) {
