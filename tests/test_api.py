@@ -128,7 +128,10 @@ def test_the_first_mode_is_that_of_the_beam():
     [
         ({"length": -1.0}, r"cane: length is -1.0; give a finite number above 0"),
         ({"radius": (0.01, 0.0)}, r"cane: radius\[1\] is 0.0; give a finite number above 0"),
+        ({"radius": "thin"}, r"cane: radius\[0\] is thin; give a finite number above 0"),
+        ({"length": None}, r"cane: length is None; give a finite number above 0"),
         ({"tip_mass": float("nan")}, r"cane: tip_mass is nan; give a finite number of 0 or more"),
+        ({"beta": "1"}, r"cane: beta is 1; give a finite number of 0 or more"),
         ({"segments": 0}, r"cane: segments is 0; give a whole number, 1 or more"),
         ({"segments": 2.5}, r"cane: segments is 2.5; give a whole number, 1 or more"),
         ({"damping_ratio": 0.1, "beta": 0.01}, r"damping_ratio 0.1 and beta 0.01 are given; give one"),
@@ -143,6 +146,13 @@ def test_an_invalid_cane_is_refused_in_one_line(field, message):
     with pytest.raises(ValueError, match=message) as error:
         vinesim.cane(**field)
     assert "\n" not in str(error.value)
+
+
+def test_numbers_of_numpy_build_the_same_cane():
+    plain = vinesim.cane(length=1, radius=0.25, tip_mass=2, segments=4)
+    same = vinesim.cane(length=np.int64(1), radius=np.float32(0.25), tip_mass=np.float32(2.0), segments=np.int64(4))
+    assert plain.digest() == same.digest()
+    assert vinesim.cane(radius=np.array([0.5, 0.25])).digest() == vinesim.cane(radius=(0.5, 0.25)).digest()
 
 
 def test_a_drawn_bend_is_the_unloaded_shape():
@@ -384,6 +394,39 @@ def test_the_vineyard_of_a_client_in_a_cell_of_a_notebook():
 
 
 # ---------------------------------------------------------------- robots
+
+
+@pytest.mark.parametrize("by_itself", [False, True])
+def test_a_world_goes_on_without_a_robot_that_was_removed(by_itself):
+    simulation = vinesim.Simulation([])
+    first, second = simulation.add_robot("vinebot", (0.0, 0.0, 0.0)), simulation.add_robot("vinebot", (0.0, 3.0, 0.0))
+    simulation.push_robot(first.name, "arm_left_7_link", (1.0, 0.0, 0.0))
+    if by_itself:
+        first.remove()
+    else:
+        simulation.remove_robot(first.name)
+    simulation.step(2)
+    assert list(simulation.robots) == [second.name]
+    third = simulation.add_robot("vinebot", (0.0, 0.0, 0.0))  # its name is no former one's
+    simulation.step()
+    assert list(simulation.robots) == ["robot_1", "robot_2"] == [second.name, third.name]
+    with pytest.raises(UsageError, match="no robot 'robot_0'; there are: robot_1, robot_2"):
+        simulation.remove_robot(first.name)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda one: one.apply_wrench(0, "abc"), r"force is abc; give three finite numbers \[N\]"),
+        (lambda one: one.apply_wrench(0, [1.0, [2.0], 3.0]), r"force is .*; give three finite numbers \[N\]"),
+        (lambda one: one.add_robot("vinebot", pose="here"), r"pose is here; give \(x, y, yaw\)"),
+        (lambda _: vinesim.Simulation([], parameters={"dt": 0.01}), "parameters is a dict; give PhysicsParameters"),
+    ],
+)
+def test_what_is_no_number_is_refused_in_one_line(call, message):
+    with pytest.raises(UsageError, match=message) as error:
+        call(vinesim.Simulation(vinesim.CaneBuilder()))
+    assert "\n" not in str(error.value)
 
 
 def test_a_push_on_a_robot_acts_in_one_call_of_step_and_is_felt_in_its_joints():

@@ -79,6 +79,8 @@ class Simulation:
         if isinstance(source, Scene):
             self.scene = source
         model = _model_of(source)
+        if parameters is not None and not isinstance(parameters, PhysicsParameters):
+            raise UsageError(f"parameters is a {type(parameters).__name__}; give PhysicsParameters, or none")
         chosen = parameters or (self.scene.physics if self.scene else PhysicsParameters())
         changes = {name: value for name, value in (("dt", dt), ("sleep", sleep)) if value is not None}
         self.parameters: PhysicsParameters = msgspec.structs.replace(chosen, **changes)
@@ -89,6 +91,7 @@ class Simulation:
         """The solver below, for what this class does not offer."""
         self.robots: dict[str, Robot] = {}
         """Robots by name; their commands take effect in the next step."""
+        self._robots_added = 0
         if self.scene is not None:
             self.physics.wind = wind_of(self.scene)
         self._loads: dict[int, np.ndarray] = {}
@@ -105,6 +108,8 @@ class Simulation:
         if not isinstance(count, int | np.integer) or count < 0:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
         self._detachments = []
+        for name in self.robots.keys() - set(self.physics.rigid.robots):  # one that was told to remove itself
+            self._forget_robot(name)
         for _ in range(count):
             for robot in self.robots.values():
                 robot.control(self.physics.time)
@@ -279,13 +284,25 @@ class Simulation:
             name: unique name of this robot; ``robot_0``, ``robot_1``, ... unless given.
         """
         described = load_description(robot)
-        index = len(self.robots)
+        index = self._robots_added
         name = name or f"robot_{index}"
-        if name in self.robots:
+        if name in self.physics.rigid.robots:
             raise UsageError(f"robot {name!r} exists already; give another name")
         self.robots[name] = added = Robot(self.physics.rigid, described, name, index, base_pose(pose))
+        self._robots_added += 1
         added.fit_cutters(self.physics)
         return added
+
+    def remove_robot(self, name: str) -> None:
+        """Remove a robot and its cutters; what it held falls."""
+        if name not in self.robots:
+            raise UsageError(f"no robot {name!r}; there are: {', '.join(self.robots) or 'none'}")
+        self.robots[name].remove()
+        self._forget_robot(name)
+
+    def _forget_robot(self, name: str) -> None:
+        del self.robots[name]
+        self._pushed = {(robot, link) for robot, link in self._pushed if robot != name}
 
     # ------------------------------------------------------------------ sensors
 
@@ -312,9 +329,10 @@ class Simulation:
 
 def base_pose(pose: Sequence[float] | np.ndarray) -> np.ndarray:
     """Pose [7] of a robot's base from (x, y, yaw) in m and rad, or from a pose [7]; :class:`UsageError` otherwise."""
-    given = np.asarray(pose, float)
+    given = _numbers(pose)
     if given.shape not in ((3,), (7,)) or not np.isfinite(given).all():
-        raise UsageError(f"pose is {given.tolist()}; give (x, y, yaw) in m and rad, or position and quaternion [7]")
+        shown = given.tolist() if given.ndim else pose
+        raise UsageError(f"pose is {shown}; give (x, y, yaw) in m and rad, or position and quaternion [7]")
     if len(given) == 7:
         return frames.checked_pose("pose", given, UsageError)
     return frames.pose(np.array([given[0], given[1], 0.0]), frames.from_yaw(given[2]))
@@ -335,7 +353,15 @@ def _model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneB
 
 def _vector(name: str, value: Sequence[float] | np.ndarray, unit: str) -> np.ndarray:
     """Three finite numbers as an array; :class:`UsageError` otherwise."""
-    vector = np.asarray(value, float)
+    vector = _numbers(value)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise UsageError(f"{name} is {value}; give three finite numbers [{unit}]")
     return vector
+
+
+def _numbers(value: Sequence[float] | np.ndarray) -> np.ndarray:
+    """An array of what was given; of one NaN if it is not an array of numbers."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        return np.array(np.nan)

@@ -78,10 +78,8 @@ class CaneBuilder:
 
     @property
     def _radii(self) -> tuple[float, float]:
-        if isinstance(self.radius, (int, float)):
-            return float(self.radius), float(self.radius)
-        base, tip = self.radius
-        return float(base), float(tip)
+        base, tip = np.broadcast_to(np.asarray(self.radius, float), 2).tolist()
+        return base, tip
 
     def first_mode(self) -> float:
         """Angular frequency [rad/s] of the first bending mode of the straight cane, clamped, without gravity.
@@ -128,12 +126,13 @@ class CaneBuilder:
         if np.shape(self.radius) not in ((), (2,)):
             raise ValueError(f"cane: radius is {self.radius}; give one number, or two for base and tip")
         numbers = {"length": self.length, "youngs_modulus": self.youngs_modulus, "density": self.density}
-        numbers |= {f"radius[{i}]": value for i, value in enumerate(self._radii)}
+        radii = np.broadcast_to(np.asarray(self.radius, object), 2)
+        numbers |= {f"radius[{i}]": value for i, value in enumerate(radii.tolist())}
         for name, value in numbers.items():
-            if not (np.isfinite(value) and value > 0.0):
+            if not (_is_finite(value) and value > 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number above 0")
         for name, value in {"tip_mass": self.tip_mass, "damping_ratio": self.damping_ratio, "beta": self.beta}.items():
-            if value is not None and not (np.isfinite(value) and value >= 0.0):
+            if value is not None and not (_is_finite(value) and value >= 0.0):
                 raise ValueError(f"cane: {name} is {value}; give a finite number of 0 or more")
         if not isinstance(self.segments, int | np.integer) or self.segments < 1:
             raise ValueError(f"cane: segments is {self.segments}; give a whole number, 1 or more")
@@ -150,6 +149,10 @@ class CaneBuilder:
         frames.checked_pose("cane: pose", self.pose)
         if self.bends is not None and np.shape(self.bends) != (self.segments, 3):
             raise ValueError(f"cane: bends has the shape {np.shape(self.bends)}; give [{self.segments}, 3]")
+
+
+def _is_finite(value: object) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and bool(np.isfinite(value))
 
 
 def _add_point_mass(body: dict, mass: float) -> None:

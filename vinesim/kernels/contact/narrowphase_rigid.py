@@ -1,7 +1,8 @@
 """Narrowphase of plants and rigid geoms: where a tree's capsules touch them, or may touch them before the step ends.
 
 Two shapes that overlap while all plants rest as generated, or are that near, are in contact only from there on. What was
-cut off may overlap less by as much as it has moved since: what grew about a wire does not fall through it.
+cut off may overlap less by as much as it has moved since: what grew about a wire does not fall through it. A bunch
+that overlaps a tree when it is picked passes through that tree until it is clear of it.
 """
 
 import warp as wp
@@ -36,6 +37,7 @@ from vinesim.kernels.contact.structs import (
     GeomStates,
     Hulls,
     Parameters,
+    PassingBunches,
     PlantBodies,
     RigidBodies,
     Trees,
@@ -361,6 +363,49 @@ def add_pair(
     return count, is_impact
 
 
+@wp.func
+def overlaps_bunch(
+    row: int,
+    tree: int,
+    bunch: int,
+    near_count: int,
+    capsules: Capsules,
+    geoms: Geoms,
+    trees: Trees,
+    capsule_states: CapsuleStates,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    near_geoms: wp.array2d(dtype=wp.int32),
+    bunch_of_geom: wp.array(dtype=wp.int32),
+):
+    """Whether a capsule of a tree overlaps a free bunch; ``near_geoms`` [row, near_count]: those to be looked at."""
+    overlaps = bool(False)
+    for k in range(near_count):
+        g = near_geoms[row, k]
+        if bunch_of_geom[g] == bunch:
+            for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
+                if not overlaps and is_collidable(
+                    capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached
+                ):
+                    nearest = segment_geom_distance(
+                        False, geoms, hulls, g, rigid.xmat[geoms.id[g]], geom_states.center[g],
+                        to_double(capsule_states.start[s]), to_double(capsule_states.end[s]), FAR,
+                    )  # fmt: skip
+                    overlaps = nearest[3] < wp.float64(capsules.radius[s])
+    return overlaps
+
+
+@wp.func
+def is_passing(tree: int, bunch: int, by_tree: wp.array2d(dtype=wp.int32)):
+    """Whether a free bunch (-1: no bunch) passes through a tree."""
+    passing = bool(False)
+    if bunch >= 0:
+        for k in range(by_tree.shape[1]):
+            passing = passing or by_tree[tree, k] == bunch
+    return passing
+
+
 @wp.kernel
 def find_rigid_contacts(
     # model
@@ -379,11 +424,13 @@ def find_rigid_contacts(
     geom_states: GeomStates,
     static_blocks: Aabbs,
     # out
+    passing_out: PassingBunches,
     candidates_out: Candidates,
 ):
     """One thread per awake tree: its contacts with rigid geoms, in the order of (capsule, geom, end).
 
-    Thread i takes the tree ``trees.awake[order[i]]`` and writes the row ``order[i]`` of the candidates.
+    Thread i takes the tree ``trees.awake[order[i]]`` and writes the row ``order[i]`` of the candidates. Bunches that
+    passed through the tree and are clear of it now do so no longer.
     """
     row = order[wp.tid()]
     tree = trees.awake[row]
@@ -394,6 +441,13 @@ def find_rigid_contacts(
     room = wp.min(geoms.count[0] + max_static_geoms, candidates_out.near_geoms.shape[1])
     candidates_out.skipped_geoms[row] = wp.max(near_count - room, 0)
     near_count = wp.min(near_count, room)
+    for k in range(passing_out.by_tree.shape[1]):
+        bunch = passing_out.by_tree[tree, k]
+        if bunch >= 0 and not overlaps_bunch(
+            row, tree, bunch, near_count, capsules, geoms, trees, capsule_states, rigid, hulls, geom_states,
+            candidates_out.near_geoms, passing_out.of_geom,
+        ):  # fmt: skip
+            passing_out.by_tree[tree, k] = -1
     is_impact = bool(False)
     count = int(0)
     last = capsules.tree_start[tree + wp.where(near_count > 0, 1, 0)]
@@ -403,7 +457,9 @@ def find_rigid_contacts(
             high = capsule_states.high[s]
             for k in range(near_count):
                 g = candidates_out.near_geoms[row, k]
-                if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):  # a call copies all structs
+                if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]) and not is_passing(
+                    tree, passing_out.of_geom[g], passing_out.by_tree
+                ):  # before the call, which copies all structs
                     count, hits = add_pair(
                         False, row, count, s, g, parameters, capsules, geoms, bodies, capsule_states, rigid, hulls, geom_states,
                         candidates_out,

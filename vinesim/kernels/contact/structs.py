@@ -196,6 +196,16 @@ class Geoms:
 
 
 @wp.struct
+class PassingBunches:
+    """Free bunches that touch nothing of some trees: they overlapped these when they were picked, and still do."""
+
+    by_tree: wp.array2d(dtype=wp.int32)
+    """[tree, k] number of a bunch, -1 for an empty place."""
+    of_geom: wp.array(dtype=wp.int32)
+    """[geom] bunch that it belongs to, -1 for none."""
+
+
+@wp.struct
 class Hulls:
     """Convex hulls of meshes, each in the frame of its geoms, about their centre."""
 

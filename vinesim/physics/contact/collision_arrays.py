@@ -144,6 +144,8 @@ class RigidArrays:
         self.capacity, self.static = world.ngeom, len(rigid.static_geoms.id)
         self.geoms = SharedArrays.zeros(structs.Geoms, self.capacity, count=np.zeros(2, np.int32))
         self.geom_states = SharedArrays.zeros(structs.GeomStates, self.capacity)
+        self.bunch_of_geom = np.full(self.capacity, -1, np.int32)
+        """[geom] the free bunch that it belongs to, -1 for none."""
         self.actors = SharedArrays.zeros(
             structs.Actors, self.capacity, start=np.zeros(self.capacity + 1, np.int32), count=np.zeros(1, np.int32)
         )
@@ -197,6 +199,7 @@ class RigidArrays:
         actor = listed.actor
         is_remote = self.geoms.is_remote
         is_remote[:count] = [name in remote_actors for name in actor]
+        self.bunch_of_geom[:count] = [int(name[6:]) if name.startswith("bunch/") else -1 for name in actor]
         self.geoms.count[:] = movable, count
         first = [i for i in range(movable) if i == 0 or actor[i] != actor[i - 1]]
         self.actor_count = self.actors.count[0] = len(first)

@@ -32,6 +32,8 @@ from vinesim.physics.plants.articulation_solver import ArticulationSolver
 AABB_BLOCK = int(structs.AABB_BLOCK)
 MIN_TREES_PER_THREAD = 16
 """With fewer awake trees for each thread, handing them over costs more than it saves. TUNED."""
+MAX_PASSING_BUNCHES = 4
+"""Picked bunches that can pass through one tree at once; a further one touches it at once."""
 MIN_TREE_ROOM = 64
 """Rows of the candidates that are allocated at least; more when more trees are awake."""
 
@@ -55,6 +57,7 @@ class ContactDetection:
         self._sorted_rows = np.zeros((2, trees), np.int32)
         self._is_near, self._is_reached = np.zeros(trees, np.bool_), np.zeros(trees, np.bool_)
         self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
+        self._passing = np.full((trees, MAX_PASSING_BUNCHES), -1, np.int32)
         self.counters = np.zeros(structs.COUNTERS, np.int32)
         """See :mod:`vinesim.kernels.contact.structs`."""
         self.tree_boxes = SharedArrays.zeros(structs.Aabbs, trees)
@@ -72,6 +75,9 @@ class ContactDetection:
         self.rigid_arrays, self._static_bounded = rigid_arrays, False
         self._static_blocks = SharedArrays.zeros(structs.Aabbs, -(-rigid_arrays.static // AABB_BLOCK))
         self._actor_boxes = SharedArrays.zeros(structs.Aabbs, len(rigid_arrays.actors.is_remote))
+        self._passing_bunches = SharedArrays(
+            structs.PassingBunches, by_tree=self._passing, of_geom=rigid_arrays.bunch_of_geom
+        )
         self._allocate_candidates(max(self._room, MIN_TREE_ROOM))
 
     def update_rigid_geoms(self) -> None:
@@ -130,6 +136,14 @@ class ContactDetection:
         self._static_bounded = True
 
     # ------------------------------------------------------------------ narrowphase
+
+    def let_pass(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
+        """Let a bunch that was picked within the box ``low`` [3] to ``high`` [3] m pass through the trees that it
+        overlaps, until it is clear of them: as it hung there, that overlap was no contact."""
+        near = np.flatnonzero(((self.tree_boxes.low <= high) & (low <= self.tree_boxes.high)).all(1))
+        room = self._passing[near] < 0
+        near, room = near[room.any(1)], room[room.any(1)]
+        self._passing[near, room.argmax(1)] = bunch
 
     def list_awake(self, awake: np.ndarray) -> None:
         """Take the awake trees [k] and bring their boxes up to their predicted motion."""
@@ -217,7 +231,7 @@ class ContactDetection:
             narrowphase_rigid.find_rigid_contacts,
             [parameters, self.parameters.max_static_geoms_per_tree, capsules, geoms, order, trees, tree_boxes, bodies,
              capsule_states, rigid.bodies.struct, rigid.hulls.struct, geom_states, self._static_blocks.struct],
-            [candidates],
+            [self._passing_bunches.struct, candidates],
             **by_tree,
         )  # fmt: skip
         sorted_rows, scratch = (share(rows, wp.int32) for rows in self._sorted_rows)

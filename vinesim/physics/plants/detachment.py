@@ -237,6 +237,8 @@ class DetachmentMonitor:
             start=start, end=end, radius=shapes.radius[of].astype(float),
         )  # fmt: skip
         self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], velocity)
+        self.rigid.let_pass(bunch)
+        self.contact_solver.let_pass(bunch, *_box_around(loose, plants.state.body_q[body].astype(float)))
         plants.state.bunch_attached[bunch] = False
         self._overloaded_steps[bunch] = 0
         plants.set_mass(body, STUB_MASS)
@@ -293,3 +295,9 @@ class DetachmentMonitor:
             if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
                 pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
         return max(sorted(pushes), key=lambda actor: pushes[actor], default="")
+
+
+def _box_around(bunch: FreeBunch, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner [3] m of the box, in the world's axes, around a bunch at ``pose`` [7]."""
+    ends = pose[:3] + frames.rotate(pose[3:], np.stack([bunch.start, bunch.end]))
+    return (ends - bunch.radius[:, None]).min((0, 1)), (ends + bunch.radius[:, None]).max((0, 1))

@@ -22,6 +22,8 @@ MAX_GEOMS = 12
 """Shapes that a body of the pool has room for."""
 PARKING_HEIGHT = -100.0
 """[m] Height of unused bodies of the pool: below the ground, where nothing is."""
+CONAFFINITY = ALL_BITS & ~CRATE_FLOOR
+"""Collision bits of what the shapes of a free bunch touch."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2]
 """MuJoCo's constraint impedance. TUNED: with still harder contacts a bunch is held a few micrometres deep, and a hand
 that moves loses contact for a step: fingers that hold with 25 N are then 3 mm further, and the bunch falls."""
@@ -86,7 +88,7 @@ def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
     for _ in range(MAX_GEOMS):
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0.05, 0.0, 0.0], mass=0.0, contype=FREE_BUNCH,
-            conaffinity=ALL_BITS & ~CRATE_FLOOR, userdata=geom_user(Material.BERRY),
+            conaffinity=CONAFFINITY, userdata=geom_user(Material.BERRY),
         )  # fmt: skip  # with collision bits, or MuJoCo makes no bounding volumes
 
 
@@ -118,13 +120,13 @@ def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsPar
         if (start != end).any():
             kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
         body.add_geom(
-            type=kind, size=[float(radius), 0, 0], mass=0.0, contype=FREE_BUNCH, conaffinity=ALL_BITS & ~CRATE_FLOOR,
+            type=kind, size=[float(radius), 0, 0], mass=0.0, contype=FREE_BUNCH, conaffinity=CONAFFINITY,
             condim=6, friction=friction, priority=1, solref=softness, solimp=_SOLIMP, **place,
         )  # fmt: skip
     for _ in range(MAX_GEOMS - len(bunch.radius)):
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=bunch.start[0], mass=0.0, contype=FREE_BUNCH,
-            conaffinity=ALL_BITS & ~CRATE_FLOOR,
+            conaffinity=CONAFFINITY,
         )  # fmt: skip
 
 

@@ -73,6 +73,8 @@ class WorldCore:
         self._free_bunches: dict[int, FreeBunch] = {}
         self._bunch_slot: dict[int, int] = {}
         """By free bunch: the number of its body in the pool."""
+        self._passing_bunches: set[int] = set()
+        """Free bunches that touch no fixed piece: they overlapped one when they were picked, and still do."""
         self._derived: weakref.WeakKeyDictionary[FreeBunch, mujoco.MjModel] = weakref.WeakKeyDictionary()
         """Constants that MuJoCo derives from the mass and shapes of each free bunch."""
         self._pool_size = 0

@@ -172,8 +172,10 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         for human in self._humans.values():
             human.apply_controls(m, d, self.dt)
         self._valid_qpos[:] = d.qpos
+        self._set_passing(self._passing_bunches, True)
         # qfrc_applied is still that of the last step: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
+        self._end_passing()
         self._pair_friction.apply(m, d)
         d.qfrc_applied[:] = 0.0
         # the whole forward pass after the velocity stage: single calls of its parts leave out dt K v

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from vinesim import frames
@@ -11,6 +13,7 @@ from vinesim.physics.rigid import free_bunch
 from vinesim.physics.rigid.free_bunch import FreeBunch
 from vinesim.physics.rigid.mujoco_sleep import wake_body
 from vinesim.physics.rigid.mujoco_world import WorldCore
+from vinesim.physics.rigid.static_world import FIRST_FIXED_GEOM, FIXED
 
 
 class BunchAccess(WorldCore):
@@ -55,7 +58,46 @@ class BunchAccess(WorldCore):
     def remove_bunch(self, bunch: int) -> None:
         """Remove a free bunch; the world is compiled anew."""
         del self._free_bunches[bunch], self._bunch_slot[bunch]
+        self._passing_bunches.discard(bunch)
         self._recompile()
+
+    def let_pass(self, bunch: int) -> None:
+        """Let a bunch that has just been picked pass through the fixed pieces (wood, wires, poles) if it overlaps one,
+        until it is clear of them: as it hung there, that overlap was no contact."""
+        self.update_kinematics()
+        self._passing_bunches.add(bunch)
+        self._end_passing()
+
+    def _end_passing(self) -> None:
+        """Let passing bunches that are clear of all fixed pieces touch these again; MuJoCo's poses must be current."""
+        clear = {bunch for bunch in self._passing_bunches if not self._overlaps_fixed_piece(bunch)}
+        self._passing_bunches -= clear
+        self._set_passing(clear, False)
+
+    def _set_passing(self, bunches: set[int], passing: bool) -> None:
+        """Let free bunches touch fixed pieces or not."""
+        m = self.mj_model
+        bits = free_bunch.CONAFFINITY & ~FIXED if passing else free_bunch.CONAFFINITY
+        for bunch in bunches:
+            m.body_conaffinity[self._body_of_object(f"bunch/{bunch}", "bunch")] = bits
+            m.geom_conaffinity[self._geoms_of_bunch(bunch)] = bits
+
+    def _overlaps_fixed_piece(self, bunch: int) -> bool:
+        m, d = self.mj_model, self.mj_data
+        geoms = self._geoms_of_bunch(bunch)
+        low = (d.geom_xpos[geoms] - m.geom_rbound[geoms, None]).min(0)
+        high = (d.geom_xpos[geoms] + m.geom_rbound[geoms, None]).max(0)
+        start, end = self.model.fixed_start, self.model.fixed_end
+        radius = self.model.fixed_radius.mean(1)[:, None]
+        near = (np.minimum(start, end) - radius < high) & (low < np.maximum(start, end) + radius)
+        pieces = np.flatnonzero(near.all(1)) + FIRST_FIXED_GEOM
+        pairs = itertools.product(geoms, pieces.tolist())
+        return any(mujoco.mj_geomDistance(m, d, geom, piece, 0.0, None) < 0.0 for geom, piece in pairs)
+
+    def _geoms_of_bunch(self, bunch: int) -> range:
+        """MuJoCo's numbers of the shapes of a free bunch."""
+        first = int(self.mj_model.body_geomadr[self._body_of_object(f"bunch/{bunch}", "bunch")])
+        return range(first, first + len(self._free_bunches[bunch].radius))
 
     def bunch_pose(self, bunch: int) -> np.ndarray:
         """World pose [7] of a free bunch."""
