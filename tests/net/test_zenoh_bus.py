@@ -255,7 +255,7 @@ def test_an_open_session_does_not_block_exit(server):
         "from vinesim.net.transport.zenoh_bus import ZenohBus\n"
         f"bus = ZenohBus('ada', connect={server.endpoint!r})\nprint('in')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
     assert (done.returncode, done.stdout) == (0, "in\n"), done.stderr
 
 

@@ -120,7 +120,7 @@ def test_only_nodes_with_pictures_use_shared_memory(reach):
 
     def segments(kind: str) -> list[int]:
         command = [sys.executable, "-c", NODE, kind]
-        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True, timeout=60.0)
+        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True, timeout=300.0)
         return json.loads(done.stdout)
 
     assert segments("small") == []
