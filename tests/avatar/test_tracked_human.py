@@ -56,6 +56,19 @@ def test_a_hand_without_a_controller_hangs_beside_the_person_wherever_it_walks(h
     np.testing.assert_allclose(pose.root[:3], [*pose.hips[:2], 0.0])
 
 
+def test_who_is_put_elsewhere_stands_there_at_once(human):
+    """No point of the body is seen, or pushes, on the way; a step later it stands as before."""
+    before = human.pose.points[1:]
+    for _ in range(3):
+        human.take(TrackedPoints(human.pose.head))
+        human(0.0)
+    head = human.pose.head + np.array([3.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    human.take(TrackedPoints(head))
+    for _ in range(60):
+        points = human(0.0).points[1:]
+        np.testing.assert_allclose(points[:, :3] - before[:, :3], np.tile([3.0, 1.0, 0.0], (6, 1)), atol=1e-9)
+
+
 def test_closing_a_hand_and_bending_fingers_pass_through(human):
     human.take(TrackedPoints(human.pose.head, None, human.pose.right, (False, True), (OPEN_HAND, FIST)))
     pose = human(0.0)

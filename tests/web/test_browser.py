@@ -522,6 +522,22 @@ def test_a_headset_moves_head_and_hands(page):
         page.run("device.controllers.left.updateAxes('thumbstick', 0, 0), 0")
         page.run("device.controllers.right.updateAxes('thumbstick', 1, 0), 0")
         wait(lambda: frames.to_yaw(human.pose.head[3:]) < 0.0, "the stick turns to the right")
+        page.run("device.controllers.right.updateAxes('thumbstick', 0, 0), 0")
+        page.run("device.controllers.right.quaternion.set(-Math.sin(0.4), 0, 0, Math.cos(0.4)), 0")  # down by 0.8 rad
+        page.run("device.controllers.right.updateAxes('thumbstick', 0, -1), 0")
+        mark = "(({ mark }) => [mark.visible, mark.position.x, -mark.position.z])(vinesim.viewer.headset)"
+        wait(lambda: page.run(mark)[0], "the stick pushed ahead marks a place on the floor")
+        is_drawn_anew(page)
+        place, head = np.array(page.run(mark)[1:]), human.pose.head.copy()
+        yaw = frames.to_yaw(head[3:])
+        gone = 0.4 + 1.2 / np.tan(0.8)  # the controller is 0.4 m ahead of the head, 1.2 m above the floor
+        expected = head[:2] + gone * np.array([np.cos(yaw), np.sin(yaw)])
+        assert np.linalg.norm(place - expected) < 0.35, "where the controller points"
+        page.run("device.controllers.right.updateAxes('thumbstick', 0, 0), 0")
+        wait(lambda: np.linalg.norm(human.pose.head[:2] - place) < 5e-3, "letting go jumps there")
+        feet = np.stack([human.pose.left_foot, human.pose.right_foot])[:, :2]
+        assert np.linalg.norm(feet.mean(0) - place) < 0.2, "with both feet"
+        assert not page.run(mark)[0]
         assert page.run("vinesim.calls") <= 2 * MAX_CALLS
         assert page.errors == []
 

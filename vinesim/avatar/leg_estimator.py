@@ -33,6 +33,12 @@ class LegEstimator:
         """[foot] Phase of its step, 0 to 1."""
         self._head = np.asarray(pose.head[:3], float).copy()
 
+    def stand(self, head: np.ndarray) -> None:
+        """Both feet under a head at ``head`` [7], wherever they were: the person was put there."""
+        self._feet = frames.compose(_upright(head), self._below_head)[1:]
+        self._swing = [1.0, 1.0]
+        self._head = np.asarray(head[:3], float).copy()
+
     def update(self, head: np.ndarray) -> np.ndarray:
         """Hips and both feet [3, 7] a time ``dt`` later, with the head at ``head`` [7]."""
         there = frames.compose(_upright(head), self._below_head)

@@ -16,6 +16,9 @@ from vinesim.scene.values import HumanPose
 
 MAX_PERIOD = 0.1
 """Inputs that are further apart are not interpolated over the whole time between them [s]. GUESSED."""
+MAX_MOTION = 0.5
+"""A head that moves further than this [m] between two inputs was put elsewhere, as physics takes it
+(``PhysicsParameters.teleport_distance``): nothing moves there on the way."""
 _SMOOTHING = 0.2
 """Weight of the newest interval in the mean time between inputs [1]."""
 
@@ -107,6 +110,9 @@ class TrackedHuman:
         hanging = frames.compose(upright, self._below_head)
         left, right = (hanging[k] if hand is None else hand for k, hand in enumerate((points.left, points.right)))
         self._goal, self._share = np.stack([points.head, left, right]).astype(float), 0.0
+        if np.linalg.norm(self._goal[0, :3] - self._start[0, :3]) > MAX_MOTION:
+            self._start = self._goal
+            self._legs.stand(self._goal[0])
 
 
 def _between(start: np.ndarray, goal: np.ndarray, share: float) -> np.ndarray:

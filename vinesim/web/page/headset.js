@@ -12,6 +12,7 @@ const FORWARD = new THREE.Quaternion(-0.5, 0.5, 0.5, 0.5);
 const FINGERS = ["thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"];
 /** Angles [rad] between the first and the last bone of a finger that is bent all the way; the thumb has one joint less. */
 const FULL_BEND = [1.6, 3.8, 3.8, 3.8, 3.8];
+const AIM = 0.7, FARTHEST = 8, FLATTEST = 0.1; // share of a stick's way; m; how steep a ray to the floor is at least
 const CLICK = [0.3, 30]; // amplitude and ms of the pulse for a choice
 const STICK = 3; // number of the button under a stick, by the standard mapping of WebXR
 const PINCH = 0.025, CLOSED = 0.5; // m between the tips, mean bend of the fingers
@@ -30,12 +31,16 @@ export class Headset {
     this.choose = choose;
     this.wrist = new THREE.Group(); // goes with the left hand
     this.pulled = false;
+    this.mark = new THREE.Mesh(new THREE.RingGeometry(0.18, 0.22, 32).rotateX(-Math.PI / 2), // where a jump leads
+      new THREE.MeshBasicMaterial({ color: 0x30c060, depthTest: false, transparent: true, toneMapped: false }));
+    this.mark.visible = false;
     this.pressed = [false, false];
     this.renderer = renderer;
     this.rig = rig;
     this.turned = false;
     this.viewer = new THREE.Matrix4(); // between the eyes, on the rig
     renderer.xr.enabled = true;
+    renderer.xr.addEventListener("sessionend", () => { this.mark.visible = false; });
     renderer.xr.setReferenceSpaceType("local-floor");
     rig.add(camera);
     this.rays = [0, 1].map((k) => rig.add(renderer.xr.getController(k)) && renderer.xr.getController(k));
@@ -63,8 +68,10 @@ export class Headset {
     await this.renderer.xr.setSession(session);
   }
 
-  /** Of one XRFrame: where the head is; sticks: left walks where the head looks, right turns by 30 degrees to a side,
-   * and chooses when it is pulled back. */
+  /**
+   * Of one XRFrame: where the head is; sticks: left walks where the head looks, right turns by 30 degrees to a side,
+   * chooses when it is pulled back, and pushed ahead marks a place on the floor, to which letting go of it jumps.
+   */
   update(frame, seconds) {
     const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
     if (viewer) this.viewer.fromArray(viewer.transform.matrix);
@@ -75,7 +82,7 @@ export class Headset {
       if (pressed && !this.pressed[k]) this.press(source.handedness);
       this.pressed[k] = pressed;
     });
-    for (const source of this.sources) {
+    this.sources.forEach((source, k) => {
       const [x, y] = source?.gamepad?.axes?.slice(-2) ?? [0, 0];
       if (source?.handedness === "left" && Math.hypot(x, y) > DEAD) {
         const [c, s] = this.heading();
@@ -83,15 +90,33 @@ export class Headset {
         this.rig.position.z -= WALK * seconds * (-y * s - x * c);
       }
       if (source?.handedness === "right") {
-        if (Math.abs(x) > 0.7 && !this.turned) this.turn(-Math.sign(x) * TURN);
-        this.turned = Math.abs(x) > 0.7 || (this.turned && Math.abs(x) > DEAD);
-        if (y > 0.7 && !this.pulled) {
+        if (y < -AIM || (this.mark.visible && y < -DEAD)) this.aim(this.rays[k]);
+        else if (this.mark.visible) this.jump();
+        if (Math.abs(x) > AIM && !this.turned) this.turn(-Math.sign(x) * TURN);
+        this.turned = Math.abs(x) > AIM || (this.turned && Math.abs(x) > DEAD);
+        if (y > AIM && !this.pulled) {
           this.choose();
           source.gamepad.hapticActuators?.[0]?.pulse(...CLICK);
         }
-        this.pulled = y > 0.7 || (this.pulled && y > DEAD);
+        this.pulled = y > AIM || (this.pulled && y > DEAD);
       }
-    }
+    });
+  }
+
+  /** Mark where the `ray` of a controller meets the floor, if that is near enough to jump there. */
+  aim(ray) {
+    const from = new THREE.Vector3().setFromMatrixPosition(ray.matrixWorld);
+    const way = new THREE.Vector3(0, 0, -1).transformDirection(ray.matrixWorld);
+    const distance = way.y < -FLATTEST ? -from.y / way.y : Infinity;
+    this.mark.visible = distance < FARTHEST;
+    if (this.mark.visible) this.mark.position.copy(from).addScaledVector(way, distance);
+  }
+
+  /** Move the floor so that the head is above the mark. */
+  jump() {
+    const head = new THREE.Vector3().setFromMatrixPosition(this.viewer).applyMatrix4(this.rig.matrixWorld);
+    this.rig.position.add(this.mark.position).sub(head).setY(0);
+    this.mark.visible = false;
   }
 
   /** A hand whose joints the headset sees: palm on the rig, bend of each finger, whether it holds; null: not seen. */

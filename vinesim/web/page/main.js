@@ -53,6 +53,7 @@ class Viewer {
     this.shears = new Shears(mouth, world.group);
     this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons,
       (side) => this.shears.toggle(side), () => this.indicate(this.wrist.after(this.intention)));
+    this.scene.add(this.headset.mark);
     this.wrist = new Wrist(this.headset.wrist, world.header.intentions);
     this.offerHeadset();
     this.absence = new Absence();
