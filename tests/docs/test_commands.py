@@ -8,11 +8,13 @@ import shutil
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import typer.main
 
 from tests.client.test_recorder import World
 from tests.support.recorded_pick import record_a_pick
+from tests.support.tuning import hanging, scan
 from vinesim.cli import app
 from vinesim.cli.bench import BENCHES
 from vinesim.tune import Experiment, load_specimen, measure
@@ -122,9 +124,12 @@ def test_the_short_commands_of_a_page_run(page, tmp_path):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     shutil.copy(ROOT / "examples/plants/vine.mtg", tmp_path)
     lines = [line for line in commands_of(page) if line.startswith(RUNS)]
-    track = measure(load_specimen(ROOT / "examples/cane.toml"), Experiment(duration=2.0))
+    cane = load_specimen(ROOT / "examples/cane.toml")
+    track = measure(cane, Experiment(duration=2.0))
     for name in ("pull.csv", "filmed.csv"):
         track.write(tmp_path / name)
+    if any("scan.xyz" in line for line in lines):
+        np.savetxt(tmp_path / "scan.xyz", scan(hanging(cane)), "%.5f")
     if any("run.mcap" in line for line in lines):
         record_a_pick(tmp_path / "run.mcap")
     for line in lines:

@@ -80,7 +80,8 @@ def test_the_list_of_decisions_is_complete(site):
 
 def test_the_reference_has_every_public_name(site):
     import vinesim
+    import vinesim.tune
 
     text = (site / "reference.html").read_text()
-    names = [name for name in vinesim.__all__ if not name.startswith("_")]
+    names = [name for name in (*vinesim.__all__, *vinesim.tune.__all__) if not name.startswith("_")]
     assert [name for name in names if not re.search(rf'id="[\w.]*\b{name}"', text)] == []

@@ -28,6 +28,14 @@ def test_units_markers_gaps_and_comments_are_understood(tmp_path) -> None:
     assert np.flatnonzero(np.isnan(track.force)).tolist() == [3]
 
 
+def test_units_may_stand_in_round_brackets(tmp_path) -> None:
+    """As spreadsheets and trackers write them."""
+    track = read(tmp_path, "Time (s),X (mm),middle z (cm)\n" + ROWS)
+    assert track.markers == ("tip", "middle")
+    np.testing.assert_allclose(track.position[:, 0, 0], 1e-3 * np.arange(10))
+    np.testing.assert_allclose(track.position[:, 1, 2], -1e-2 * np.arange(10))
+
+
 def test_a_track_survives_its_file(tmp_path) -> None:
     rng = np.random.default_rng(1)
     position = rng.normal(size=(20, 2, 3))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import collections
+import importlib.util
 import multiprocessing
 import os
 import pathlib
 import signal
+import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -24,6 +26,16 @@ from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.export.files import remove_partial_files
 from vinesim.sensors.raster import renderer_selection
+
+CONNECT_TIMEOUT = 10.0
+"""[s] To reach a scheduler."""
+_RENDERING = threading.Lock()
+
+
+class DaskMissing(RuntimeError):
+    """The extra ``dask`` is not installed."""
+
+    exit_code = 3
 
 
 class WorkerDied(RuntimeError):
@@ -48,10 +60,13 @@ def run(
     actors: float,
     renderer: str,
     device: str,
+    scheduler: str | None = None,
 ) -> int:
     """Render the missing images, then gather the annotations of all images; the exit code."""
     if seed < 0:
         raise UsageError(f"--seed is {seed}: give 0 or more")
+    if scheduler is not None and workers is not None:
+        raise UsageError(f"--workers is {workers}, but the workers are those of --scheduler; leave one out")
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     find_device(device)
@@ -72,6 +87,11 @@ def run(
         dataset.prepare_folder(plan, out, images)
         compile_kernels(SENSOR_PACKAGES, device)
         wanted = dataset.missing_images(out, images)
+        if scheduler is not None:
+            with Progress(*columns) as progress:
+                task = progress.add_task("images", total=images, completed=images - len(wanted))
+                _render_on_cluster(scheduler, plan, out, wanted, lambda done: progress.advance(task, done))
+            return _finish(out, images, len(wanted))
         # Of an image on a GPU the cores only generate, write and compute the truth; they share the GPU.
         cores = os.cpu_count() or 2
         shares = _shares(wanted, workers or max(cores // 2 if device == "cpu" else cores, 1))
@@ -86,21 +106,69 @@ def run(
         return 130
     finally:
         _stop_workers(running, out)
+    return _finish(out, images, len(wanted))
+
+
+def _finish(out: pathlib.Path, images: int, new: int) -> int:
+    """Gather the annotations and say what there is; the exit code."""
     splits = collections.Counter(map(dataset.split_of, range(images)))
     parts = ", ".join(f"{splits[split]} {split}" for split in dataset.SPLITS)
-    print(f"{dataset.finish(out, images)}: {images} images ({parts}), {len(wanted)} of them new")
+    print(f"{dataset.finish(out, images)}: {images} images ({parts}), {new} of them new")
     return 0
+
+
+def _by_vineyard(wanted: list[int]) -> list[list[int]]:
+    """Images of one vineyard each."""
+    vineyards: dict[int, list[int]] = {}
+    for image in wanted:
+        vineyards.setdefault(image // dataset.IMAGES_PER_VINEYARD, []).append(image)
+    return list(vineyards.values())
 
 
 def _shares(wanted: list[int], workers: int) -> list[list[int]]:
     """Images for each worker, whole vineyards where possible: generating one costs more than rendering it."""
-    vineyards: dict[int, list[int]] = {}
-    for image in wanted:
-        vineyards.setdefault(image // dataset.IMAGES_PER_VINEYARD, []).append(image)
     shares: list[list[int]] = [[] for _ in range(workers)]
-    for group in vineyards.values():
+    for group in _by_vineyard(wanted):
         min(shares, key=len).extend(group)
     return [share for share in shares if share]
+
+
+def _render_on_cluster(
+    scheduler: str, plan: DatasetPlan, out: pathlib.Path, wanted: list[int], advance: Callable[[int], None]
+) -> None:
+    """Render images by the workers of a Dask scheduler, a vineyard a task; ``advance`` takes the images of each.
+
+    What a killed worker had goes to another one. All machines must see ``out`` at the same path.
+    """
+    if importlib.util.find_spec("distributed") is None:
+        raise DaskMissing("Dask is not installed; run: pip install 'vinesim[dask]'")
+    import distributed
+
+    try:
+        client = distributed.Client(scheduler, timeout=CONNECT_TIMEOUT)
+    except (OSError, ValueError) as bad:
+        raise UsageError(
+            f"--scheduler is {scheduler!r}: {str(bad).splitlines()[0]}; give the address that dask scheduler prints"
+        ) from None
+    with client:
+        futures = [
+            client.submit(_render_share, plan, out.absolute(), share, pure=False) for share in _by_vineyard(wanted)
+        ]
+        try:
+            for future in distributed.as_completed(futures):
+                advance(future.result())
+        finally:
+            client.cancel(futures)
+    if missing := dataset.missing_images(out, wanted[-1] + 1 if wanted else 0):
+        raise WriteError(
+            f"{len(missing)} images that workers wrote are not in {out}; give a folder that all machines share"
+        )
+
+
+def _render_share(plan: DatasetPlan, out: pathlib.Path, share: list[int]) -> int:
+    """By a worker of a cluster: render images; how many. One share at a time in a process, whatever its threads."""
+    with _RENDERING:
+        return sum(1 for _ in dataset.render_images(plan, out, share))
 
 
 def _start_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int]) -> Worker:

@@ -34,13 +34,16 @@ def require_scipy() -> None:
 def run(
     data: pathlib.Path, model: pathlib.Path, fit: str, out: pathlib.Path | None, as_json: bool,
     plot: pathlib.Path | None, release: float | None, push: bool, samples: int, seed: int, device: str,
+    cloud: pathlib.Path | None = None,
 ) -> int:  # fmt: skip
     """Fit and print; the exit code: 0, or 5 if something speaks against the fit."""
     require_scipy()
-    from vinesim.tune import load_specimen, read_trajectory, tune
+    from vinesim.tune import load_specimen, read_trajectory, tune, with_cloud
 
     parameters = [name.strip() for name in fit.split(",") if name.strip()]
     specimen, track = load_specimen(model), read_trajectory(data)
+    if cloud is not None:
+        specimen = with_cloud(specimen, cloud)
     found = tune(specimen, track, parameters, release=release, samples=samples, seed=seed, device=device, pushed=push)
     print(json.dumps(found.as_json()) if as_json else "\n".join(found.lines()))
     if plot is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import itertools
+import math
 import pathlib
 import re
 import typing
@@ -13,6 +15,8 @@ import msgspec
 from vinesim.scene.data_files import find_data_file
 from vinesim.scene.toml_loader import DataError, load_toml
 
+AXIS_LENGTH = 0.05
+"""[1] By how much the length of a specimen's axis may differ from its measured length."""
 Grade = Literal["READ", "DERIVED", "GUESSED", "FITTED"]
 """Where a number comes from: a publication, what follows from one, a guess, or a fit to a measured plant."""
 
@@ -169,6 +173,9 @@ class Specimen(_Part, frozen=True, kw_only=True):
     """In which it grows from its base, in the world (z up); a cane along x, a peduncle down unless given."""
     bow: tuple[float, float] = (0.0, 0.0)
     """[rad] How much its slack shape bends from base to tip, about its y and its z axis."""
+    axis: tuple[tuple[float, float, float], ...] = ()
+    """[m] Points of a cane's axis from its base to its tip, as it hangs at rest under its weight; without any its slack
+    shape is straight but for ``bow``."""
     segments: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8
     """Rigid bodies that the rod is cut into."""
     markers: dict[str, float] = {}
@@ -254,6 +261,8 @@ def _check_specimen(specimen: Specimen, path: str) -> None:
         raise DataError(f"{path}: specimen.tip_mass is missing; give the mass of the bunch in kg")
     if specimen.direction is not None and not any(specimen.direction):
         raise DataError(f"{path}: specimen.direction is {specimen.direction}; give a vector that is not zero")
+    if specimen.axis:
+        _check_axis(specimen, path)
     for name, place in specimen.markers.items():
         if name.lower() == "base":  # a track's columns of that name say how the base was moved
             raise DataError(f"{path}: specimen.markers.{name} is no name for a marker; give it another one")
@@ -262,6 +271,17 @@ def _check_specimen(specimen: Specimen, path: str) -> None:
                 f"{path}: specimen.markers.{name} is {place}; give its distance from the base, "
                 f"above 0 and up to {specimen.length.value} m"
             )
+
+
+def _check_axis(specimen: Specimen, path: str) -> None:
+    if specimen.organ != "cane" or specimen.direction is not None or any(specimen.bow):
+        raise DataError(f"{path}: specimen.axis tells the shape of a cane; leave out direction and bow, or the axis")
+    pieces = [math.dist(a, b) for a, b in itertools.pairwise(specimen.axis)]
+    if not pieces or min(pieces) <= 0.0 or abs(sum(pieces) / specimen.length.value - 1.0) > AXIS_LENGTH:
+        raise DataError(
+            f"{path}: specimen.axis has {len(specimen.axis)} points on a way of {sum(pieces):.3g} m; give two or more, "
+            f"all different, over the length of {specimen.length.value:.3g} m"
+        )
 
 
 def _check_units(part: msgspec.Struct, place: str) -> None:

@@ -16,11 +16,12 @@ from vinesim.tune.experiment import Experiment, measure
 from vinesim.tune.features import Features, extract_features
 from vinesim.tune.fit import Fit
 from vinesim.tune.marker_track import track_marker
+from vinesim.tune.point_cloud import with_cloud
 from vinesim.tune.specimen import with_values
 from vinesim.tune.trajectory import Trajectory, TrajectoryError, read_trajectory
 from vinesim.tune.tuning import tune
 
 __all__ = [
     "Experiment", "Features", "Fit", "Specimen", "Trajectory", "TrajectoryError", "extract_features",
-    "load_specimen", "measure", "read_trajectory", "track_marker", "tune", "with_values",
+    "load_specimen", "measure", "read_trajectory", "track_marker", "tune", "with_cloud", "with_values",
 ]  # fmt: skip

@@ -20,7 +20,7 @@ from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import assemble
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.scene.state import State
-from vinesim.tune.specimen import TIP, base_pose, build_tree, place_markers, rest_bends
+from vinesim.tune.specimen import TIP, base_pose, build_tree, hanging_bends, place_markers, rest_bends
 
 COLUMNS = ("modulus", "damping", "mass", "bow_y", "bow_z", "pull_y", "pull_z")
 """What a candidate is: the natural logarithms of modulus, damping and mass over the specimen's own, its bow [rad], and
@@ -73,6 +73,8 @@ class Candidates:
         self._solvers: dict[int, tuple[ArticulationSolver, ArticulationSolver]] = {}
         self._own: dict[int, tuple[np.ndarray, ...]] = {}
         self._least = least
+        self._sag = np.array([frames.log(body["settled"]) for body in self._tree.bodies]) if specimen.axis else None
+        """[body, 3] rad, by which the weight of a specimen with an axis turns each joint from its slack shape."""
         self.runs = 0
         """Candidates run so far."""
 
@@ -180,15 +182,25 @@ class Candidates:
         own_mass, own_inertia, own_product = self._own[count]
         plants.body_inertia[:], plants.body_product[:] = own_inertia * mass, own_product * mass
         plants.body_mass[:] = own_mass * mass[:, 0]
-        bends = rest_bends(self.specimen, candidates[:, 3:5])
         rest = plants.kernel_arrays()[wp.quat]["body_rest"].reshape(count, self.size, 4)
-        rest[:, : self.specimen.segments] = frames.exp(bends)
+        if self._sag is None:
+            rest[:, : self.specimen.segments] = frames.exp(rest_bends(self.specimen, candidates[:, 3:5]))
+        else:  # it hangs as its axis shows, whatever its modulus is: the stiffer, the less the slack shape differs
+            hanging = frames.exp(hanging_bends(self.specimen))
+            rest[:] = frames.multiply(hanging[None], frames.conjugate(frames.exp(self._sags(candidates))))
         plants.launches.changed = True
+
+    def _sags(self, candidates: np.ndarray) -> np.ndarray:
+        """[n, body, 3] rad, by which weight turns the joints of candidates [n, 7] of a specimen with an axis."""
+        assert self._sag is not None
+        return self._sag * np.exp(candidates[:, 2] - candidates[:, 0])[:, None, None]
 
     def _settle(self, plants: ArticulationSolver, candidates: np.ndarray, count: int) -> None:
         """Bring the first trees into equilibrium under their pull."""
         state = plants.state
         state.joint_q[:] = frames.IDENTITY
+        if self._sag is not None:
+            state.joint_q[:] = frames.exp(self._sags(candidates)).reshape(-1, 4)
         state.joint_qd[:] = 0.0
         self._begin(plants, count)
         plants.forward_kinematics()

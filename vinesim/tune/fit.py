@@ -246,7 +246,11 @@ def specimen_toml(specimen: Specimen) -> str:
             lines.append(f"{name} = {_number(number)}")
     if specimen.direction is not None:
         lines.append(f"direction = {list(specimen.direction)}")
-    lines += [f"bow = {list(specimen.bow)}", f"segments = {specimen.segments}"]
+    if specimen.axis:
+        lines.append("axis = [\n" + "".join(f"    {list(point)},\n" for point in specimen.axis) + "]")
+    else:
+        lines.append(f"bow = {list(specimen.bow)}")
+    lines.append(f"segments = {specimen.segments}")
     if specimen.markers:
         lines.append("markers = { " + ", ".join(f'"{k}" = {v}' for k, v in specimen.markers.items()) + " }")
     return "\n".join(lines) + "\n"

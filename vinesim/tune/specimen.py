@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import msgspec
 import numpy as np
 
@@ -24,7 +26,9 @@ def with_values(specimen: Specimen, **values: float) -> Specimen:
 
 
 def base_pose(specimen: Specimen) -> np.ndarray:
-    """Pose [7] of the base: at the origin, x in the direction of growth."""
+    """Pose [7] of the base: at the origin, x in the direction of growth, or of the first segment of an axis."""
+    if specimen.axis:
+        return frames.pose(np.zeros(3), _axis_turns(specimen)[0])
     along = np.array(specimen.direction or _DIRECTIONS[specimen.organ], float)
     return frames.pose(np.zeros(3), frames.from_x_axis(along / np.linalg.norm(along)))
 
@@ -39,16 +43,39 @@ def rest_bends(specimen: Specimen, bow: np.ndarray) -> np.ndarray:
     return bends
 
 
+def _axis_turns(specimen: Specimen) -> np.ndarray:
+    """Rotation [segments, 4] in the world of each segment along a specimen's axis, without twist between them."""
+    points = np.array(specimen.axis)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    at = np.linspace(0.0, way[-1], specimen.segments + 1)
+    along = np.diff(np.stack([np.interp(at, way, points[:, i]) for i in range(3)], -1), axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    turns = [frames.from_x_axis(along[0])]
+    for before, after in itertools.pairwise(along):
+        axis = np.cross(before, after)
+        sine = np.linalg.norm(axis)
+        turn = axis * (np.arctan2(sine, before @ after) / max(sine, 1e-12))
+        turns.append(frames.multiply(frames.exp(turn), turns[-1]))
+    return np.array(turns)
+
+
+def hanging_bends(specimen: Specimen) -> np.ndarray:
+    """Rotation vectors [segments, 3] rad of each segment against the one before, along the axis of a specimen."""
+    turns = _axis_turns(specimen)
+    bends = frames.log(frames.multiply(frames.conjugate(turns[:-1]), turns[1:]))
+    return np.concatenate([np.zeros((1, 3)), bends])
+
+
 def build_tree(specimen: Specimen) -> TreeBuilder:
     """One specimen as a tree: the rod's segments, then the bunch if it is one."""
     radius = (0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value)
-    bends = rest_bends(specimen, np.array(specimen.bow))
+    bends = hanging_bends(specimen) if specimen.axis else rest_bends(specimen, np.array(specimen.bow))
     if specimen.organ == "cane":
         return CaneBuilder(
             length=specimen.length.value, radius=radius, youngs_modulus=specimen.modulus.value,
             density=specimen.density.value, segments=specimen.segments, beta=specimen.damping.value,
             tip_mass=0.0 if specimen.tip_mass is None else specimen.tip_mass.value, pose=base_pose(specimen),
-            bends=bends,
+            bends=bends, shape="equilibrium" if specimen.axis else "slack",
         ).tree()  # fmt: skip
     tree = TreeBuilder(base_pose(specimen))
     material = RodMaterial(specimen.modulus.value, specimen.density.value, specimen.damping.value)

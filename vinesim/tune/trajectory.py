@@ -21,7 +21,7 @@ _SCALE = {"s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "N": 1.0}
 _UNITS = {"time": ("s", "ms"), "force": ("N",), "position": ("m", "cm", "mm"), "base": ("m", "cm", "mm")}
 BASE = "base"
 """Names the columns that say how the base was moved; no marker is called so."""
-_HEADER = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
+_HEADER = re.compile(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]")
 
 
 class TrajectoryError(ValueError):
@@ -128,7 +128,8 @@ def read_trajectory(path: str | pathlib.Path) -> Trajectory:
 
     The first line names columns with units: ``time [s]``, ``x [mm]`` for the tip, ``NAME x [mm]`` for a marker,
     ``base x [mm]`` for how far the base was moved, ``force [N]``; axes x, y, z of the world, z up; s or ms, m, cm or
-    mm. Empty cells and ``nan`` are gaps, which time and base must not have. Lines that begin with ``#`` are skipped.
+    mm, in brackets [] or (). Empty cells and ``nan`` are gaps, which time and base must not have. Lines that begin
+    with ``#`` are skipped.
 
     :class:`TrajectoryError` with line, column, value and remedy if a line does not fit.
     """

@@ -59,6 +59,8 @@ def tune(
     :class:`~vinesim.errors.UsageError` for other parameters. A fit that has failed is returned and says so.
     """
     fitted = _columns(parameters)
+    if specimen.axis and "rest" in parameters:
+        raise UsageError("'rest' cannot be fitted beside specimen.axis, which tells the shape; leave out one of them")
     if track.base is not None and (pushed or release is not None):
         what = "push" if pushed else "release"
         raise UsageError(f"{track.source}: its base is shaken, so there is no {what}; leave out --{what}")

@@ -119,6 +119,10 @@ def dataset(
         int | None,
         typer.Option(min=1, max=256, help="Processes; half as many as cores unless given, as many with a GPU."),
     ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(help="Address of a Dask scheduler whose workers render; they must see OUT. Needs vinesim[dask]."),
+    ] = None,
     renderer: Renderer = "warp",
     device: Device = "cpu",
     actors: Annotated[
@@ -134,6 +138,7 @@ def dataset(
     \b
     Examples:
       vinesim dataset --images 1000 --out grapes
+      vinesim dataset --images 100000 --out /shared/grapes --scheduler tcp://HOST:8786
       vinesim dataset --images 200 --out vsp --scene vsp --seed 3 --camera pinhole --size 320x240 --workers 4
     """
     options = dict(locals())

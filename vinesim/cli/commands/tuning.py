@@ -34,6 +34,10 @@ def tune(
     plot: Annotated[
         pathlib.Path | None, typer.Option(help="Draw track, residuals and posterior into this file (.png, .pdf, .svg).")
     ] = None,
+    cloud: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Points of the cane as it hangs at rest, base at the origin [m]: PLY, or lines of x y z."),
+    ] = None,
     release: Annotated[float | None, typer.Option(help="When it was let go [s]; found unless given.")] = None,
     push: Annotated[bool, typer.Option("--push", help="The track is of a push: a steady force begins.")] = False,
     samples: Annotated[
@@ -55,7 +59,7 @@ def tune(
     """
     from vinesim.cli.tune import run
 
-    raise typer.Exit(run(data, model, fit, out, json, plot, release, push, samples, seed, device))
+    raise typer.Exit(run(data, model, fit, out, json, plot, release, push, samples, seed, device, cloud))
 
 
 def track(

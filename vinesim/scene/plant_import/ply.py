@@ -24,10 +24,7 @@ def read_ply(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
     """The skeleton in a PLY file; ``unit`` and ``diameter_unit`` [m] as for
     :func:`~vinesim.scene.plant_import.mtg.read_mtg`."""
     elements = _read(path)
-    vertex = elements.get("vertex")
-    if vertex is None or not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
-        raise PlantFileError(f"{path}: has no element 'vertex' with x, y and z; give them")
-    position = np.stack([vertex[axis].astype(float) for axis in "xyz"], -1)
+    vertex, position = _vertices(path, elements)
     names = set(vertex.dtype.names or ())
     if "parent" in names:
         parent = vertex["parent"].astype(int)
@@ -45,6 +42,34 @@ def read_ply(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
             diameter = scale * diameter_unit * vertex[name].astype(float)
     bunch = vertex["bunch"].astype(float) if "bunch" in names else np.zeros(len(position))
     return sort_nodes(path, unit * position, parent, diameter, bunch, "PLY skeleton")
+
+
+def read_points(path: pathlib.Path) -> np.ndarray:
+    """Points [n, 3] of a PLY file's vertices, or of a text file with x, y and z in a line; :class:`PlantFileError`."""
+    if not path.is_file():
+        raise PlantFileError(f"{path}: no such file; give points as PLY, or as text with x, y and z in a line")
+    if path.suffix.lower() == ".ply":
+        return _vertices(path, _read(path))[1]
+    rows = []
+    for number, line in enumerate(path.read_text("utf-8", "replace").splitlines(), 1):
+        words = line.replace(",", " ").split()
+        if not words or words[0].startswith("#") or (not rows and words[0].strip('"').lower() == "x"):
+            continue
+        try:
+            rows.append([float(word) for word in words[:3]])
+        except ValueError:
+            rows.append([])
+        if len(rows[-1]) != 3:
+            raise PlantFileError(f"{path}:{number}: is {line.strip()[:40]!r}; give x, y and z as numbers")
+    return np.array(rows).reshape(-1, 3)
+
+
+def _vertices(path: pathlib.Path, elements: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The table of vertices, and where they are [vertex, 3] in the file's unit."""
+    vertex = elements.get("vertex")
+    if vertex is None or not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
+        raise PlantFileError(f"{path}: has no element 'vertex' with x, y and z; give them")
+    return vertex, np.stack([vertex[axis].astype(float) for axis in "xyz"], -1)
 
 
 def _parents(path: pathlib.Path, position: np.ndarray, pairs: np.ndarray) -> np.ndarray:
