@@ -273,6 +273,11 @@ def test_secured_from_certificate_to_client(tmp_path):
         (["client", "--role", "human", "--tls", "certs"], ["--tls certs", "--connect tls/HOST:7447"]),
         (["client", "--role", "spectator", "--no-ros"], ["--no-ros", "robot", "not of spectator"]),
         (["client", "--tls", "certs", "--no-ros"], ["--tls certs", "--connect tls/HOST:7447"]),
+        (["client", "--world", "north", "--no-ros"], ["--world north", "--connect tcp/HOST:7447"]),
+        (
+            ["client", "--world", "n", "--tls", "c", "--connect", "tls/h:1", "--no-ros"],
+            ["one world", "leave --world out"],
+        ),
         (["server", "--listen", "7447"], ["'7447'", "tcp/HOST:PORT"]),
         (["server", "--listen", "tls/0.0.0.0:7447"], ["tls/0.0.0.0:7447", "--tls DIR"]),
         (["server", "--listen", "tcp/0.0.0.0:7447"], ["tcp/0.0.0.0:7447", "--tls DIR", "--insecure"]),

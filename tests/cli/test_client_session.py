@@ -1,4 +1,4 @@
-"""The loop of a client process: what it says when its GPU fails."""
+"""A client process: the world that it enters, and what its loop says when its GPU fails."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
+from tests.support.waiting import wait
 from vinesim.cli import client_session
 from vinesim.cli.client_session import ClientSession
+from vinesim.net.server.server import Server
 from vinesim.physics.plants.device_buffers import DeviceLost
 
 
@@ -36,6 +38,15 @@ def test_a_gpu_that_fails_under_the_plants_ends_the_client_in_one_line(session, 
     with session._stack, pytest.raises(DeviceLost, match=r"cuda:0 failed after 12\.5 s: Warp sees no NVIDIA GPU"):
         session.run(CLIENT)
     assert DeviceLost.exit_code == 3
+
+
+def test_clients_in_different_worlds_of_one_server_do_not_meet(session):
+    with session._stack, Server("tcp/127.0.0.1:0") as server:
+        for world, name in (("north", "ada"), ("south", "bob"), ("south", "eva")):
+            session.options = SimpleNamespace(connect=server.endpoint, tls=None, world=world)
+            bus = session.bus(name)
+        wait(lambda: server.actors == ["north/ada", "south/bob", "south/eva"], "three actors in two worlds")
+        wait(lambda: bus.alive() == {"bob", "eva"}, "those of the south to meet")
 
 
 def test_a_failure_beside_a_gpu_that_works_is_not_blamed_on_it(session, monkeypatch):

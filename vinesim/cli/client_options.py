@@ -19,6 +19,8 @@ ROLES_OF_OPTION = {
 }
 """The roles that an option belongs to, by its name; all roles have the options that are not named here."""
 
+DEFAULT_WORLD = "vineyard"
+
 STATUS_FORMATS = ("text", "json", "none")
 
 
@@ -79,6 +81,8 @@ class ClientOptions:
     """File of a person's own finger poses."""
     outfit: str | None = None
     """What a person wears, by name; None: what follows from its own name."""
+    world: str = DEFAULT_WORLD
+    """Of the server's worlds; those in different ones do not meet."""
 
     @property
     def is_for_page(self) -> bool:
@@ -111,6 +115,12 @@ def check_options(options: ClientOptions) -> None:
         raise UsageError("--page-lan without a page: give --page PORT, too")
     if options.tls is not None and options.connect is None:
         raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7447")
+    if options.world != DEFAULT_WORLD and options.connect is None:
+        raise UsageError(f"--world {options.world} without a server: give --connect tcp/HOST:7447")
+    if options.world != DEFAULT_WORLD and options.tls is not None:
+        raise UsageError(
+            f"--world {options.world} --tls {options.tls}: a server with certificates has one world; leave --world out"
+        )
     if options.params_file is not None and not options.params_file.is_file():
         raise UsageError(f"--params-file {options.params_file}: there is no such file; give a ROS 2 parameter file")
     from vinesim.physics.plants.device_buffers import find_device

@@ -80,11 +80,12 @@ class ClientSession:
 
     def bus(self, name: str) -> Bus:
         """A member of the world on the server, or of a network in memory if there is no server."""
-        if self.options.connect is None:
+        options = self.options
+        if options.connect is None:
             return self.enter(self._hub.bus(name))
         from vinesim.net.transport.zenoh_bus import ZenohBus
 
-        return self.enter(ZenohBus(name, connect=self.options.connect, certificates=self.options.tls))
+        return self.enter(ZenohBus(name, connect=options.connect, world=options.world, certificates=options.tls))
 
     def client_options(self, name: str | None = None) -> dict[str, Any]:
         """Keyword arguments that :class:`Client` takes for every role; ``name`` instead of the session's."""

@@ -24,6 +24,6 @@ Insecure = Annotated[
         help="Listen on a network without certificates: any program that reaches it may publish under any name."
     ),
 ]
-World = Annotated[str, typer.Option(help="Which of the server's worlds.")]
+World = Annotated[str, typer.Option(help="Which of the server's worlds; those in different ones do not meet.")]
 Pose = tuple[float, float, float]
 """X Y [m] and YAW [rad]."""
