@@ -3,8 +3,7 @@
 Fast DDS keeps a lock (flock) on ``NAME_el`` while the owner of segment ``NAME`` lives; its own ``fastdds shm clean``
 goes by the same lock. Readers that still have a removed segment mapped keep it until they unmap it.
 
-Its files of ports are left: they take 52 KB each and are used again by the next node with that number, and a writer
-that still has one mapped would reach that node no longer.
+Its files of ports are left: they take 52 KB each and are used again by the next node with that number.
 """
 
 from __future__ import annotations
