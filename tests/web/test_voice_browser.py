@@ -140,3 +140,24 @@ def test_a_word_in_a_page_reaches_a_robot_and_a_robots_loudspeaker_reaches_the_p
         np.testing.assert_allclose(place, live.bot.sound.place_of("bot"), atol=0.1)
         assert page.errors == []
         assert live.server.voice.refused == 0
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_what_a_browser_lacks_to_speak_is_said_with_the_remedy():
+    refuse = "navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('', '%s'); };"
+    clicks_may_come_from_scripts = "--autoplay-policy=no-user-gesture-required"
+    with LiveTalk() as live, browser_page(clicks_may_come_from_scripts) as page:
+        page.resize(320, 240)
+        for lacks, said in (
+            (refuse % "NotFoundError", "no microphone was found: connect one"),
+            (refuse % "NotAllowedError", "allow it at the address bar"),
+            ("Object.defineProperty(window, 'isSecureContext', {value: false});", "start the client with --page-lan"),
+        ):
+            page.open(live.server.address + "?triangles=3000&rate=10&shadows=0", before=lacks)
+            wait(lambda: page.run("window.vinesim?.drawn >= 1 || window.vinesim?.failure"), "a state is drawn")
+            page.run("document.querySelectorAll('#sound button')[1].click()")
+            told = "document.querySelector('#sound span').textContent"
+            wait(lambda said=said, told=told: said in page.run(told), said)
+            assert page.run("vinesim.failure") is None
+            assert page.errors == []
