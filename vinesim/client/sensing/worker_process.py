@@ -26,7 +26,9 @@ from vinesim.client.sensing.spawned_process import CONTEXT, SpawnedProcess, spaw
 log = logging.getLogger(__name__)
 
 EXIT_TIMEOUT = 1.2
-"""How long a process may take to end [s]."""
+"""How long a process that failed may take to end [s]."""
+CLOSE_TIMEOUT = 10.0
+"""The same for one that was asked to: it ends the picture that it is at, on a busy machine."""
 STABLE_TIME = 10.0
 """A process that ran this long before it failed is started again at once [s]; else there is a pause before. A start
 takes two seconds of one core."""
@@ -227,7 +229,7 @@ class WorkerProcess(Generic[S]):
         was_ready = self.is_ready
         self._closing.set()
         self._newest.send("stop")
-        self._thread.join(EXIT_TIMEOUT if was_ready else 0.0)
+        self._thread.join(CLOSE_TIMEOUT if was_ready else 0.0)
         if self._thread.is_alive() and was_ready:
             log.warning("%s did not end by itself", self.title)
         while self._thread.is_alive():
