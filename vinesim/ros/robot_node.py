@@ -237,7 +237,7 @@ class RobotNode(Node):
 
     @property
     def refused_commands(self) -> int:
-        """Messages and goals so far that contradicted themselves, or that nobody took in time."""
+        """Messages and goals so far that contradicted themselves, or that left a full queue unread."""
         return self._commands.rejected
 
     @property

@@ -166,8 +166,7 @@ class RosProcess:
             self._write_truth(client)
 
     def _tell_of_people(self, client: Client) -> None:
-        """Pass what people indicate and what their hands show to the process when it changes; a new run is told what it
-        does not know."""
+        """Send people's intentions and hand gestures to the ROS process when they change, and to a restarted one."""
         now = client.physics.time + client.world_time.offset
         people: dict[str, LocalHuman | RemoteHuman] = dict(client.humans)
         people |= {name: one for name, one in client.remote_actors.items() if isinstance(one, RemoteHuman)}

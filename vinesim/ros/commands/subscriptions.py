@@ -49,7 +49,7 @@ class CommandQueue:
         self._logged: set[str] = set()
         """Reasons that the log has."""
         self.rejected = 0
-        """Messages and goals that contradicted themselves, or that nobody took before too many others came."""
+        """Messages and goals that contradicted themselves, or that left a full queue before the client read them."""
 
     def drain(self) -> list[Command]:
         """Take all commands that arrived since the last call, in order of arrival."""
@@ -132,7 +132,10 @@ class CommandSubscriptions:
         self.types[self._node.resolve_topic_name(topic)] = f"{package}/msg/{name}"
 
     def foreign_types(self) -> dict[str, list[str]]:
-        """Topics that somebody publishes as another type, and those types: DDS delivers nothing of it, in silence."""
+        """Command topics that another node publishes as other message types, and those types.
+
+        DDS delivers none of these messages, and reports nothing.
+        """
         known = self._node.get_topic_names_and_types()
         return {
             topic: others
