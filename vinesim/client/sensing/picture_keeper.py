@@ -11,8 +11,8 @@ RENEWAL_PERIOD = 1.0
 class PictureKeeper:
     """Keeps the picture with the highest score, and asks for one only where it would be kept.
 
-    A whole picture without a subscriber costs as much as one with: rendered at the camera's own rate, they would take
-    a fifth of a small machine for one that is written in the end.
+    A whole picture without a subscriber costs as much as one with, and one of all is written in the end
+    (docs/decisions/sensor-process.md).
     """
 
     def __init__(self) -> None:
