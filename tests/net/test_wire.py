@@ -119,6 +119,16 @@ class NetworkTestbed:
             windows.append(self.count())
         return windows[-1]
 
+    def count_idle(self) -> Window:
+        """A window of idle links that the one before agrees with: a busy machine may hold messages back in one."""
+        before = self.count()
+        for _ in range(WINDOWS):
+            window = self.count()
+            if all(window.differs_from(before, name) < IDLE_VARIATION for name in self.clients):
+                return window
+            before = window
+        pytest.fail(f"no two of {WINDOWS} windows agree while nothing is touched")
+
     def check_idle(self, idle: Window, *names: str) -> None:
         """The links of these clients carry what they carry when ``idle``; no window has any payload but the first, in
         which on a busy machine arrives what was on its way."""
@@ -187,7 +197,7 @@ def test_branch_touched_far_from_all_peers_costs_nothing(world):
     world.settle()
     world.command("ada", place=[55.0, 0.0])  # 25 m from cleo, 53 m from bob
     time.sleep(0.3)
-    idle, reads = world.count(), world.command("ada")["reads"]
+    idle, reads = world.count_idle(), world.command("ada")["reads"]
     world.command("ada", touch=list(range(50, 60)), swing=[49])
     time.sleep(0.1)
     world.check_idle(idle, *world.clients)
@@ -199,7 +209,7 @@ def test_branch_touched_far_from_all_peers_costs_nothing(world):
 def test_branch_is_received_only_by_clients_near_it(world):
     """F71, F72: bob at 1.5 m from the branch receives the stream; cleo at 29 m receives no byte more than idle."""
     world.settle()
-    idle = world.count()
+    idle = world.count_idle()
     world.command("ada", touch=list(range(6)))
     wait(lambda: world.command("bob")["owner"].get("0") == "ada", "bob to receive the tree")
 
@@ -224,7 +234,7 @@ def test_a_client_that_comes_near_receives_and_one_that_leaves_does_not(world):
 
 def test_a_swinging_branch_is_received_and_a_resting_one_is_not(world):
     world.settle()
-    idle = world.count()
+    idle = world.count_idle()
     world.command("ada", touch=[0])
     wait(lambda: world.command("bob")["owner"].get("0") == "ada", "bob to receive the tree")
     world.command("ada", touch=[], swing=[0])
@@ -296,7 +306,7 @@ def test_a_hanging_bunch_is_part_of_its_tree_and_received_only_near(world):
 def test_a_free_bunch_from_cut_to_ground_to_hand_to_box(world):
     """F76, F77, F78: a stream while it moves; one record when it comes to rest, and not one byte after it."""
     world.settle()
-    idle = world.count()
+    idle = world.count_idle()
     start = {name: world.command(name) for name in world.clients}
     world.command("ada", pick=[BUNCH])
     wait(lambda: str(BUNCH) in world.command("bob")["facts"], "bob to receive the detachment")

@@ -266,11 +266,14 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
 
         wait_until(lambda: counted() > 1.0, lambda: drive(0.0, 0.4))
         wait_until(lambda: abs(odometry[-1].twist.twist.angular.z) < 1e-3, lambda: drive(0.0, 0.0), "rest")
-        truth = turned(true_yaw(), before)
-        # what was sent while it turned may still wait; then both hold
-        wait_until(lambda: abs(turned(found(), truth)) < 0.04, lambda: drive(0.0, 0.0), f"a turn of {truth:.2f} rad")
-        wait_until(lambda: abs(counted() - truth / (1.0 - SLIP)) < 0.04, lambda: drive(0.0, 0.0), "odometry")
-        assert abs(turned(found(), truth)) < 0.04
+
+        def truth() -> float:
+            return turned(true_yaw(), before)
+
+        # commands and transforms that a busy machine held back may still come; then all hold
+        wait_until(lambda: abs(turned(found(), truth())) < 0.04, lambda: drive(0.0, 0.0), "the true turn")
+        wait_until(lambda: abs(counted() - truth() / (1.0 - SLIP)) < 0.04, lambda: drive(0.0, 0.0), "odometry")
+        assert abs(turned(found(), truth())) < 0.04
     for one in subscriptions:
         robot.node.destroy_subscription(one)
 
