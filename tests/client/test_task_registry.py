@@ -8,7 +8,7 @@ import pytest
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
-from vinesim.client.tasks.motions import LookAt
+from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.task_registry import UnknownTask, plan_task
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -165,3 +165,26 @@ def test_invalid_commands_are_counted_and_ignored():
     ]
     np.testing.assert_allclose(commanded.run(0.5), start, atol=1e-4)
     assert commanded.handle_commands.rejected_count == 3
+
+
+def test_a_robot_stands_until_it_may_start_and_then_drives_there() -> None:
+    """It goes on when the reason to start is gone again."""
+    robot = Robot(RigidWorld(assemble([])), load_robot("vinebot"), "anna")
+    others: list[str] = []
+    drive, times = DriveTo(robot, frames.pose([2.0, 0.0, 0.0]), may_start=lambda: others), iter(range(100_000))
+
+    def go(seconds: float) -> float:
+        for _ in range(round(100 * seconds)):
+            time = 0.01 * next(times)
+            drive(time)
+            robot.control(time)
+            robot.rigid.predict()
+            robot.rigid.integrate()
+        return float(robot.rigid.base_state("anna")[0][0])
+
+    assert go(1.0) == pytest.approx(0.0, abs=1e-3)
+    others.append("bob")
+    assert go(0.5) > 0.1
+    others.clear()
+    assert go(12.0) == pytest.approx(2.0, abs=0.1)
+    assert drive.is_done

@@ -131,8 +131,10 @@ def _add_behaviour(session: ClientSession, client: Client, task: Task | None, ap
     if watched is not None:
         session.trace(client, watched)
     if approach > 0.0:
+        may_start = (lambda: client.remote_actors) if options.connect else (lambda: True)
         for i, robot in enumerate(client.robots.values()):
-            client.pre_step.append(DriveTo(robot, start_pose(session.scene, session.spawn, queue=i)))
+            pose = start_pose(session.scene, session.spawn, queue=i)
+            client.pre_step.append(DriveTo(robot, pose, may_start=may_start))
     if options.push is not None and client.trace is not None:
         side = client.side_of(client.trace.centre())
         client.pre_step.append(PushBunch(client.robot, side, client.trace.centre).control)

@@ -26,7 +26,12 @@ Robots = Annotated[
 ]
 Spawn = Annotated[int, typer.Option(min=0, help="Index of one of the scene's start poses.")]
 StartPose = Annotated[Pose | None, typer.Option(help="Start at X Y [m] with YAW [rad] instead.")]
-Approach = Annotated[float, typer.Option(help="Of a robot: start this far behind the start pose and drive to it [m].")]
+Approach = Annotated[
+    float,
+    typer.Option(
+        help="Of a robot: start this far behind the start pose and drive to it [m]; on a server once others are there."
+    ),
+]
 Namespace = Annotated[str, typer.Option(help="Of a robot: prefix of all ROS topics.")]
 Ros = Annotated[bool, typer.Option(help="Of a robot: run a ROS 2 node, if ROS 2 is installed.")]
 ParamsFile = Annotated[

@@ -16,14 +16,18 @@ class DriveTo:
     POSITION_TOLERANCE = 0.05
     """[m] A base this near to the place has reached it. GUESSED"""
 
-    def __init__(self, robot: Robot, place: np.ndarray, *, speed: float = 1.2) -> None:
-        """``place`` [7]: pose of the base in the world."""
-        self.robot, self.speed = robot, speed
+    def __init__(
+        self, robot: Robot, place: np.ndarray, *, speed: float = 1.2, may_start: Callable[[], object] = lambda: True
+    ) -> None:
+        """``place`` [7]: pose of the base in the world; it stands until ``may_start()`` is true."""
+        self.robot, self.speed, self._may_start = robot, speed, may_start
+        self._has_started = False
         self.is_done = False
         self._place = np.asarray(place, float)[:2]
 
     def __call__(self, time: float) -> None:
-        if self.is_done:
+        self._has_started = self._has_started or bool(self._may_start())
+        if self.is_done or not self._has_started:
             return
         base, _ = self.robot.rigid.base_state(self.robot.name)
         offset = frames.rotate(frames.conjugate(base[3:]), np.append(self._place - base[:2], 0.0))
