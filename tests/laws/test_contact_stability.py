@@ -10,7 +10,7 @@ from tests.support.contact_scenes import bar, cane, probe
 from vinesim import frames
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.step import Physics
-from vinesim.scene.builder import assemble
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Drive
 
@@ -188,3 +188,38 @@ def test_plants_that_overlap_when_drawn_stay_at_rest():
     assert fastest < 1e-3
     assert len(physics.plants.awake) == 0
     assert physics.contacts == ()
+
+
+def upright(x: float, y: float, radius: float) -> TreeBuilder:
+    """A cane of 1 m that grows upward from the ground."""
+    tree = TreeBuilder(frames.pose(np.array([x, y, 0.0]), frames.from_x_axis(np.array([0.0, 0.0, 1.0]))))
+    tree.add_rod(-1, 1.0, (radius, radius), RodMaterial(5e9, 800.0, 0.01, shear_modulus=2.5e9), 16)
+    return tree
+
+
+def energy_of_box(physics: Physics) -> float:
+    """Kinetic energy and weight of the first box [J]."""
+    world, data = physics.rigid.mj_model, physics.rigid.mj_data
+    body, motion = world.body("box/0").id, data.joint("box/0").qvel
+    weight = 9.81 * world.body_mass[body] * data.xipos[body, 2]
+    linear, angular = world.body_mass[body] * motion[:3] @ motion[:3], motion[3:] ** 2 @ world.body_inertia[body]
+    return float(weight + (linear + angular) / 2.0)
+
+
+@pytest.mark.parametrize(("radius", "mass"), [(0.004, 0.1), (0.004, 0.2), (0.004, 1.0), (0.0005, 0.1)])
+def test_a_crate_that_falls_beside_the_bases_of_canes_gains_no_energy(radius, mass):
+    """The ground lets go of a light crate that canes push, and the crate slides on it: neither holds it in place."""
+    bases, gain = ((0.12, 0.0), (-0.1, 0.1), (0.0, -0.12)), []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        canes = [upright(x + 0.01 * rng.normal(), y + 0.01 * rng.normal(), radius) for x, y in bases]
+        at = frames.pose([0.02 * rng.normal(), 0.02 * rng.normal(), 0.02], frames.from_yaw(rng.normal()))
+        physics = Physics(assemble(canes, box_pose=[at], box_size=[(0.4, 0.3, 0.25)], box_mass=[mass]))
+        physics.rigid.mj_data.joint("box/0").qvel[:3] = [*(0.5 * rng.normal(size=2)), -2.4]
+        physics.step()
+        start, highest = energy(physics) + energy_of_box(physics), -np.inf
+        for _ in range(100):
+            physics.step()
+            highest = max(highest, energy(physics) + energy_of_box(physics))
+        gain.append(highest - start)
+    assert max(gain) < 0.0, f"{np.round(gain, 3)} J"

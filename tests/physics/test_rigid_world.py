@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from tests.support.contact_scenes import cane
 from vinesim import frames
 from vinesim.physics.rigid import free_bunch, static_world
 from vinesim.physics.rigid.rigid_world import RigidWorld
@@ -133,6 +134,25 @@ def test_response_includes_the_stiffness_of_an_active_limit():
     predicted = rigid.velocity_free + rigid.impulse_response(force[None])[:, 0] * rigid.dt
     rigid.integrate(force)
     np.testing.assert_allclose(rigid.mj_data.qvel, predicted, atol=1e-7)
+
+
+def test_response_of_a_crate_that_slides_on_the_ground_is_that_of_its_friction_cones():
+    """The prediction with a small force, less that without, is the response times the force: to 1 % of it."""
+    rigid = RigidWorld(assemble([cane((0.0, 9.0, 2.0))], box_pose=[frames.pose([0, 0, 0])], box_size=[(0.6, 0.4, 0.3)],
+                                box_mass=[2.0]))  # fmt: skip
+    rigid.mj_data.joint("box/0").qvel[:2] = 1.0, 0.3
+    step(rigid, 3)
+    rigid.predict()
+    assert (rigid.mj_data.efc_state == int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)).all()
+    first = int(rigid.mj_model.joint("box/0").dofadr[0])
+    forces = 1e-3 * np.eye(rigid.mj_model.nv)[first : first + 6]
+    response = rigid.impulse_response(forces).T * rigid.dt
+    without, rates = rigid.velocity_free, []
+    for force in forces:
+        rigid.predict_with(force)
+        rates.append(rigid.velocity_free - without)
+    error = np.abs(np.array(rates) - response).max(1) / np.abs(response).max(1)
+    assert error.max() < 0.01, error
 
 
 def test_new_gains_do_not_change_the_last_measured_effort():

@@ -10,10 +10,11 @@ _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
 
 
 class EffectiveMass:
-    """H = M^ + Jc^T D Jc: mass with implicit servos, and the stiffness of MuJoCo's constraints that are active now.
+    """H = M^ + Jc^T D Jc: mass with implicit servos, and the tangent stiffness of MuJoCo's active constraints.
 
-    These are joint limits, mimic joints, and contacts of a robot with a pole. Only the kinematic trees concerned are
-    factored.
+    These are joint limits, mimic joints, and contacts of rigid bodies with each other; D is that of the acceleration
+    that MuJoCo has found last, and for contacts that slide the Hessian of their friction cone. Only the kinematic trees
+    concerned are factored.
     """
 
     def __init__(self, world: mujoco.MjModel) -> None:
@@ -89,12 +90,18 @@ class _Block:
             H[self.row, self.column] = H[self.column, self.row] = d.M[self.entry]
         if d.nefc:
             state = d.efc_state
-            stiff = (state == _QUADRATIC) | (state == _CONE)
             row = np.repeat(np.arange(d.nefc), d.efc_J_rownnz)
             column = self.at[d.efc_J_colind[: len(row)]]
-            entry = np.flatnonzero(stiff[row] & (column >= 0))
+            entry = np.flatnonzero(((state == _QUADRATIC) | (state == _CONE))[row] & (column >= 0))
             if len(entry):
                 J = np.zeros((d.nefc, self.count))
                 J[row[entry], column[entry]] = d.efc_J[: len(row)][entry]
-                H += J.T @ (d.efc_D[:, None] * J)
+                H += J.T @ (np.where(state == _QUADRATIC, d.efc_D, 0.0)[:, None] * J)
+                first = d.contact.efc_address
+                sliding = np.flatnonzero((first >= 0) & (state[first] == _CONE))
+                for k in np.unique(d.contact.dim[sliding]).tolist():
+                    alike = sliding[d.contact.dim[sliding] == k]
+                    rows = J[first[alike, None] + np.arange(k)]
+                    tangent = d.contact.H.reshape(-1, 36)[alike, : k * k].reshape(-1, k, k)
+                    H += rows.reshape(-1, self.count).T @ (tangent @ rows).reshape(-1, self.count)
         return H

@@ -157,12 +157,16 @@ class ImpulseSolver:
         self._write_contact_rows(n)
 
         self.response.compute(n)
-        if self.rigid.mj_data.nefc and self.rigid.is_constrained(self._touched_rigid_bodies(n)):
+        is_constrained = bool(self.rigid.mj_data.nefc) and self.rigid.is_constrained(self._touched_rigid_bodies(n))
+        if is_constrained:
             rigid_response[:] = self.rigid.impulse_response(rigid_jacobian).T
         else:
             self._respond_rigidly(row_count)
         self._assemble_delassus(n)
         self._solve_islands(island_count)
+        self._set_rigid_force(row_count)
+        if is_constrained:
+            self._follow_constraints(n, island_count)
         self.island_count = island_count
         self.unfinished += int(np.count_nonzero(self.islands.sweeps[:island_count] >= self.parameters.solver_sweeps))
 
@@ -170,7 +174,33 @@ class ImpulseSolver:
         self._store_warm_start(n)
         self._accumulate_wrenches(1)
         self.wrenches = self._wrench[:touched].copy()
-        self.rigid_force = rows.impulse[:row_count] @ rigid_jacobian / -self.parameters.dt
+
+    def _set_rigid_force(self, row_count: int) -> None:
+        rows = self.rows
+        self.rigid_force = rows.impulse[:row_count] @ rows.rigid_jacobian[:row_count] / -self.parameters.dt
+
+    def _follow_constraints(self, count: int, island_count: int) -> None:
+        """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve took them to.
+
+        The response to impulses is linear, but a support lets go of a body, and begins to slide under it. Had a light
+        body to be pushed as if its support held it, it would be thrown off. Each round is a Newton step: it starts from
+        the last impulses and the tangent stiffness of the constraints under them.
+        """
+        rows, row_count, p = self.rows, 3 * count, self.parameters
+        jacobian, response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
+        free = self.rigid.velocity_free
+        for _ in range(p.solver_constraint_steps):
+            assert self.rigid_force is not None
+            self.rigid.predict_with(self.rigid_force)
+            impulse, velocity = rows.impulse[:row_count], self.rigid.velocity_free
+            if np.abs(jacobian @ (velocity - free + impulse @ response)).max() < p.solver_constraint_tolerance:
+                return
+            response[:] = self.rigid.impulse_response(jacobian).T
+            free_before, free = free, velocity + impulse @ response
+            rows.velocity_free[:row_count] -= jacobian @ (free - free_before)
+            self._assemble_delassus(count)
+            self._solve_islands(island_count)
+            self._set_rigid_force(row_count)
 
     def _touched_rigid_bodies(self, count: int) -> np.ndarray:
         """MuJoCo's bodies [k] on the other side of the first ``count`` contacts, once for each."""

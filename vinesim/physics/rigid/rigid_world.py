@@ -217,11 +217,17 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         :class:`EffectiveMass`."""
         return self._effective_mass.impulse_response(self.mj_data, J)
 
+    def predict_with(self, force: np.ndarray) -> None:
+        """Predict again with generalised contact forces of plants, ``force`` [dof] N or N m: which constraints of
+        MuJoCo hold, slide or open under them."""
+        np.add(force, 0.0, out=self.mj_data.qfrc_applied)  # turns -0 into +0: -0 would keep sleeping boxes awake
+        mujoco.mj_forwardSkip(self.mj_model, self.mj_data, mujoco.mjtStage.mjSTAGE_VEL, 1)
+
     def integrate(self, force: np.ndarray | None = None) -> None:
         """Second half: integrate with generalised contact forces of plants, ``force`` [dof] N or N m."""
         m, d = self.mj_model, self.mj_data
         if force is not None:
-            np.add(force, 0.0, out=d.qfrc_applied)  # turns -0 into +0: -0 would keep sleeping boxes awake
+            np.add(force, 0.0, out=d.qfrc_applied)  # see predict_with()
         mujoco.mj_step2(m, d)
         self._link_sensors.measure(m, d)
         if self._is_faulty():
