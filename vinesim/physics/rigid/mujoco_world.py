@@ -28,6 +28,7 @@ from vinesim.physics.rigid.link_sensors import LinkSensors
 from vinesim.physics.rigid.pair_friction import PairFriction
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
+from vinesim.physics.rigid.speculative_contacts import SpeculativeContacts
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidVisual
@@ -91,6 +92,7 @@ class WorldCore:
         """Actor and link of every MuJoCo body that can be added, removed or moved, as in :class:`RigidGeoms`."""
         self._link_sensors = LinkSensors()
         self._pair_friction = PairFriction(parameters)
+        self._speculative_contacts = SpeculativeContacts()
         _log_mujoco_warnings()
         self._recompile()
 
@@ -270,6 +272,7 @@ class WorldCore:
             actor.find_indices(m, self._names)
         self._link_sensors.find_indices(m, self._robots)
         self._pair_friction.find_materials(m)
+        self._speculative_contacts.find_crates(m, sorted(m.body(f"box/{number}").id for number in self._boxes))
         for human in self._humans.values():
             for hand in human.hands:
                 self._restore_grasp(hand)

@@ -157,6 +157,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         m, d = self.mj_model, self.mj_data
         found = []
         for contact in d.contact:
+            if contact.dist > 0.0:
+                continue
             bodies = [m.geom_bodyid[geom] for geom in contact.geom]
             pairs = zip(bodies, contact.geom, strict=True)
             names = [self.owners[body][0] if body in self.owners else m.geom(geom).name for body, geom in pairs]
@@ -173,10 +175,13 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
             human.apply_controls(m, d, self.dt)
         self._valid_qpos[:] = d.qpos
         self._set_passing(self._passing_bunches, True)
+        has_margins = self._speculative_contacts.set_margins(m, d)
         # qfrc_applied is still that of the last step: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
         self._end_passing()
         self._pair_friction.apply(m, d)
+        if has_margins:
+            self._speculative_contacts.limit_closing(m, d)
         d.qfrc_applied[:] = 0.0
         # the whole forward pass after the velocity stage: single calls of its parts leave out dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
@@ -255,6 +260,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
             robot.find_indices(mj_model, self._names)
         self._link_sensors.find_indices(mj_model, self._robots)
         self._pair_friction.find_materials(mj_model)
+        crates = sorted(mj_model.body(f"box/{number}").id for number in self._boxes)
+        self._speculative_contacts.find_crates(mj_model, crates)
 
     def _is_faulty(self) -> bool:
         """Whether a number is not finite, or a rate beyond :data:`MAX_RATE`."""
