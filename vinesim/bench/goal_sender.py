@@ -248,7 +248,7 @@ def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, i
     columns = [sender.names.index(name) for name in one.joints]
     sender.wait(0.2)  # on a busy machine a result comes before the joint states of up to a second
     wanted, measured = 0.0, 0.0
-    first = np.array(sender.feedback[0].desired.positions) if sender.feedback else one.positions[0]
+    first = sender.history[0][1][columns]  # it stood there; the first feedback may be missing on a busy machine
     for told in sender.feedback:
         desired, speed = np.array(told.desired.positions), np.array(told.desired.velocities)
         wanted = max(wanted, one.velocity_off(first, desired, speed))

@@ -75,4 +75,5 @@ class SpeculativeContacts:
         is_closing = d.efc_vel[row] * dt < -gap
         d.efc_margin[row] = np.where(is_closing, d.efc_pos[row] - gap, -NEVER_REACHED)
         d.efc_KBIP[row, 0], d.efc_KBIP[row, 1], d.efc_KBIP[row, 2] = dt**-2, is_closing / dt, 1.0
-        d.efc_KBIP[row + 1, 1] = d.efc_KBIP[row + 2, 1] = 0.0
+        sliding = row[contact.dim[is_open] > 1]
+        d.efc_KBIP[sliding + 1, 1] = d.efc_KBIP[sliding + 2, 1] = 0.0
