@@ -102,6 +102,22 @@ def test_a_newer_goal_ends_the_older_and_cancelling_holds() -> None:
     assert len(managed.ended) == 2
 
 
+@pytest.mark.parametrize("how", ["cancel", "stop"])
+def test_after_a_trajectory_was_stopped_the_desired_state_is_that_the_joints_hold(how) -> None:
+    managed = ManagedRobot()
+    manager, joints = managed.manager, managed.robot.joint_indices(ARM)
+    manager.start_trajectory("arm_left_controller", managed.swing(0.5), managed.time, b"a")
+    managed.run(0.5)
+    assert (manager.desired_velocity[joints] > 0.1).all()
+    if how == "cancel":
+        manager.cancel(b"a", managed.time)
+    else:
+        manager.stop_trajectory("arm_left_controller")
+    managed.run(1.0)
+    assert not manager.desired_velocity.any()
+    np.testing.assert_allclose(manager.desired[joints], managed.arm(), atol=1e-4)
+
+
 def test_a_gripper_reaches_its_goal_or_stalls() -> None:
     """Empty fingers close to where they are asked; behind a stop of the joint's limit they stall."""
     managed = ManagedRobot()

@@ -98,6 +98,7 @@ class ControllerManager:
         self._spec(name, ControllerKind.JOINT_TRAJECTORY)
         if name in self._trajectories:
             self._trajectories[name].cancel()
+            self._take_desired(name)
             self._end(name, Outcome.CANCELED, "an empty trajectory stopped it")
 
     def start_gripper(self, name: str, opening: float, effort: float | None, time: float, goal: bytes) -> None:
@@ -126,6 +127,7 @@ class ControllerManager:
             if active.id == goal:
                 if name in self._trajectories:
                     self._trajectories[name].cancel()
+                    self._take_desired(name)
                 elif name in self._grippers:
                     here = self.robot.gripper_opening(self.specs[name].group)
                     self._grippers[name].start(here, None, time)
@@ -195,9 +197,7 @@ class ControllerManager:
             active = self._goals.get(name)
             if controller.is_moving:
                 controller(time)
-                state = controller.state(time)
-                joints = self._indices[name]
-                self.desired[joints], self.desired_velocity[joints] = state.desired, state.desired_velocity
+                self._take_desired(name)
             if active is not None and active.trajectory is not None and active.trajectory.outcome is not None:
                 self._end(name, active.trajectory.outcome, active.trajectory.text)
         for name in list(self._goals):
@@ -206,6 +206,11 @@ class ControllerManager:
                 self._results.append(GoalResult(self._goals.pop(name).id, Outcome.SUCCESSFUL, "", state))
         np.copyto(self.desired, self.robot.setpoint, where=~self._follows)
         self.desired_velocity[~self._follows] = 0.0
+
+    def _take_desired(self, name: str) -> None:
+        """Let :attr:`desired` be what a trajectory controller asks of its joints now."""
+        joints, controller = self._indices[name], self._trajectories[name]
+        self.desired[joints], self.desired_velocity[joints] = controller.desired, controller.desired_velocity
 
     def _gripper_state(self, name: str, time: float) -> GripperState | None:
         if name in self._grippers:

@@ -180,8 +180,9 @@ class TrajectoryController:
         """The goal that is executed, None if there is none."""
         self._splines: list[_Spline] = []
         """Oldest first; each joint follows the newest that has begun. The last is that of the active goal."""
-        self._desired = robot.setpoint[self.indices].copy()
-        self._desired_velocity = np.zeros(len(self.joints))
+        self.desired = robot.setpoint[self.indices].copy()
+        self.desired_velocity = np.zeros(len(self.joints))
+        """[joint] with :attr:`desired`, what it asks for at the end of the step [rad or m, rad/s or m/s]."""
 
     @property
     def is_moving(self) -> bool:
@@ -207,11 +208,11 @@ class TrajectoryController:
         moving = np.zeros(len(order))
         if began <= time:
             if self._splines:
-                moving = self._desired_velocity[order]
-            self._desired[order], self._desired_velocity[order] = here, moving
+                moving = self.desired_velocity[order]
+            self.desired[order], self.desired_velocity[order] = here, moving
         else:
             resting = ~self._sample(time)[2][order]
-            self._desired[order[resting]], self._desired_velocity[order[resting]] = here[resting], 0.0
+            self.desired[order[resting]], self.desired_velocity[order[resting]] = here[resting], 0.0
             position, velocity, moved = self._sample(began)
             here = np.where(moved[order], position[order], here)
             moving = np.where(moved[order], velocity[order], 0.0)
@@ -298,8 +299,8 @@ class TrajectoryController:
         goal, dt = self.active_goal, self.robot.rigid.dt
         wanted, rate, _ = self._sample(time)
         ahead, ahead_rate, moved = self._sample(time, dt)
-        self._desired[moved] = ahead[moved]
-        self._desired_velocity[:] = np.where(moved, ahead_rate, 0.0)
+        self.desired[moved] = ahead[moved]
+        self.desired_velocity[:] = np.where(moved, ahead_rate, 0.0)
         if goal is not None and time >= goal.start_time and not self._judge(goal, time, wanted, rate):
             return
         self.robot.command_position(ahead[moved], self.indices[moved])
@@ -337,13 +338,13 @@ class TrajectoryController:
         """Desired and actual joint states at ``time`` [s]."""
         position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
         return ControllerState(
-            time, self.joints, self._desired.copy(), self._desired_velocity.copy(), position[self.indices],
+            time, self.joints, self.desired.copy(), self.desired_velocity.copy(), position[self.indices],
             velocity[self.indices],
         )  # fmt: skip
 
     def _sample(self, time: float, ahead: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions, velocities [joint] so far ``ahead`` of ``time`` [s], and whether each joint follows a spline."""
-        position, velocity = self._desired.copy(), np.zeros(len(self.joints))
+        position, velocity = self.desired.copy(), np.zeros(len(self.joints))
         moved = np.zeros(len(self.joints), bool)
         for spline in self._splines:
             if (elapsed := time - spline.start + ahead) >= 0.0:
@@ -363,7 +364,7 @@ class TrajectoryController:
         active = self.indices[order]
         position = self.robot.rigid.joint_measurements(self.robot.name)[0][active]
         self.robot.command_position(position, active)
-        self._desired[order], self._desired_velocity[order] = position, 0.0
+        self.desired[order], self.desired_velocity[order] = position, 0.0
         self.active_goal, self._splines = None, []
 
     def _end(self, outcome: Outcome, text: str) -> None:
