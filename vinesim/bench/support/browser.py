@@ -13,6 +13,7 @@ import tempfile
 import threading
 import wave
 from collections.abc import Iterator
+from subprocess import PIPE
 from typing import Any
 
 import aiohttp
@@ -29,6 +30,9 @@ OPTIONS = (
     "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
     "--disable-dev-shm-usage", "--remote-debugging-port=0", "--window-size=640,480",
 )  # fmt: skip
+
+GUARD = '"$@" & read -r _; kill -9 $!'
+"""Script of a shell that runs a program until its own standard input ends: with this process, however that ends."""
 
 AS_RECORDED = """
   const media = navigator.mediaDevices, open = media.getUserMedia.bind(media);
@@ -138,9 +142,8 @@ def browser_page(*options: str) -> Iterator[Page]:
     if path is None:
         raise BrowserMissing(f"a browser is needed, one of {', '.join(PROGRAMS)}: install chromium")
     profile = tempfile.mkdtemp()
-    child = subprocess.Popen(
-        [path, *OPTIONS, *options, f"--user-data-dir={profile}", "about:blank"], stderr=subprocess.PIPE, text=True
-    )
+    command = [path, *OPTIONS, *options, f"--user-data-dir={profile}", "about:blank"]
+    child = subprocess.Popen(["sh", "-c", GUARD, "sh", *command], stdin=PIPE, stderr=PIPE, text=True)
     loop = asyncio.new_event_loop()
     try:
         assert child.stderr is not None
@@ -155,7 +158,8 @@ def browser_page(*options: str) -> Iterator[Page]:
         finally:
             loop.run_until_complete(session.close())
     finally:
-        child.kill()
+        assert child.stdin is not None
+        child.stdin.close()
         child.wait()
         loop.close()
         shutil.rmtree(profile, ignore_errors=True)
