@@ -127,6 +127,8 @@ class RosProcess:
         if self._is_restarted:
             self._is_restarted = False
             self.handler.cancel_all(time)
+            if self._simulation is not None:
+                self._simulation.end_steps("the process that asked for them failed")
         self.handler(time)
 
     def _finish(self, result: GoalResult) -> None:
