@@ -309,6 +309,14 @@ def test_resets_from_another_process_leave_nothing_behind(robot: StockNode) -> N
         assert row.peer != "bar, at least" or row.value >= row.peer_value, (row, rows)
 
 
+def test_a_robot_without_a_server_shows_no_area_of_interest(robot: StockNode) -> None:
+    heard: list[MarkerArray] = []
+    subscription = robot.node.create_subscription(MarkerArray, "/vine/markers", heard.append, 10)
+    wait_until(lambda: heard, lambda: robot.spin(0.05), "markers")
+    robot.node.destroy_subscription(subscription)
+    assert {one.ns for one in heard[-1].markers} == {"contacts"}
+
+
 # ---------------------------------------------------------------- the folder ros/
 
 

@@ -52,10 +52,10 @@ class RobotNode(Node):
     """One robot's topics but those of its cameras and lidars (:mod:`vinesim.ros.sensor_node`).
 
     ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
-    sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none. All topics but /clock
-    and /diagnostics stand under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether
-    this node may publish it, which one node of a ROS domain does. ``params_file``,
-    ``parameters``: see :class:`Node`.
+    sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none, ``interest_radius`` [m]
+    that of the area of interest around the robot, None without a server. All topics but /clock and /diagnostics stand
+    under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether this node may publish it, which
+    one node of a ROS domain does. ``params_file``, ``parameters``: see :class:`Node`.
     """
 
     def __init__(
@@ -69,6 +69,7 @@ class RobotNode(Node):
         imus: Sequence[str] = (),
         wrenches: Sequence[str] = (),
         bunch_of_body: np.ndarray | None = None,
+        interest_radius: float | None = None,
         base: str = "base_footprint",
         clock: bool = True,
         params_file: pathlib.Path | None = None,
@@ -79,6 +80,7 @@ class RobotNode(Node):
         self._has_clock, self._controllers = clock, controllers
         self._imus, self._wrenches = imus, wrenches
         self._bunch_of_body = np.zeros(0, np.int32) if bunch_of_body is None else bunch_of_body
+        self._interest_radius = interest_radius
         self._commands = CommandQueue()
         self._steps = 0
         self._next_look = 0.0
@@ -105,7 +107,7 @@ class RobotNode(Node):
         self._control = ControlPublisher(self._advertise, self._controllers)
         links = ElementTree.fromstring(self._urdf).iterfind("link")
         numbers = {link.get("name", ""): number for number, link in enumerate(links)}
-        self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers)
+        self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers, self._interest_radius)
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
         self._subscriptions = CommandSubscriptions(self._node, self._controllers, self._commands, AudioData)
 
