@@ -3,6 +3,8 @@
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import os
 from collections.abc import Callable
 from typing import Any
@@ -24,12 +26,15 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import String
 
+from tests.support import sensor_scenes
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.ros.messages import message_packages
 from vinesim.ros.names import ros_name
 from vinesim.ros.robot_node import RobotNode
 from vinesim.ros.sensor_node import SensorNode
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput, ComponentStatus, JointSample, RobotSample
+from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler
 
 REST = frames.pose(np.zeros(3))
 NONE = np.zeros(0)
@@ -220,6 +225,40 @@ def test_depth_labels_and_rates_of_sensors():
         assert node.rate("camera") == 5.0
         for name, value in (("camera.rate", 0.0), ("camera.jpeg_quality", 101), ("camera.exact_depth", "yes")):
             assert put(name, value), name
+
+
+def test_ranges_of_a_lidar_without_its_errors():
+    """Of the ground below a real lidar: scattered by centimetres, and exact with the parameter."""
+    clouds: list[PointCloud2] = []
+    above = frames.pose(np.array([0.0, 0.0, 1.2]))
+    (plane, view), times = sensor_scenes.world(), itertools.count()
+    with SensorNode("r_sensors", lidars=["lidar"]) as node, StockNode() as peer:
+        peer.node.create_subscription(PointCloud2, "lidar/points", clouds.append, 10)
+        lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
+        wanted = lambda: node.lidar_outputs_wanted("lidar")  # noqa: E731
+        sensor = ScheduledSensor(lidar, node.publish_lidar, wanted)
+        scheduler = SensorScheduler(sensor_scenes.empty(), [sensor], primitives=plane)
+
+        def tick() -> None:
+            scheduler.advance(dataclasses.replace(view, time=0.1 * next(times)), {"lidar": above})
+            peer.spin(0.01)
+
+        def error() -> float:
+            """Greatest distance of a point of the newest cloud from the ground [m]."""
+            cloud = clouds[-1]
+            (place,) = [field.offset for field in cloud.fields if field.name == "z"]
+            heights = np.ndarray(cloud.width * cloud.height, "<f4", bytes(cloud.data), place, (cloud.point_step,))
+            return float(np.abs(heights + 1.2).max())
+
+        wait_until(lambda: clouds, tick, "a cloud")
+        assert node.lidar_outputs_wanted("lidar") == CameraOutput.DEPTH
+        assert error() > 0.005
+        put = Setter(peer, "/r_sensors", tick)
+        assert put("lidar.exact_ranges", True) == ""
+        wait_until(lambda: error() < 1e-4, tick, "exact ranges")
+        assert put("lidar.exact_ranges", 1)
+        assert put("lidar.exact_ranges", False) == ""
+        wait_until(lambda: error() > 0.005, tick, "ranges with errors")
 
 
 @pytest.mark.parametrize(
