@@ -20,6 +20,7 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -143,6 +144,64 @@ def test_a_robot_without_truth_and_bad_values():
         peer.node.create_subscription(TFMessage, "space/tf_environment_static", heard["poles"].append, latched)
         wait_until(lambda: heard["tf"] and heard["poles"], tick, "topics of a node that was started again")
         assert (parents(), len(heard["poles"][-1].transforms), node.environment_rate) == (["odom"], 0, 20.0)
+
+
+def test_odometry_without_the_slip_of_the_tracks():
+    """It goes on from where it was by the true motion, odom stays in the map; then it is what is measured again."""
+    message_packages.ensure_importable(["tf2_msgs"])
+    from tf2_msgs.msg import TFMessage
+
+    turn = frames.from_yaw(0.5 * np.pi)
+    times = itertools.count(1)
+    odometry: list[Odometry] = []
+    transforms: list[TFMessage] = []
+
+    def sample() -> RobotSample:
+        """Of a robot that looks along y, in which it drives; the tracks measure a quarter more."""
+        way = 0.01 * next(times)
+        joints = JointSample(way, (), NONE, NONE, NONE, NONE)
+        true, measured = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.array([1.25, 0.0, 0.0, 0.0, 0.0, 0.0])
+        base, odom = frames.pose([3.0, way, 0.0], turn), frames.pose([1.25 * way, 0.0, 0.0])
+        covariance = np.full((2, 3, 3), 0.04)
+        return RobotSample("r", joints, base, true, odom, measured, covariance, (), np.zeros((0, 7)))
+
+    def last() -> tuple[float, float, float]:
+        """Of the newest odometry: how far it is along x, how fast, and the variance of x."""
+        pose, twist = odometry[-1].pose, odometry[-1].twist
+        return pose.pose.position.x, twist.twist.linear.x, pose.covariance[0]
+
+    def odom_in_map() -> tuple[float, float]:
+        (found,) = [t.transform.translation for t in transforms[-1].transforms if t.child_frame_id == "odom"]
+        return found.x, found.y
+
+    def time() -> float:
+        stamp = odometry[-1].header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec
+
+    with RobotNode("r", "<robot name='r'/>") as node, StockNode() as peer:
+        peer.node.create_subscription(Odometry, "mobile_base_controller/odom", odometry.append, 10)
+        peer.node.create_subscription(TFMessage, "tf", transforms.append, 10)
+
+        def tick() -> None:
+            node.publish_robot_state(sample())
+            for _ in range(4):
+                peer.spin(0.005)
+
+        wait_until(lambda: odometry and transforms, tick, "odometry")
+        assert last() == pytest.approx((1.25 * time(), 1.25, 0.04))
+        put = Setter(peer, "/r", tick)
+        assert put("exact_odometry", True) == ""
+        wait_until(lambda: last()[1:] == pytest.approx((1.0, 1e-6)), tick, "exact odometry")
+        begin, at = time(), last()[0]
+        assert begin < at < 1.25 * begin + 1e-9
+        wait_until(lambda: time() > begin + 0.5, tick, "a way")
+        assert last()[0] - at == pytest.approx(time() - begin)
+        there = odom_in_map()
+        seen = len(transforms)
+        wait_until(lambda: len(transforms) > seen + 20, tick, "more of tf")
+        assert odom_in_map() == pytest.approx(there)
+        assert put("exact_odometry", False) == ""
+        wait_until(lambda: last() == pytest.approx((1.25 * time(), 1.25, 0.04)), tick, "what the tracks measure")
 
 
 def test_a_parameter_file_counts_from_the_start(tmp_path):

@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
 MAP_TO_ODOM, TRUTH, ENVIRONMENT_RATE = "publish_map_to_odom", "publish_truth", "environment_rate"
+EXACT_ODOMETRY = "exact_odometry"
 """Names of parameters."""
 LOOK_PERIOD = 1.0
 """Wall time between two looks for another robot under the same names, and for commands of another type [s]."""
@@ -128,10 +129,17 @@ class RobotNode(Node):
             "Publish what no robot could measure: tf_environment, vine/contacts, vine/markers.",
             changed=self._apply_parameters,
         )
+        declare(
+            EXACT_ODOMETRY,
+            False,
+            "Odometry of the motion of the base from now on, without the slip of its tracks.",
+            changed=self._apply_parameters,
+        )
         declare(ENVIRONMENT_RATE, 10.0, "Messages a second of tf_environment [Hz].", (0.1, 50.0))
 
     def _apply_parameters(self) -> None:
         self._robot.publishes_map_to_odom = self._parameters[MAP_TO_ODOM]
+        self._robot.has_exact_odometry = self._parameters[EXACT_ODOMETRY]
         for publisher in (self._ground_truth, self._contacts):
             publisher.mute(not self._parameters[TRUTH])
 
