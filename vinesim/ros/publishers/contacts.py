@@ -56,10 +56,10 @@ class ContactPublisher:
 
     def _all_markers(self, sample: RobotSample) -> MarkerArray:
         """Those of the message before go; the area of interest is one of them."""
-        message = _arrows(sample)
+        markers = _arrows(sample)
         if self._edge is not None:
-            message.markers.append(_interest(self._edge, sample))
-        return message
+            markers.append(_interest(self._edge, sample))
+        return MarkerArray(markers=markers)
 
     def _cloud(self, sample: RobotSample) -> PointCloud2 | bytes:
         if not sample.contacts:
@@ -73,11 +73,10 @@ class ContactPublisher:
         return convert.contact_cloud(at_time, self._links, self._bunch_of_body, MAP_FRAME)
 
 
-def _arrows(sample: RobotSample) -> MarkerArray:
+def _arrows(sample: RobotSample) -> list[Marker]:
     """One arrow a contact, along the force on the robot; those of the message before go."""
     markers = [Marker(header=convert.header(sample.joints.time, MAP_FRAME), ns="contacts", action=Marker.DELETEALL)]
-    markers += [_arrow(i, contact, sample.joints.time) for i, contact in enumerate(sample.contacts)]
-    return MarkerArray(markers=markers)
+    return markers + [_arrow(i, contact, sample.joints.time) for i, contact in enumerate(sample.contacts)]
 
 
 def _arrow(number: int, contact: Contact, time: float) -> Marker:
