@@ -9,7 +9,7 @@ from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.motions import DriveTo, LookAt
-from vinesim.client.tasks.ros_command_handler import RosCommandHandler
+from vinesim.client.tasks.ros_command_handler import MAX_LOGGED, RosCommandHandler
 from vinesim.client.tasks.task_registry import UnknownTask, plan_task
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.rigid_world import RigidWorld
@@ -18,7 +18,7 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes
 from vinesim.robot.tasks.task import Task
-from vinesim.ros.commands.types import Command, ForwardCommand, JointTrajectory
+from vinesim.ros.commands.types import BaseVelocity, Command, ForwardCommand, JointTrajectory
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
@@ -165,6 +165,35 @@ def test_invalid_commands_are_counted_and_ignored():
     ]
     np.testing.assert_allclose(commanded.run(0.5), start, atol=1e-4)
     assert commanded.handle_commands.rejected_count == 3
+
+
+def test_the_log_has_each_kind_of_refusal_once(caplog):
+    """Whatever values the commands have; every refusal counts."""
+    commanded = CommandedRobot()
+    commanded.run(0.1)
+    missing = ("arm_left_1_joint", "no_joint")
+    for value in (0.1, 0.25, -3e-7):
+        commanded.queue = [
+            BaseVelocity(0.0, np.full(3, np.nan), np.full(3, value)),
+            ForwardCommand("no_controller", np.full(2, value)),
+            ForwardCommand("forward_position_controller", np.full(round(abs(value) * 10) + 1, value)),
+            ForwardCommand("forward_velocity_controller", np.full(2, value)),
+            trajectory(np.full(2, value), joints=missing),
+            trajectory(np.full(2, value), joints=missing[::-1]),
+        ]
+        commanded.run(0.01)
+    assert commanded.handle_commands.rejected_count == 18
+    logged = [record.getMessage() for record in caplog.records]
+    assert len(logged) == 6, logged
+    assert logged[0] == (
+        "refused a command of BaseVelocity, further ones of this kind are only counted: "
+        "anna: base velocity (nan, 0.1) is not finite"
+    )
+    for number in range(3 * MAX_LOGGED):
+        commanded.queue = [ForwardCommand(f"controller_{number}", np.zeros(2))]
+        commanded.run(0.01)
+    assert len(caplog.records) == MAX_LOGGED
+    assert commanded.handle_commands.rejected_count == 18 + 3 * MAX_LOGGED
 
 
 def test_a_robot_stands_until_it_may_start_and_then_drives_there() -> None:

@@ -30,6 +30,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, JointState, PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from visualization_msgs.msg import Marker, MarkerArray
 
 from tests.support.stock_node import TIMEOUT, StockNode, wait_until
 from vinesim.ros.commands.convert import CommandError
@@ -302,6 +303,33 @@ def test_no_message_is_built_without_a_subscriber(monkeypatch):
         sent = {name for name, count in (robot.sent | sensors.sent).items() if count and name not in LATCHED}
         assert sent == {"joint_states"}
         assert not any((robot.dropped | sensors.dropped).values())
+
+
+def test_the_area_of_interest_is_a_circle_around_the_base_and_there_is_none_without_a_server():
+    heard: dict[str, list[MarkerArray]] = {"shared": [], "alone": []}
+    with (
+        RobotNode("one", URDF, namespace="shared", interest_radius=3.5) as shared,
+        RobotNode("two", URDF, namespace="alone", clock=False) as alone,
+        StockNode() as peer,
+    ):
+        for name, messages in heard.items():
+            peer.node.create_subscription(MarkerArray, f"/{name}/vine/markers", messages.append, 10)
+
+        def tick() -> None:
+            for node in (shared, alone):
+                node.publish_robot_state(robot_sample(1.0))
+            peer.spin(0.01)
+
+        wait_until(lambda: all(heard.values()), tick, "markers")
+    assert [one.action for one in heard["alone"][-1].markers] == [Marker.DELETEALL]
+    clear, circle = heard["shared"][-1].markers
+    assert (clear.action, circle.action, circle.type) == (Marker.DELETEALL, Marker.ADD, Marker.LINE_STRIP)
+    assert (circle.ns, circle.header.frame_id) == ("interest", "map")
+    assert (circle.pose.position.x, circle.pose.position.y, circle.pose.position.z) == (1.0, 2.0, 0.0)
+    points = np.array([[point.x, point.y, point.z] for point in circle.points])
+    np.testing.assert_allclose(np.hypot(points[:, 0], points[:, 1]), 3.5, rtol=1e-12)
+    np.testing.assert_allclose(points[0], points[-1], atol=1e-12)
+    assert not points[:, 2].any()
 
 
 def test_subscribers_are_counted_by_family_and_knows_its_topics():

@@ -3,6 +3,8 @@
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import os
 from collections.abc import Callable
 from typing import Any
@@ -18,18 +20,22 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import String
 
+from tests.support import sensor_scenes
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.ros.messages import message_packages
 from vinesim.ros.names import ros_name
 from vinesim.ros.robot_node import RobotNode
 from vinesim.ros.sensor_node import SensorNode
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput, ComponentStatus, JointSample, RobotSample
+from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler
 
 REST = frames.pose(np.zeros(3))
 NONE = np.zeros(0)
@@ -140,6 +146,64 @@ def test_a_robot_without_truth_and_bad_values():
         assert (parents(), len(heard["poles"][-1].transforms), node.environment_rate) == (["odom"], 0, 20.0)
 
 
+def test_odometry_without_the_slip_of_the_tracks():
+    """It goes on from where it was by the true motion, odom stays in the map; then it is what is measured again."""
+    message_packages.ensure_importable(["tf2_msgs"])
+    from tf2_msgs.msg import TFMessage
+
+    turn = frames.from_yaw(0.5 * np.pi)
+    times = itertools.count(1)
+    odometry: list[Odometry] = []
+    transforms: list[TFMessage] = []
+
+    def sample() -> RobotSample:
+        """Of a robot that looks along y, in which it drives; the tracks measure a quarter more."""
+        way = 0.01 * next(times)
+        joints = JointSample(way, (), NONE, NONE, NONE, NONE)
+        true, measured = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.array([1.25, 0.0, 0.0, 0.0, 0.0, 0.0])
+        base, odom = frames.pose([3.0, way, 0.0], turn), frames.pose([1.25 * way, 0.0, 0.0])
+        covariance = np.full((2, 3, 3), 0.04)
+        return RobotSample("r", joints, base, true, odom, measured, covariance, (), np.zeros((0, 7)))
+
+    def last() -> tuple[float, float, float]:
+        """Of the newest odometry: how far it is along x, how fast, and the variance of x."""
+        pose, twist = odometry[-1].pose, odometry[-1].twist
+        return pose.pose.position.x, twist.twist.linear.x, pose.covariance[0]
+
+    def odom_in_map() -> tuple[float, float]:
+        (found,) = [t.transform.translation for t in transforms[-1].transforms if t.child_frame_id == "odom"]
+        return found.x, found.y
+
+    def time() -> float:
+        stamp = odometry[-1].header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec
+
+    with RobotNode("r", "<robot name='r'/>") as node, StockNode() as peer:
+        peer.node.create_subscription(Odometry, "mobile_base_controller/odom", odometry.append, 10)
+        peer.node.create_subscription(TFMessage, "tf", transforms.append, 10)
+
+        def tick() -> None:
+            node.publish_robot_state(sample())
+            for _ in range(4):
+                peer.spin(0.005)
+
+        wait_until(lambda: odometry and transforms, tick, "odometry")
+        assert last() == pytest.approx((1.25 * time(), 1.25, 0.04))
+        put = Setter(peer, "/r", tick)
+        assert put("exact_odometry", True) == ""
+        wait_until(lambda: last()[1:] == pytest.approx((1.0, 1e-6)), tick, "exact odometry")
+        begin, at = time(), last()[0]
+        assert begin < at < 1.25 * begin + 1e-9
+        wait_until(lambda: time() > begin + 0.5, tick, "a way")
+        assert last()[0] - at == pytest.approx(time() - begin)
+        there = odom_in_map()
+        seen = len(transforms)
+        wait_until(lambda: len(transforms) > seen + 20, tick, "more of tf")
+        assert odom_in_map() == pytest.approx(there)
+        assert put("exact_odometry", False) == ""
+        wait_until(lambda: last() == pytest.approx((1.25 * time(), 1.25, 0.04)), tick, "what the tracks measure")
+
+
 def test_a_parameter_file_counts_from_the_start(tmp_path):
     message_packages.ensure_importable(["tf2_msgs"])
     from tf2_msgs.msg import TFMessage
@@ -220,6 +284,40 @@ def test_depth_labels_and_rates_of_sensors():
         assert node.rate("camera") == 5.0
         for name, value in (("camera.rate", 0.0), ("camera.jpeg_quality", 101), ("camera.exact_depth", "yes")):
             assert put(name, value), name
+
+
+def test_ranges_of_a_lidar_without_its_errors():
+    """Of the ground below a real lidar: scattered by centimetres, and exact with the parameter."""
+    clouds: list[PointCloud2] = []
+    above = frames.pose(np.array([0.0, 0.0, 1.2]))
+    (plane, view), times = sensor_scenes.world(), itertools.count()
+    with SensorNode("r_sensors", lidars=["lidar"]) as node, StockNode() as peer:
+        peer.node.create_subscription(PointCloud2, "lidar/points", clouds.append, 10)
+        lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
+        wanted = lambda: node.lidar_outputs_wanted("lidar")  # noqa: E731
+        sensor = ScheduledSensor(lidar, node.publish_lidar, wanted)
+        scheduler = SensorScheduler(sensor_scenes.empty(), [sensor], primitives=plane)
+
+        def tick() -> None:
+            scheduler.advance(dataclasses.replace(view, time=0.1 * next(times)), {"lidar": above})
+            peer.spin(0.01)
+
+        def error() -> float:
+            """Greatest distance of a point of the newest cloud from the ground [m]."""
+            cloud = clouds[-1]
+            (place,) = [field.offset for field in cloud.fields if field.name == "z"]
+            heights = np.ndarray(cloud.width * cloud.height, "<f4", bytes(cloud.data), place, (cloud.point_step,))
+            return float(np.abs(heights + 1.2).max())
+
+        wait_until(lambda: clouds, tick, "a cloud")
+        assert node.lidar_outputs_wanted("lidar") == CameraOutput.DEPTH
+        assert error() > 0.005
+        put = Setter(peer, "/r_sensors", tick)
+        assert put("lidar.exact_ranges", True) == ""
+        wait_until(lambda: error() < 1e-4, tick, "exact ranges")
+        assert put("lidar.exact_ranges", 1)
+        assert put("lidar.exact_ranges", False) == ""
+        wait_until(lambda: error() > 0.005, tick, "ranges with errors")
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,9 @@ pytestmark = pytest.mark.ros
 if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
+from action_msgs.msg import GoalStatus
+from rclpy.action import ActionClient
+
 from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.client.client import Client
@@ -56,6 +59,33 @@ class SimulationInRos:
         wait_until(answer.done, self.step, service)
         return answer.result()
 
+    def connect(self) -> ActionClient:
+        """A client of the action of steps."""
+        from simulation_interfaces.action import SimulateSteps
+
+        found = ActionClient(self.peer.node, SimulateSteps, "simulate_steps")
+        wait_until(found.server_is_ready, self.step, "simulate_steps")
+        return found
+
+    def send(self, to: ActionClient, steps: int, heard: list[tuple[int, int]]) -> Any:
+        """The handle of a goal, which is accepted; ``heard`` takes completed and remaining steps of its feedback."""
+        from simulation_interfaces.action import SimulateSteps
+
+        def take(message: Any) -> None:
+            heard.append((message.feedback.completed_steps, message.feedback.remaining_steps))
+
+        answer = to.send_goal_async(SimulateSteps.Goal(steps=steps), feedback_callback=take)
+        wait_until(answer.done, self.step, "an answer")
+        assert answer.result().accepted
+        return answer.result()
+
+    def end_of(self, handle: Any) -> tuple[int, int, str]:
+        """Status of a goal, code and text of its result."""
+        answer = handle.get_result_async()
+        wait_until(answer.done, self.step, "a result")
+        result = answer.result().result.result
+        return answer.result().status, result.result, result.error_message
+
     def step(self) -> None:
         self.client.tick()
         self.peer.spin(0.002)
@@ -78,7 +108,7 @@ def test_pause_and_single_steps(world: SimulationInRos) -> None:
 
     physics = world.client.physics
     assert world.call("GetSimulationState").state.state == SimulationState.STATE_PLAYING
-    assert world.call("StepSimulation", steps=3).result.result == Result.RESULT_INCORRECT_STATE
+    assert world.call("StepSimulation", steps=3).result.result == Result.RESULT_OPERATION_FAILED
     pause = SimulationState(state=SimulationState.STATE_PAUSED)
     assert world.call("SetSimulationState", state=pause).result.result == Result.RESULT_OK
     stood = physics.tick
@@ -94,6 +124,66 @@ def test_pause_and_single_steps(world: SimulationInRos) -> None:
     stop = SimulationState(state=SimulationState.STATE_STOPPED)
     refused = world.call("SetSimulationState", state=stop).result
     assert (refused.result, "plays and pauses" in refused.error_message) == (Result.RESULT_FEATURE_UNSUPPORTED, True)
+
+
+def test_steps_by_the_action_are_told_of_one_by_one(world: SimulationInRos) -> None:
+    """Exactly as many as the goal says, and only of a paused simulation."""
+    from simulation_interfaces.msg import Result, SimulationState
+
+    physics, actions = world.client.physics, world.connect()
+    heard: list[tuple[int, int]] = []
+    runs = world.end_of(world.send(actions, 3, heard))
+    assert runs == (GoalStatus.STATUS_ABORTED, Result.RESULT_OPERATION_FAILED, "the simulation runs; pause it first")
+    world.call("SetSimulationState", state=SimulationState(state=SimulationState.STATE_PAUSED))
+    expected = [(done, 7 - done) for done in range(1, 8)]
+    while heard != expected:  # the server may not have found this client's subscription to feedback yet
+        heard.clear()
+        stood = physics.tick
+        end = world.end_of(world.send(actions, 7, heard))
+        assert end == (GoalStatus.STATUS_SUCCEEDED, Result.RESULT_OK, "")
+        assert physics.tick == stood + 7
+        for _ in range(10):
+            world.step()
+        assert physics.tick == stood + 7
+    none = world.end_of(world.send(actions, 0, heard))
+    assert none == (GoalStatus.STATUS_ABORTED, Result.RESULT_OPERATION_FAILED, "0 steps; give 1 to 100000")
+    assert 33 in world.call("GetSimulatorFeatures").features.features
+    world.call("SetSimulationState", state=SimulationState(state=SimulationState.STATE_PLAYING))
+
+
+def test_steps_by_the_action_end_when_they_are_cancelled(world: SimulationInRos) -> None:
+    """Services are answered meanwhile; other steps are refused, and play ends the goal, too."""
+    from simulation_interfaces.msg import Result, SimulationState
+
+    physics, actions = world.client.physics, world.connect()
+    pause = SimulationState(state=SimulationState.STATE_PAUSED)
+    play = SimulationState(state=SimulationState.STATE_PLAYING)
+    world.call("SetSimulationState", state=pause)
+    stood = physics.tick
+    handle = world.send(actions, 50_000, [])
+    wait_until(lambda: physics.tick > stood + 5, world.step, "steps")
+    assert "robot" in world.call("GetEntities").entities
+    other = world.end_of(world.send(actions, 5, []))
+    assert other[:2] == (GoalStatus.STATUS_ABORTED, Result.RESULT_OPERATION_FAILED)
+    assert "other steps are being simulated" in other[2]
+    assert world.call("StepSimulation", steps=5).result.error_message == other[2]
+    cancelled = handle.cancel_goal_async()
+    wait_until(cancelled.done, world.step, "the cancel's answer")
+    assert len(cancelled.result().goals_canceling) == 1
+    status, code, text = world.end_of(handle)
+    assert (status, code) == (GoalStatus.STATUS_CANCELED, Result.RESULT_OPERATION_FAILED)
+    assert text == f"cancelled after {physics.tick - stood} of 50000 steps"
+    stood = physics.tick
+    for _ in range(10):
+        world.step()
+    assert physics.tick == stood
+    handle = world.send(actions, 50_000, [])
+    world.call("SetSimulationState", state=play)
+    status, code, text = world.end_of(handle)
+    assert (status, code) == (GoalStatus.STATUS_ABORTED, Result.RESULT_OPERATION_FAILED)
+    assert text.startswith("ended by play after ")
+    stood = physics.tick
+    wait_until(lambda: physics.tick > stood + 20, world.step, "the simulation to play")
 
 
 def test_entities_and_their_states(world: SimulationInRos) -> None:
@@ -181,5 +271,7 @@ def test_a_client_of_a_shared_world_does_not_pause(world: SimulationInRos) -> No
         pause = SimulationState(state=SimulationState.STATE_PAUSED)
         refused = world.call("SetSimulationState", state=pause).result
         assert (refused.result, "cannot pause" in refused.error_message) == (Result.RESULT_INCORRECT_STATE, True)
+        steps = world.call("StepSimulation", steps=3).result
+        assert (steps.result, steps.error_message) == (Result.RESULT_OPERATION_FAILED, refused.error_message)
     finally:
         world.client.world_time.is_shared = False

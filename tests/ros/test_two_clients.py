@@ -21,6 +21,7 @@ if middleware.unavailable_reason() is not None:
 
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
+from visualization_msgs.msg import MarkerArray
 
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.client.processes.child_process import Process, ProcessGroup, process_group
@@ -32,6 +33,8 @@ from vinesim.ros.tools.subscribing import offered_qos
 SHARED = {"/clock", "/diagnostics", "/rosout", "/parameter_events"}
 """Topics that are the same whatever the namespace."""
 TF = "tf2_msgs/msg/TFMessage"
+INTEREST_RADIUS = 4.5
+"""[m] Of all clients: near their default."""
 NEWEST = 300
 """Messages of a topic whose stamps are compared with the time at which they were sent."""
 
@@ -76,10 +79,11 @@ class World:
         peer.node.create_subscription(Clock, "/clock", self._take_clock, 1000)
 
     def start(self, name: str, spawn: int) -> None:
-        """Start a client whose robot has this name and namespace."""
+        """Start a client whose robot has this name and namespace, and an :data:`INTEREST_RADIUS`."""
         self.clients[name] = self._group.start(
             name, "-m", "vinesim", "client", "--role", "robot", "--connect", self._endpoint, "--name", name,
             "--namespace", name, "--spawn", str(spawn), "--status", "none",
+            "--interest-radius", str(INTEREST_RADIUS),
         )  # fmt: skip
 
     def look(self) -> None:
@@ -172,6 +176,23 @@ def test_names_and_frames_of_two_clients_do_not_collide(world: World, peer: Stoc
         for frame in moving.keys() | fixed.keys():
             while frame != "map":  # ends: every frame hangs on the map
                 (frame,) = (moving | fixed)[frame]
+
+
+@pytest.mark.slow
+def test_markers_show_the_area_of_interest_of_each_client(world: World, peer: StockNode) -> None:
+    heard: dict[str, list[MarkerArray]] = {"north": [], "south": []}
+    subscriptions = [
+        peer.node.create_subscription(MarkerArray, f"/{name}/vine/markers", messages.append, 10)
+        for name, messages in heard.items()
+    ]
+    wait_until(lambda: all(heard.values()), world.look, "markers")
+    for one in subscriptions:
+        peer.node.destroy_subscription(one)
+    for messages in heard.values():
+        (circle,) = [one for one in messages[-1].markers if one.ns == "interest"]
+        assert [np.hypot(point.x, point.y) for point in circle.points] == pytest.approx(
+            [INTEREST_RADIUS] * len(circle.points)
+        )
 
 
 @pytest.mark.slow

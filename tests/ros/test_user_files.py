@@ -16,6 +16,7 @@ import sys
 import threading
 import types
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,9 +28,12 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 import yaml
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.action.client import ClientGoalHandle
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.task import Future
 from sensor_msgs.msg import BatteryState, JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
@@ -307,6 +311,67 @@ def test_resets_from_another_process_leave_nothing_behind(robot: StockNode) -> N
     for row in reset_rows(rows, {}):
         assert row.peer != "bar, at most" or row.value <= row.peer_value, (row, rows)
         assert row.peer != "bar, at least" or row.value >= row.peer_value, (row, rows)
+
+
+def test_steps_of_the_paused_robot_are_told_of_and_cancelled(robot: StockNode) -> None:
+    """By its ROS process; the robot's state says how many there were."""
+    from rclpy.action import ActionClient
+    from simulation_interfaces.action import SimulateSteps
+    from simulation_interfaces.msg import Result, SimulationState
+    from simulation_interfaces.srv import GetEntityState, SetSimulationState
+
+    state = robot.node.create_client(GetEntityState, "/get_entity_state")
+    setter = robot.node.create_client(SetSimulationState, "/set_simulation_state")
+    actions = ActionClient(robot.node, SimulateSteps, "/simulate_steps")
+
+    def wait_for(future: Future) -> Any:
+        wait_until(future.done, lambda: robot.spin(0.05), "an answer")
+        return future.result()
+
+    def put(state: int) -> None:
+        answer = wait_for(setter.call_async(SetSimulationState.Request(state=SimulationState(state=state))))
+        assert answer.result.result == Result.RESULT_OK
+
+    def steps_done() -> int:
+        stamp = wait_for(state.call_async(GetEntityState.Request(entity="vinebot"))).state.header.stamp
+        return stamp.sec * 100 + round(stamp.nanosec / 10**7)
+
+    def send(steps: int, heard: list[int]) -> ClientGoalHandle:
+        take = lambda message: heard.append(message.feedback.completed_steps)  # noqa: E731
+        return wait_for(actions.send_goal_async(SimulateSteps.Goal(steps=steps), feedback_callback=take))
+
+    servers = (state.service_is_ready, setter.service_is_ready, actions.server_is_ready)
+    wait_until(lambda: all(is_ready() for is_ready in servers), lambda: robot.spin(0.05), "the simulation's node")
+    put(SimulationState.STATE_PAUSED)
+    heard: list[int] = []
+    while heard[-1:] != [20]:  # the robot may not have found this node's subscription to feedback yet
+        heard.clear()
+        stood = steps_done()
+        answer = wait_for(send(20, heard).get_result_async())
+        assert (answer.status, answer.result.result.result) == (GoalStatus.STATUS_SUCCEEDED, Result.RESULT_OK)
+        assert steps_done() == stood + 20
+        for _ in range(10):
+            robot.spin(0.02)
+    assert heard == sorted(set(heard))
+    stood = steps_done()
+    heard.clear()
+    handle = send(50_000, heard)
+    wait_until(lambda: len(heard) > 5, lambda: robot.spin(0.05), "steps")
+    assert len(wait_for(handle.cancel_goal_async()).goals_canceling) == 1
+    answer = wait_for(handle.get_result_async())
+    assert answer.status == GoalStatus.STATUS_CANCELED
+    text = answer.result.result.error_message
+    assert text == f"cancelled after {steps_done() - stood} of 50000 steps"
+    put(SimulationState.STATE_PLAYING)
+    actions.destroy()
+
+
+def test_a_robot_without_a_server_shows_no_area_of_interest(robot: StockNode) -> None:
+    heard: list[MarkerArray] = []
+    subscription = robot.node.create_subscription(MarkerArray, "/vine/markers", heard.append, 10)
+    wait_until(lambda: heard, lambda: robot.spin(0.05), "markers")
+    robot.node.destroy_subscription(subscription)
+    assert {one.ns for one in heard[-1].markers} == {"contacts"}
 
 
 # ---------------------------------------------------------------- the folder ros/

@@ -238,6 +238,27 @@ def test_range_noise_and_steps() -> None:
     assert np.abs(steps - np.round(steps)).max() < 0.01
 
 
+@pytest.mark.parametrize("returns", ["strongest", "dual"])
+def test_an_exact_revolution_is_that_of_an_ideal_lidar(returns: str) -> None:
+    """From the next one on: the present revolution stays as it began."""
+    spec, walls = _but(returns=returns, weakest=8e-5), _two_walls(1.5)
+    lidar, other, ideal = Lidar(spec), Lidar(spec), Lidar(spec.ideal()).scan(walls, AT)
+    lidar.begin_revolution()
+    lidar.is_exact = True
+    lidar.fire(walls, 0, np.broadcast_to(AT, (lidar.firings, 7)))
+    measured = other.scan(walls, AT)
+    assert np.array_equal(lidar.finish_revolution(AT, 0.0).xyz, measured.xyz)
+    exact = lidar.scan(walls, AT)
+    assert len(exact.xyz) > len(measured.xyz)
+    for name in ("ring", "offset", "labels"):
+        assert np.array_equal(getattr(exact, name), getattr(ideal, name)), name
+    assert exact.xyz == pytest.approx(ideal.xyz, abs=1e-6)
+    assert exact.intensity == pytest.approx(ideal.intensity, abs=1e-4)
+    lidar.is_exact = False
+    other.revolution += 1
+    assert np.array_equal(lidar.scan(walls, AT).xyz, other.scan(walls, AT).xyz)
+
+
 def test_weak_echoes_are_lost() -> None:
     """The same wall returns less and less often from farther away, and from a darker thing none."""
     shares = []

@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
 MAP_TO_ODOM, TRUTH, ENVIRONMENT_RATE = "publish_map_to_odom", "publish_truth", "environment_rate"
+EXACT_ODOMETRY = "exact_odometry"
 """Names of parameters."""
 LOOK_PERIOD = 1.0
 """Wall time between two looks for another robot under the same names, and for commands of another type [s]."""
@@ -52,10 +53,10 @@ class RobotNode(Node):
     """One robot's topics but those of its cameras and lidars (:mod:`vinesim.ros.sensor_node`).
 
     ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
-    sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none. All topics but /clock
-    and /diagnostics stand under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether
-    this node may publish it, which one node of a ROS domain does. ``params_file``,
-    ``parameters``: see :class:`Node`.
+    sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none, ``interest_radius`` [m]
+    that of the area of interest around the robot, None without a server. All topics but /clock and /diagnostics stand
+    under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether this node may publish it, which
+    one node of a ROS domain does. ``params_file``, ``parameters``: see :class:`Node`.
     """
 
     def __init__(
@@ -69,6 +70,7 @@ class RobotNode(Node):
         imus: Sequence[str] = (),
         wrenches: Sequence[str] = (),
         bunch_of_body: np.ndarray | None = None,
+        interest_radius: float | None = None,
         base: str = "base_footprint",
         clock: bool = True,
         params_file: pathlib.Path | None = None,
@@ -79,6 +81,7 @@ class RobotNode(Node):
         self._has_clock, self._controllers = clock, controllers
         self._imus, self._wrenches = imus, wrenches
         self._bunch_of_body = np.zeros(0, np.int32) if bunch_of_body is None else bunch_of_body
+        self._interest_radius = interest_radius
         self._commands = CommandQueue()
         self._steps = 0
         self._next_look = 0.0
@@ -105,7 +108,7 @@ class RobotNode(Node):
         self._control = ControlPublisher(self._advertise, self._controllers)
         links = ElementTree.fromstring(self._urdf).iterfind("link")
         numbers = {link.get("name", ""): number for number, link in enumerate(links)}
-        self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers)
+        self._contacts = ContactPublisher(self._advertise, self._bunch_of_body, numbers, self._interest_radius)
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
         self._subscriptions = CommandSubscriptions(self._node, self._controllers, self._commands, AudioData)
 
@@ -126,10 +129,17 @@ class RobotNode(Node):
             "Publish what no robot could measure: tf_environment, vine/contacts, vine/markers.",
             changed=self._apply_parameters,
         )
+        declare(
+            EXACT_ODOMETRY,
+            False,
+            "Odometry of the motion of the base from now on, without the slip of its tracks.",
+            changed=self._apply_parameters,
+        )
         declare(ENVIRONMENT_RATE, 10.0, "Messages a second of tf_environment [Hz].", (0.1, 50.0))
 
     def _apply_parameters(self) -> None:
         self._robot.publishes_map_to_odom = self._parameters[MAP_TO_ODOM]
+        self._robot.has_exact_odometry = self._parameters[EXACT_ODOMETRY]
         for publisher in (self._ground_truth, self._contacts):
             publisher.mute(not self._parameters[TRUTH])
 

@@ -53,7 +53,7 @@ class SensorNode(Node):
         parameters = self._parameters
         self._cameras = {one: CameraPublisher(self._advertise, one, parameters) for one in self._camera_names}
         self._lidars = {  # Nav2 expects /scan
-            one: LidarPublisher(self._advertise, one, f"{one}/scan" if i else "scan")
+            one: LidarPublisher(self._advertise, one, f"{one}/scan" if i else "scan", parameters)
             for i, one in enumerate(self._lidar_names)
         }
         for sensor, rate in self._rates.items():
@@ -89,8 +89,11 @@ class SensorNode(Node):
         """What subscribers need of the frames of one of ``cameras``; :class:`ValueError` if there is no such camera."""
         return self._publisher(self._cameras, "camera", camera).wanted()
 
-    def lidar_wanted(self, lidar: str) -> bool:
-        """Whether one of ``lidars`` has subscribers; :class:`ValueError` if there is no such lidar."""
+    def lidar_outputs_wanted(self, lidar: str) -> CameraOutput:
+        """What subscribers need of the scans of one of ``lidars``: depth, exact depth, or none.
+
+        :class:`ValueError` if there is no such lidar.
+        """
         return self._publisher(self._lidars, "lidar", lidar).wanted()
 
     @property

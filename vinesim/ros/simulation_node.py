@@ -1,4 +1,4 @@
-"""simulation_interfaces: services by which test programs pause, step and reset a simulation, and change what is in it.
+"""simulation_interfaces: how test programs pause, step and reset a simulation, and change what is in it.
 
 Services wait for an answer of the simulation, which is given between two steps; so this node has a thread and a context
 of its own. What is not supported says so: result 0, with a text.
@@ -9,12 +9,14 @@ from __future__ import annotations
 import itertools
 import re
 import threading
+import time as wall
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Pose, Twist
 
+from vinesim.ros.commands.step_action import StepAction
 from vinesim.ros.commands.types import (
     Entity,
     EntityArguments,
@@ -23,6 +25,7 @@ from vinesim.ros.commands.types import (
     SimulationAction,
     SimulationReply,
     SimulationRequest,
+    StepProgress,
 )
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.node import Node
@@ -51,21 +54,28 @@ INVALID_SPAWN_POSE, INVALID_POSE = 109, 101
 
 
 class SimulationNode(Node):
-    """The services, beside a robot's node. ``ask`` sends a request to the simulation; :meth:`answer` takes replies."""
+    """The services and the action, beside a robot's node.
+
+    ``ask`` sends a request to the simulation; :meth:`answer` takes replies.
+    """
 
     def __init__(self, name: str, namespace: str, ask: Callable[[SimulationRequest], None]) -> None:
         message_packages.ensure_importable(["simulation_interfaces"])
         self._ask = ask
-        self._numbers = itertools.count()
+        # another run of the process may get late answers to requests of this one
+        self._numbers = itertools.count(wall.monotonic_ns())
         self._waiting: dict[int, threading.Event] = {}
         self._replies: dict[int, SimulationReply] = {}
         super().__init__(name, namespace, ())
 
-    def answer(self, reply: SimulationReply) -> None:
-        """Pass on the simulation's answer; called by any thread."""
-        if (waiting := self._waiting.get(reply.number)) is not None:
+    def answer(self, reply: SimulationReply | StepProgress) -> None:
+        """Pass on the simulation's answer, or how far it is; called by any thread."""
+        waiting = self._waiting.get(reply.number)
+        if waiting is not None and isinstance(reply, SimulationReply):
             self._replies[reply.number] = reply
             waiting.set()
+        else:
+            self._steps.answer(reply)
 
     def _wake(self) -> None:
         for waiting in list(self._waiting.values()):
@@ -94,6 +104,7 @@ class SimulationNode(Node):
         for name, serve in served.items():
             topic = re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
             self._node.create_service(getattr(services, name), topic, serve)
+        self._steps = StepAction(self._node, self._ask, self._numbers, self._result_of)
 
     # ------------------------------------------------------------------ services
 
@@ -104,7 +115,7 @@ class SimulationNode(Node):
             known.SIMULATION_RESET, known.SIMULATION_RESET_STATE, known.SIMULATION_RESET_SPAWNED,
             known.ENTITY_CATEGORIES, known.ENTITY_STATE_GETTING, known.ENTITY_INFO_GETTING,
             known.SIMULATION_STATE_GETTING, known.SIMULATION_STATE_SETTING, known.SIMULATION_STATE_PAUSE,
-            known.STEP_SIMULATION_SINGLE, known.STEP_SIMULATION_MULTIPLE,
+            known.STEP_SIMULATION_SINGLE, known.STEP_SIMULATION_MULTIPLE, known.STEP_SIMULATION_ACTION,
         ]  # fmt: skip
         response.features.custom_info = (
             "only a client without a server pauses, steps, resets and changes entities; time goes on over a reset; "
@@ -227,6 +238,12 @@ class SimulationNode(Node):
             self._time = reply.time
             result.result = self._result.RESULT_OK
         return reply
+
+    def _result_of(self, reply: SimulationReply) -> Any:
+        """The answer to a request of steps as a Result."""
+        if reply.refusal:
+            return self._result(result=_CODES[reply.kind], error_message=reply.refusal)
+        return self._result(result=self._result.RESULT_OK)
 
     def _fail(self, result: Any, code: int, text: str) -> None:
         result.result, result.error_message = code, text

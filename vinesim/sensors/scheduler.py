@@ -32,7 +32,7 @@ def load_kernels() -> None:
 
 
 DemandQuery = Callable[[], CameraOutput]
-"""The outputs of a sensor that are wanted now; a lidar scans if there is any."""
+"""The outputs of a sensor that are wanted now; a lidar scans if there is any, exactly if it is exact depth alone."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -150,6 +150,7 @@ class SensorScheduler:
             yield frame
             return
         scan = self._scans[scheduled.name]
+        scheduled.sensor.is_exact = scheduled.wanted() == CameraOutput.EXACT_DEPTH
         scan.set_period(scheduled.period)
         missed = scan.dropped
         yield from scan.advance(self.primitives, now)

@@ -33,13 +33,12 @@ class RobotProcesses:
 
     def __init__(
         self, name: str, scene: Scene, model: Model, description: RobotDescription, *, namespace: str = "",
-        params_file: pathlib.Path | None = None,
+        params_file: pathlib.Path | None = None, interest_radius: float | None = None,
         ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
         renderer: str = "warp", device: str = "cpu",
     ) -> None:  # fmt: skip
         """``clock``: may publish /clock, as one node of a ROS domain does; ``params_file``: ROS parameters of the
-        nodes. For the others see
-        :class:`SensorProcess`."""
+        nodes; ``interest_radius``: see :class:`RosProcess`. For the others see :class:`SensorProcess`."""
         if ros and (reason := middleware.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
@@ -50,13 +49,13 @@ class RobotProcesses:
                     keep_pictures=keep_pictures, sensor_hz=sensor_hz, renderer=renderer, device=device,
                 )
             )  # fmt: skip
-            self.ros = (
-                stack.enter_context(
-                    RosProcess(name, model, description, namespace=namespace, params_file=params_file, clock=clock)
-                )
-                if ros
-                else None
-            )
+            self.ros = None
+            if ros:
+                process = RosProcess(
+                    name, model, description, namespace=namespace, params_file=params_file, clock=clock,
+                    interest_radius=interest_radius,
+                )  # fmt: skip
+                self.ros = stack.enter_context(process)
             self._stack = stack.pop_all()
 
     def attach(self, client: Client, robot: Robot | None = None) -> None:

@@ -46,10 +46,11 @@ class RosProcess:
 
     def __init__(
         self, name: str, model: Model, description: RobotDescription, *, namespace: str = "",
-        params_file: pathlib.Path | None = None, clock: bool = True,
+        params_file: pathlib.Path | None = None, clock: bool = True, interest_radius: float | None = None,
     ) -> None:  # fmt: skip
         """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock, and
-        serves simulation_interfaces. ``params_file``: ROS parameters of its node."""
+        serves simulation_interfaces. ``params_file``: ROS parameters of its node. ``interest_radius`` [m]: of the
+        client, to be shown; None without a server."""
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
         self._sent: dict[str, int] = {}
@@ -79,7 +80,7 @@ class RosProcess:
             frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
             model.bunch_of_body(),
             description.controllers, tuple(mount.name for mount in description.imus),
-            tuple(mount.name for mount in description.wrenches), params_file,
+            tuple(mount.name for mount in description.wrenches), interest_radius, params_file,
         )  # fmt: skip
         self._visuals: tuple[RigidVisual, ...] | None = None
         """All rigid bodies when the list of those in the truth was made."""
@@ -127,6 +128,8 @@ class RosProcess:
         if self._is_restarted:
             self._is_restarted = False
             self.handler.cancel_all(time)
+            if self._simulation is not None:
+                self._simulation.end_steps("the process that asked for them failed")
         self.handler(time)
 
     def _finish(self, result: GoalResult) -> None:

@@ -72,6 +72,8 @@ class RosConfig:
     controllers: tuple[ControllerSpec, ...]
     imus: tuple[str, ...]
     wrenches: tuple[str, ...]
+    interest_radius: float | None = None
+    """[m] Of the area around the robot within which the network sends it what others move; None without a server."""
     params_file: pathlib.Path | None = None
     """ROS parameters of the node."""
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
@@ -133,9 +135,8 @@ class RosWorker:
         self.node = RobotNode(
             ros_name(config.name), config.urdf, namespace=config.namespace, static_transforms=config.static_transforms,
             controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
-            bunch_of_body=config.bunch_of_body, base=config.base, clock=config.clock,
-            params_file=config.params_file,
-            parameters=config.parameters,
+            bunch_of_body=config.bunch_of_body, interest_radius=config.interest_radius, base=config.base,
+            clock=config.clock, params_file=config.params_file, parameters=config.parameters,
         )  # fmt: skip
         self._requests: queue.SimpleQueue[SimulationRequest] = queue.SimpleQueue()
         self.simulation = None

@@ -227,10 +227,9 @@ class SensorWorker:
         return demand
 
     def _lidar_demand(self, name: str) -> Callable[[], CameraOutput]:
-        """Whether a lidar has subscribers now."""
-        return lambda: (
-            CameraOutput.DEPTH if self.node is not None and self.node.lidar_wanted(name) else CameraOutput.NONE
-        )
+        """What the subscribers of a lidar need now."""
+        node = self.node
+        return lambda: CameraOutput.NONE if node is None else node.lidar_outputs_wanted(name)
 
     # ------------------------------------------------------------------ loop
 

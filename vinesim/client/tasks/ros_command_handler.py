@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import re
 from collections.abc import Callable, Iterable
 
 from vinesim.client.world_time import WorldTime
@@ -32,6 +33,13 @@ from vinesim.ros.commands.types import (
 
 log = logging.getLogger(__name__)
 
+MAX_LOGGED = 32
+"""Largest number of kinds of refusals in the log: some reasons name what the sender made up."""
+
+_NUMBER = r"(?<![\w.])[-+]?(?:\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|nan|inf)(?!\w)"
+_NUMBERS = re.compile(rf"{_NUMBER}(?:,? {_NUMBER})*")
+"""Numbers in a reason: values, which differ with each command, but not those in names of joints."""
+
 _STATUS = {Outcome.SUCCESSFUL: GoalStatus.SUCCEEDED, Outcome.CANCELED: GoalStatus.CANCELED}
 
 
@@ -55,6 +63,8 @@ class RosCommandHandler:
         self.controllers = ControllerManager(robot)
         self.rejected_count = 0
         """Commands that this robot cannot take."""
+        self._logged: set[tuple[str, str]] = set()
+        """Kinds of refusals that the log has."""
         self._lights_color: tuple[float, float, float] | None = None
         """Of the indicator lights; None: that of the pattern."""
         self._commands, self._finish, self._world_time = commands, finish, world_time
@@ -66,12 +76,22 @@ class RosCommandHandler:
             try:
                 self._apply(command, time)
             except CommandError as error:
-                self.rejected_count += 1
-                if self.rejected_count == 1:
-                    log.warning("refused a command, further ones are only counted: %s", error)
+                self._refuse(command, error)
         self.controllers(time)
         for result in self.controllers.take_results():
             self._finish(_goal_result(result))
+
+    def _refuse(self, command: Command, error: CommandError) -> None:
+        """Count a command that this robot cannot take; the log has each kind of refusal once.
+
+        A kind is a controller, or a type of commands that have none, with a reason, whatever numbers that names.
+        """
+        self.rejected_count += 1
+        sender = getattr(command, "controller", type(command).__name__)
+        kind = sender, _NUMBERS.sub("#", str(error))
+        if kind not in self._logged and len(self._logged) < MAX_LOGGED:
+            self._logged.add(kind)
+            log.warning("refused a command of %s, further ones of this kind are only counted: %s", sender, error)
 
     def cancel_all(self, time: float) -> None:
         """Cancel all goals, as the process that serves them is gone."""

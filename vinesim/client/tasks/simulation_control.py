@@ -15,6 +15,7 @@ from vinesim.ros.commands.types import (
     SimulationAction,
     SimulationReply,
     SimulationRequest,
+    StepProgress,
 )
 
 MAX_STEPS = 100_000
@@ -27,12 +28,14 @@ class SimulationControl:
     Only a client without a server pauses: others would see its actors stand still and take their objects.
     """
 
-    def __init__(self, client: Client, reply: Callable[[SimulationReply], None]) -> None:
+    def __init__(self, client: Client, reply: Callable[[SimulationReply | StepProgress], None]) -> None:
         self._client, self._reply = client, reply
         self._editor = WorldEditor(client)
         self._requests: collections.deque[SimulationRequest] = collections.deque()
         self._stepping: SimulationRequest | None = None
         """A request whose steps are being simulated."""
+        self._told_steps = 0
+        """How many of its steps were told of."""
 
     def put(self, request: SimulationRequest) -> None:
         """Add a request."""
@@ -40,22 +43,42 @@ class SimulationControl:
 
     def __call__(self) -> None:
         """Answer what can be answered now; call it between two steps."""
-        client = self._client
-        if self._stepping is not None:
-            if client.steps_before_pause:
-                return
-            self._answer(self._stepping)
-            self._stepping = None
-        while self._requests and self._stepping is None:
+        self._follow_steps()
+        while self._requests:
             self._serve(self._requests.popleft())
 
+    def end_steps(self, reason: str) -> None:
+        """End the steps that are being simulated, if there are any, and pause; their request is refused."""
+        if (request := self._stepping) is None:
+            return
+        done = request.steps - (self._client.steps_before_pause or 0)
+        self._stepping, self._client.steps_before_pause = None, 0
+        self._answer(request, refusal=f"{reason} after {done} of {request.steps} steps", kind=Refusal.FAILED)
+
+    def _follow_steps(self) -> None:
+        """Tell of the step that was done since the last call; answer the request after its last step."""
+        if (request := self._stepping) is None:
+            return
+        remaining = self._client.steps_before_pause or 0
+        done = request.steps - remaining
+        if request.wants_progress and done > self._told_steps:
+            self._told_steps = done
+            self._reply(StepProgress(request.number, done, remaining))
+        if not remaining:
+            self._stepping = None
+            self._answer(request)
+
     def _serve(self, request: SimulationRequest) -> None:
+        if request.action is SimulationAction.CANCEL_STEPS:
+            if self._stepping is not None and self._stepping.number == request.number:
+                self.end_steps("cancelled")
+            return
         try:
             result = self._do(request)
         except RequestRefused as error:
             self._answer(request, refusal=str(error), kind=error.kind)
         else:
-            if self._stepping is None:
+            if self._stepping is not request:
                 self._answer(request, **result)
 
     def _do(self, request: SimulationRequest) -> dict[str, Any]:
@@ -74,24 +97,29 @@ class SimulationControl:
                 editor.set_state(arguments)
             case SimulationAction.RESET:
                 editor.reset(keep_state=request.keep_state, keep_spawned=request.keep_spawned)
+                self.end_steps("ended by reset")
             case SimulationAction.PLAY | SimulationAction.PAUSE | SimulationAction.STEP:
                 self._play(request)
         return {}
 
     def _play(self, request: SimulationRequest) -> None:
         """Play, pause, or begin to step."""
-        client = self._client
+        client, is_step = self._client, request.action is SimulationAction.STEP
         if client.world_time.is_shared:
             text = "a client of a shared world cannot pause; start it without --connect"
-            raise RequestRefused(Refusal.INCORRECT_STATE, text)
-        if request.action is not SimulationAction.STEP:
+            # StepSimulation and SimulateSteps define this code for a simulation that runs
+            raise RequestRefused(Refusal.FAILED if is_step else Refusal.INCORRECT_STATE, text)
+        if not is_step:
+            self.end_steps(f"ended by {request.action}")
             client.steps_before_pause = 0 if request.action is SimulationAction.PAUSE else None
         elif client.steps_before_pause is None:
-            raise RequestRefused(Refusal.INCORRECT_STATE, "the simulation runs; pause it first")
+            raise RequestRefused(Refusal.FAILED, "the simulation runs; pause it first")
+        elif self._stepping is not None:
+            raise RequestRefused(Refusal.FAILED, "other steps are being simulated; wait for them, or cancel them")
         elif not 1 <= request.steps <= MAX_STEPS:
             raise RequestRefused(Refusal.FAILED, f"{request.steps} steps; give 1 to {MAX_STEPS}")
         else:
-            client.steps_before_pause, self._stepping = request.steps, request
+            client.steps_before_pause, self._stepping, self._told_steps = request.steps, request, 0
 
     def _answer(self, request: SimulationRequest, **values: Any) -> None:
         client = self._client

@@ -17,6 +17,8 @@ class Receiver:
 
     rays: int
     """Of one shot, the first one in its middle."""
+    used: int
+    """Of these, how many count, from the first on."""
     reflectance: wp.array(dtype=wp.float32)
     """[organ]"""
     nearest: float
@@ -59,7 +61,7 @@ class SortedRays:
     range: RayValues
     """[m]"""
     brightness: RayValues
-    """Reflectance times cosine, over the number of rays."""
+    """Reflectance times cosine, over the number of rays that count."""
     ray: RayValues
     """Which ray it was."""
     count: int
@@ -83,7 +85,7 @@ def sorted_rays(
     bright = RayValues()
     name = RayValues()  # which ray, sorted with the others
     count = wp.int32(0)
-    for k in range(rays):
+    for k in range(receiver.used):
         ray = shot * rays + k
         it = primitive[ray]
         r = distance[ray]
@@ -94,7 +96,7 @@ def sorted_rays(
                 n = normal_at(shapes, it, wp.transform_point(pose, direction[ray] * r))
                 matter = organ[it]
             slant = wp.abs(wp.dot(n, wp.transform_vector(pose, direction[ray])))
-            light = receiver.reflectance[matter] * slant / float(rays)
+            light = receiver.reflectance[matter] * slant / float(receiver.used)
             # insert by range
             j = count
             while j > 0 and t[j - 1] > r:

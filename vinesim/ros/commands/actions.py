@@ -30,7 +30,7 @@ MAX_GOALS = 32
 """Goals of one robot that are executed at once; further ones are rejected."""
 
 
-class _DeferredActionServer(ActionServer):
+class DeferredActionServer(ActionServer):
     """An action server whose accepted goals are executing, but have no task until there is a result."""
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Callable[..., Any] | None) -> None:
@@ -65,7 +65,7 @@ class ControllerActions:
     def _serve(
         self, node: rclpy.node.Node, action: Any, name: str, take: Callable[..., JointTrajectory | GripperGoal]
     ) -> None:
-        server = _DeferredActionServer(
+        server = DeferredActionServer(
             node, action, name, lambda _: action.Result(), goal_callback=partial(self._judge, take),
             cancel_callback=self._cancel, result_timeout=RESULT_TIMEOUT,
         )  # fmt: skip
@@ -129,10 +129,10 @@ class ControllerActions:
             if (gripper := result.gripper) is not None:
                 message.position, message.effort = gripper.position, gripper.effort
                 message.stalled, message.reached_goal = gripper.stalled, gripper.reached_goal
-        goal.server.notify_execute(goal.handle, partial(_end, result.status, message))
+        goal.server.notify_execute(goal.handle, partial(end_goal, result.status, message))
 
 
-def _end(status: GoalStatus, result: Any, handle: ServerGoalHandle) -> Any:
+def end_goal(status: GoalStatus, result: Any, handle: ServerGoalHandle) -> Any:
     """Bring a goal into its last state; a cancel request that came too late leaves it succeeded or aborted."""
     if handle.is_cancel_requested and status is not GoalStatus.SUCCEEDED:
         handle.canceled()

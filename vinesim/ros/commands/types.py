@@ -179,6 +179,8 @@ class SimulationAction(enum.StrEnum):
     PLAY = "play"
     PAUSE = "pause"
     STEP = "step_simulation"
+    CANCEL_STEPS = "cancel_steps"
+    """The end of a :attr:`STEP` before its last step; the request has the number of that one, which is answered."""
     GET_ENTITIES = "get_entities"
     GET_SPAWNABLES = "get_spawnables"
     SPAWN = "spawn_entity"
@@ -267,11 +269,22 @@ class SimulationRequest:
     action: SimulationAction
     steps: int = 0
     """Of :attr:`SimulationAction.STEP`."""
+    wants_progress: bool = False
+    """Of :attr:`SimulationAction.STEP`: whether each step is told of by a :class:`StepProgress`."""
     entity: EntityArguments | None = None
     keep_state: bool = False
     """Of :attr:`SimulationAction.RESET`: only spawned entities go."""
     keep_spawned: bool = False
     """Of :attr:`SimulationAction.RESET`: spawned entities stay, where they were spawned."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class StepProgress:
+    """How far the steps of the request of the same number are; its answer follows after the last."""
+
+    number: int
+    completed: int
+    remaining: int
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

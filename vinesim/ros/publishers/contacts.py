@@ -1,4 +1,4 @@
-"""Topics of contacts between a robot and plants: as a cloud for programs, as arrows for RViz."""
+"""Topics of contacts between a robot and plants: a cloud for programs, arrows and the area of interest for RViz."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
-from geometry_msgs.msg import Point, Vector3
+from geometry_msgs.msg import Point, Pose, Vector3
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
@@ -22,16 +22,23 @@ MARKER_PERIOD = 10
 """Steps between two arrays of markers: 10 Hz."""
 ARROW_SCALE = 0.01
 """[m/N] Length of an arrow for its force."""
+CIRCLE_CORNERS = 64
+"""Of the edge of the area of interest."""
 
 
 class ContactPublisher:
     """``vine/contacts`` after every step, with or without contacts; ``vine/markers`` at 10 Hz."""
 
-    def __init__(self, advertise: Advertise, bunch_of_body: np.ndarray, links: dict[str, int] | None = None) -> None:
-        """``bunch_of_body`` [body]: -1 for wood. ``links``: numbers of the robot's links by name."""
+    def __init__(
+        self, advertise: Advertise, bunch_of_body: np.ndarray, links: dict[str, int] | None = None,
+        interest_radius: float | None = None,
+    ) -> None:  # fmt: skip
+        """``bunch_of_body`` [body]: -1 for wood. ``links``: numbers of the robot's links by name. ``interest_radius``
+        [m]: of the area of interest around the robot; None: there is none, as no other client is in the world."""
         self._contacts = advertise(PointCloud2, "vine/contacts", RELIABLE)
         self._markers = advertise(MarkerArray, "vine/markers", RELIABLE)
         self._bunch_of_body, self._links = bunch_of_body, links or {}
+        self._edge = None if interest_radius is None else _circle(interest_radius)
         self._steps = 0
         self._write_none: Callable[[float], bytes] | None = None
 
@@ -45,7 +52,14 @@ class ContactPublisher:
         yield self._contacts, partial(self._cloud, sample)
         self._steps += 1
         if self._steps % MARKER_PERIOD == 0:
-            yield self._markers, partial(_arrows, sample)
+            yield self._markers, partial(self._all_markers, sample)
+
+    def _all_markers(self, sample: RobotSample) -> MarkerArray:
+        """Those of the message before go; the area of interest is one of them."""
+        markers = _arrows(sample)
+        if self._edge is not None:
+            markers.append(_interest(self._edge, sample))
+        return MarkerArray(markers=markers)
 
     def _cloud(self, sample: RobotSample) -> PointCloud2 | bytes:
         if not sample.contacts:
@@ -59,11 +73,10 @@ class ContactPublisher:
         return convert.contact_cloud(at_time, self._links, self._bunch_of_body, MAP_FRAME)
 
 
-def _arrows(sample: RobotSample) -> MarkerArray:
+def _arrows(sample: RobotSample) -> list[Marker]:
     """One arrow a contact, along the force on the robot; those of the message before go."""
     markers = [Marker(header=convert.header(sample.joints.time, MAP_FRAME), ns="contacts", action=Marker.DELETEALL)]
-    markers += [_arrow(i, contact, sample.joints.time) for i, contact in enumerate(sample.contacts)]
-    return MarkerArray(markers=markers)
+    return markers + [_arrow(i, contact, sample.joints.time) for i, contact in enumerate(sample.contacts)]
 
 
 def _arrow(number: int, contact: Contact, time: float) -> Marker:
@@ -73,4 +86,20 @@ def _arrow(number: int, contact: Contact, time: float) -> Marker:
     return Marker(
         header=convert.header(time, MAP_FRAME), ns="contacts", id=number, type=Marker.ARROW, action=Marker.ADD,
         points=points, scale=Vector3(x=0.01, y=0.02, z=0.0), color=ColorRGBA(r=1.0, g=0.3, b=0.0, a=1.0),
+    )  # fmt: skip
+
+
+def _circle(radius: float) -> list[Point]:
+    """Points [:data:`CIRCLE_CORNERS` + 1] of a circle of ``radius`` [m] about the origin, in the ground plane."""
+    angles = np.linspace(0.0, 2.0 * np.pi, CIRCLE_CORNERS + 1)
+    return [Point(x=float(radius * np.cos(angle)), y=float(radius * np.sin(angle))) for angle in angles]
+
+
+def _interest(edge: list[Point], sample: RobotSample) -> Marker:
+    """The edge of the area of interest, around the robot's base."""
+    x, y, z = map(float, sample.base_q[:3])
+    return Marker(
+        header=convert.header(sample.joints.time, MAP_FRAME), ns="interest", type=Marker.LINE_STRIP, action=Marker.ADD,
+        pose=Pose(position=Point(x=x, y=y, z=z)), points=edge, scale=Vector3(x=0.03),
+        color=ColorRGBA(r=0.24, g=0.55, b=1.0, a=1.0),
     )  # fmt: skip

@@ -8,21 +8,28 @@ from functools import partial
 from sensor_msgs.msg import LaserScan, PointCloud2
 
 from vinesim.ros.messages import convert
+from vinesim.ros.parameters import Parameters
 from vinesim.ros.topic import SENSOR_DATA, Advertise, PendingMessage
-from vinesim.scene.values import LidarScan
+from vinesim.scene.values import CameraOutput, LidarScan
 
 
 class LidarPublisher:
     """``<name>/points``: x y z intensity ring time; return_type too if the lidar reports two returns of a shot. And
-    ``scan_topic``: its laser nearest to the horizontal."""
+    ``scan_topic``: its laser nearest to the horizontal. Its parameter: ``<name>.exact_ranges``."""
 
-    def __init__(self, advertise: Advertise, name: str, scan_topic: str) -> None:
+    def __init__(self, advertise: Advertise, name: str, scan_topic: str, parameters: Parameters) -> None:
+        self._parameters, self._exact = parameters, f"{name}.exact_ranges"
+        parameters.declare(
+            self._exact, False, "What the middle of each beam meets, exactly, instead of what the sensor measures."
+        )
         self._points = advertise(PointCloud2, f"{name}/points", SENSOR_DATA)
         self._scan = advertise(LaserScan, scan_topic, SENSOR_DATA)
 
-    def wanted(self) -> bool:
-        """Whether there are subscribers."""
-        return bool(self._points.subscription_count or self._scan.subscription_count)
+    def wanted(self) -> CameraOutput:
+        """Depth as the lidar measures it, or exact, if there are subscribers."""
+        if not (self._points.subscription_count or self._scan.subscription_count):
+            return CameraOutput.NONE
+        return CameraOutput.EXACT_DEPTH if self._parameters[self._exact] else CameraOutput.DEPTH
 
     def pending(self, scan: LidarScan) -> Iterator[PendingMessage]:
         """The messages of one revolution."""

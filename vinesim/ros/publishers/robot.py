@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
@@ -19,6 +20,8 @@ from vinesim.scene.values import JointSample, RobotSample
 MAP_FRAME, ODOM_FRAME = "map", "odom"
 ODOMETRY = "mobile_base_controller/odom"
 """Topic."""
+EXACT_VARIANCE = 1e-6
+"""[m2, rad2, m2/s2, rad2/s2] Of exact odometry, as of tracks that do not slip: filters invert covariances."""
 
 
 class RobotPublisher:
@@ -35,6 +38,10 @@ class RobotPublisher:
         self._base = base
         self.publishes_map_to_odom = True
         """Whether ``tf`` holds the true pose of ``odom`` in the map, which else a localisation publishes."""
+        self.has_exact_odometry = False
+        """Whether odometry measures the motion of the base from now on, without the slip of its tracks."""
+        self._odom_q: np.ndarray | None = None
+        """Pose [7] of ``odom`` in the map while odometry is exact: that when it became so."""
         self._pairs: tuple[bool, tuple[tuple[str, str], ...]] | None = None
         self._transforms = SerializedTransforms([])
         self._names: tuple[str, ...] | None = None
@@ -53,6 +60,7 @@ class RobotPublisher:
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """All messages of one step."""
+        sample = self._with_odometry(sample)
         if sample.joints.names is not self._names:  # the same tuple every step
             self._names = sample.joints.names
             self._write_joints = joint_state_writer(sample.joints)
@@ -60,6 +68,21 @@ class RobotPublisher:
         yield self._joints, partial(self._write_joints, sample.joints)
         yield self._tf, partial(self._frames, sample)
         yield self._odometry, partial(self._write_odometry, sample)
+
+    def _with_odometry(self, sample: RobotSample) -> RobotSample:
+        """The sample with the odometry to be published: as it was measured, or exact."""
+        if not self.has_exact_odometry:
+            self._odom_q = None
+            return sample
+        base_q, base_qd = np.asarray(sample.base_q, float), np.asarray(sample.base_qd, float)
+        if self._odom_q is None:
+            self._odom_q = frames.compose(base_q, frames.inverse(np.asarray(sample.odom_q, float)))
+        to_base = frames.conjugate(base_q[3:])
+        return dataclasses.replace(
+            sample, odom_q=frames.compose(frames.inverse(self._odom_q), base_q),
+            odom_qd=np.concatenate([frames.rotate(to_base, base_qd[:3]), frames.rotate(to_base, base_qd[3:])]),
+            odom_covariance=np.tile(EXACT_VARIANCE * np.eye(3), (2, 1, 1)),
+        )  # fmt: skip
 
     def _frames(self, sample: RobotSample) -> bytes:
         has_map = self.publishes_map_to_odom

@@ -168,6 +168,8 @@ class Lidar:
         see :class:`LidarRasterizer`.
         """
         self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
+        self.is_exact = False
+        """Whether revolutions that begin from now on measure what the middle of each beam meets, exactly."""
         self.revolution = 0
         """Of the present revolution."""
         self.lasers = len(spec.elevation.value)
@@ -201,7 +203,9 @@ class Lidar:
         """Finds what rays meet: a column for each firing, in it the rays of each laser's shot."""
         self._workers = ThreadPool((threads or min(usable_cores(), MAX_THREADS)) if device == "cpu" else 1)
         wp.load_module(lidar_echoes, device=device)  # threads must not do so at the same time
-        self._receiver = self._receiver_parameters()
+        self._measuring, self._exact = self._receiver_parameters(spec), self._receiver_parameters(spec.ideal())
+        self._receiver = self._measuring
+        """Of the present revolution."""
         kept = 2 if spec.returns == "dual" else 1
         self._noise = wp.zeros((len(self.offset), 3), dtype=float, device=device)
         self._xyz = wp.zeros((len(self.offset), kept), dtype=wp.vec3, device=device)
@@ -220,13 +224,15 @@ class Lidar:
         wide, high = (0.5 * leaving / FOOTPRINT_RANGE + 0.5e-3 * growing for leaving, growing in sizes)
         return np.append(0.0, ring * wide * np.cos(turn)), np.append(0.0, ring * high * np.sin(turn))
 
-    def _receiver_parameters(self) -> lidar_echoes.Receiver:
-        spec, receiver = self.spec, lidar_echoes.Receiver()
+    def _receiver_parameters(self, spec: LidarSpec) -> lidar_echoes.Receiver:
+        """What this lidar makes of its shots with the numbers of ``spec``: of as many rays of each as that has."""
+        receiver = lidar_echoes.Receiver()
         reflectance = np.zeros(len(Organ), np.float32)
         for organ, number in spec.reflectance.items():
             reflectance[Organ[organ.upper()]] = number.value
         receiver.reflectance = wp.array(reflectance, dtype=float, device=self.device)
-        receiver.rays, receiver.returns = round(spec.rays.value), _RETURNS[spec.returns]
+        receiver.rays, receiver.used = round(self.spec.rays.value), round(spec.rays.value)
+        receiver.returns = _RETURNS[self.spec.returns]
         for name in ("nearest", "farthest", "merge", "separation", "noise", "weak_noise", "step", "weakest", "flicker"):
             setattr(receiver, name, float(getattr(spec, name).value))
         return receiver
@@ -244,7 +250,8 @@ class Lidar:
         return self.finish_revolution(pose, time)
 
     def begin_revolution(self) -> None:
-        """A new revolution."""
+        """A new revolution, exact or as the lidar measures: :attr:`is_exact`."""
+        self._receiver = self._exact if self.is_exact else self._measuring
         noise = spec_file.noise_rng(self.seed, self.name, self.revolution).standard_normal(
             (len(self.offset), 3), np.float32
         )
