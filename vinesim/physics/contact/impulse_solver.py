@@ -184,22 +184,31 @@ class ImpulseSolver:
 
         The response to impulses is linear, but a support lets go of a body, and begins to slide under it. Had a light
         body to be pushed as if its support held it, it would be thrown off. Each round is a Newton step: it starts from
-        the last impulses and the tangent stiffness of the constraints under them.
+        the last impulses and the tangent stiffness of the constraints under them. The impulses of the best round count.
         """
         rows, row_count, p = self.rows, 3 * count, self.parameters
         jacobian, response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
-        free = self.rigid.velocity_free
-        for _ in range(p.solver_constraint_steps):
+        impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
+        kept = (impulse, velocity_free, response, rows.rigid_velocity)
+        free, best, best_error = self.rigid.velocity_free, tuple(values.copy() for values in kept), np.inf
+        for round_number in range(p.solver_constraint_steps + 1):
             assert self.rigid_force is not None
             self.rigid.predict_with(self.rigid_force)
-            impulse, velocity = rows.impulse[:row_count], self.rigid.velocity_free
-            if np.abs(jacobian @ (velocity - free + impulse @ response)).max() < p.solver_constraint_tolerance:
-                return
+            velocity = self.rigid.velocity_free
+            error = float(np.abs(jacobian @ (velocity - free + impulse @ response)).max())
+            if error < best_error:
+                best, best_error = tuple(values.copy() for values in kept), error
+            if error < p.solver_constraint_tolerance or round_number == p.solver_constraint_steps:
+                break
             response[:] = self.rigid.impulse_response(jacobian).T
             free_before, free = free, velocity + impulse @ response
-            rows.velocity_free[:row_count] -= jacobian @ (free - free_before)
+            velocity_free -= jacobian @ (free - free_before)
             self._assemble_delassus(count)
             self._solve_islands(island_count)
+            self._set_rigid_force(row_count)
+        if error > best_error:
+            for values, those in zip(kept, best, strict=True):
+                values[:] = those
             self._set_rigid_force(row_count)
 
     def _touched_rigid_bodies(self, count: int) -> np.ndarray:
