@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.support.live_page import CONTROLS, LiveVineyard, open_page, touch_screen
+from tests.support.live_page import CONTROLS, LiveVineyard, is_drawn_anew, open_page, touch_screen
 from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.bench.support.browser import browser_page
@@ -37,7 +37,8 @@ CONTRASTS = (
   // the picture, which is drawn in between, hides the backgrounds of what contains it
   const layers = (element) => element === null || element.contains(picture) ? []
     : [...layers(element.parentElement), parse(getComputedStyle(element).backgroundColor)];
-  const shown = [...document.querySelectorAll("body *")].filter((one) => one.checkVisibility({ visibilityProperty: true }));
+  const isShown = (one) => one.checkVisibility({ visibilityProperty: true });
+  const shown = [...document.querySelectorAll("body *")].filter(isShown);
   return shown.filter((one) => one.localName === "option" || one.localName === "select"
       || [...one.childNodes].some((node) => node.nodeType === Node.TEXT_NODE && node.textContent.trim()))
     .map((element) => {
@@ -76,6 +77,22 @@ window.pads = [null, { id: "scripted pad", index: 1, connected: true, mapping: "
 navigator.getGamepads = () => window.pads;
 """
 """A gamepad whose sticks and buttons a test moves."""
+
+
+FLOWN = """
+((pad, seconds) => {
+  const { eyes } = vinesim.viewer, { place, yaw, pitch } = eyes, before = window.pads;
+  Object.assign(eyes, { place: [1, 2, 3], yaw: 0, pitch: 0 });
+  window.pads = pad;
+  const moved = eyes.update(seconds);
+  const way = eyes.place.map((value, axis) => value - [1, 2, 3][axis]);
+  const found = { moved, way, yaw: eyes.yaw, pitch: eyes.pitch };
+  window.pads = before;
+  Object.assign(eyes, { place, yaw, pitch });
+  return found;
+})
+"""
+"""How far eyes that look along x fly and turn by gamepads in a time [s]."""
 
 
 @pytest.fixture(scope="module")
@@ -149,4 +166,67 @@ def test_text_has_contrast_before_any_picture_and_focus_is_seen(page, is_person)
             assert focus["contrast"] >= 3.0, focus
             assert focus["alpha"] == 1.0, focus
         assert page.run(f"{CONTROLS}.filter((one) => !one.isReached).map((one) => one.outerHTML)") == []
+        assert page.errors == []
+
+
+def pad_of(axes=(0.0, 0.0, 0.0, 0.0), *, sinks=0.0, rises=0.0, mapping="standard", connected=True):
+    """A gamepad with its left stick, its right stick and its triggers pushed."""
+    values = [0.0] * 17
+    values[6:8] = sinks, rises
+    buttons = [{"pressed": value > 0.0, "value": value} for value in values]
+    return {"connected": connected, "mapping": mapping, "axes": axes, "buttons": buttons}
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_a_spectator_flies_by_gamepad(page):
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
+        open_page(page, live, PAD)
+        speed = page.run("vinesim.viewer.eyes.speed")
+
+        def flown(*pads):
+            return page.run(f"{FLOWN}({json.dumps(pads)}, 0.1)")
+
+        right, back, turn, nod = np.eye(4)
+        still = {"moved": False, "way": [0, 0, 0], "yaw": 0, "pitch": 0}
+        for axes, way in ((-back, (1, 0, 0)), (back, (-1, 0, 0)), (-right, (0, 1, 0)), (right, (0, -1, 0))):
+            found = flown(None, pad_of(axes.tolist()))
+            assert found["moved"]
+            np.testing.assert_allclose(found["way"], 0.1 * speed * np.array(way), atol=1e-9)
+            assert found["yaw"] == found["pitch"] == 0.0
+        np.testing.assert_allclose(flown(pad_of(rises=1.0))["way"], [0.0, 0.0, 0.1 * speed], atol=1e-9)
+        np.testing.assert_allclose(flown(pad_of(sinks=1.0))["way"], [0.0, 0.0, -0.1 * speed], atol=1e-9)
+        assert flown(pad_of(turn.tolist()))["yaw"] < -0.1, "the right stick to the right turns to the right"
+        assert flown(pad_of((-nod).tolist()))["pitch"] > 0.1, "pushed ahead it looks up"
+        assert not flown(pad_of(turn.tolist()))["moved"], "who only looks follows an actor still"
+
+        assert flown(pad_of([0.14, -0.14, 0.14, -0.14], sinks=0.1)) == still, "sticks and triggers that rest"
+        slow, half = (flown(pad_of((-share * back).tolist()))["way"][0] for share in (0.16, 0.575))
+        assert 0.0 < slow < 0.02 * 0.1 * speed, "it starts slowly"
+        assert half == pytest.approx(0.05 * speed), "half of its way beyond rest"
+        assert flown(pad_of([0, -1, 1, 1], connected=False)) == still, "a pad that is gone, as some browsers keep it"
+        other = flown(pad_of([0, -1, -1, -1], rises=1.0, mapping=""))
+        np.testing.assert_allclose(other["way"], [0.1 * speed, 0.0, 0.0], atol=1e-9)
+        assert other["yaw"] == other["pitch"] == 0.0, "axes of unknown meaning"
+
+        # picture by picture, and as the client knows it
+        start = live.client.pose.copy()
+        page.run("pads[1].axes[1] = -1, 0")
+        wait(lambda: live.client.pose[0] > start[0] + 0.3, "the eyes fly ahead")
+        np.testing.assert_allclose(live.client.pose[1:3], start[1:3], atol=1e-6)
+        page.run("pads[1].axes[1] = 0, 0")
+        is_drawn_anew(page)
+        place = page.run("vinesim.viewer.eyes.place")
+        is_drawn_anew(page)
+        assert page.run("vinesim.viewer.eyes.place") == place, "they stop"
+        page.run("pads[1].axes[2] = 1, 0")
+        wait(lambda: frames.to_yaw(live.client.pose[3:]) < -0.3, "they turn to the right")
+        page.run("pads[1].axes = [0, -1, 0, 0], 0")
+        wait(lambda: np.linalg.norm(live.client.pose[:3] - place) > 0.1, "they fly where they look")
+        assert live.client.pose[1] < place[1]
+        page.run("pads[1] = null, 0")
+        is_drawn_anew(page)
+        place = page.run("vinesim.viewer.eyes.place")
+        is_drawn_anew(page)
+        assert page.run("vinesim.viewer.eyes.place") == place, "without the pad they stop"
         assert page.errors == []
