@@ -185,7 +185,8 @@ class PageWorld:
         sun = scene.sun.direction(0.0)
         return array_message.encode(
             {
-                "scene": scene.name, "seed": scene.seed, "sun": list(sun), "light": _light(sun[2]), "rows": list(row_layout(model)),
+                "scene": scene.name, "seed": scene.seed, "sun": list(sun), "light": _light(sun[2]),
+                "rows": list(row_layout(model)),
                 "bodies": len(model.body_mass), "dt": self._client.physics.dt,
                 "interest": self._client.replicator.interest_radius,
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
