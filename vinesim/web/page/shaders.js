@@ -154,7 +154,8 @@ void main() {
   uint packed = vSurface.x, material = vSurface.y;
   vec3 tint = pow(vec3(packed & 255u, (packed >> 8) & 255u, (packed >> 16) & 255u) / 255.0, vec3(2.2));
   vec3 n = normalize(vNormal), d = normalize(vPlace - eye);
-  if (!LEAF && dot(n, d) > 0.0) n = normalize(n - d * dot(n, d)); // at rims of coarse meshes normals point away
+  float away = dot(n, d) + 0.15;
+  if (!LEAF && away > 0.0) n = normalize(n - d * away); // at rims of coarse meshes normals point away from the eye
   float seed = uintBitsToFloat(vSurface.w);
 ` + (isLeaf ? /* glsl */ `
   Surface s = blade(n, tint, vSky, vLocal, seed, vDetail, material, d);
