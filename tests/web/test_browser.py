@@ -1,34 +1,36 @@
 """The page in a real browser: it draws the live vineyard within its budgets, and what happens there is seen."""
 
-import contextlib
 import pathlib
 import threading
 
 import numpy as np
 import pytest
 
+from tests.support.live_page import (
+    BUNCH,
+    CONTROLS,
+    VICTORY,
+    LiveVineyard,
+    is_drawn_anew,
+    look_at,
+    open_page,
+    press,
+    touch_screen,
+)
 from tests.support.recorded_pick import PICKED_AT, replay_of_a_pick
 from tests.support.waiting import wait
 from vinesim import frames
-from vinesim.avatar.gestures import GESTURES, Gestures
-from vinesim.avatar.tracked_human import TrackedHuman
+from vinesim.avatar.gestures import GESTURES
 from vinesim.bench.support.browser import browser_page
-from vinesim.client.client import Client
-from vinesim.client.page_world import PageWorld
-from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene import appearance
-from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
-from vinesim.scene.spec import load_scene
 from vinesim.scene.values import INTENTIONS, HumanSpec
 from vinesim.web.page_server import WINDOW, PageServer
 
 MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
 """Of one picture for one eye, and of the vineyard that a page loads [B]."""
-BUNCH = 10
-VICTORY = (1.0, 0.0, 0.0, 1.0, 1.0)
 HEADSET = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
 """Put there by tools/build_page."""
 
@@ -84,59 +86,6 @@ WRIST = """
 })(vinesim.viewer)
 """
 """What a person in a headset reads, whether it is seen, and how far it is from the left hand [m]."""
-CONTROLS = "[...document.querySelectorAll('button, input, select, summary')].filter((one) => one.checkVisibility())"
-
-
-class LiveVineyard:
-    """A client that steps in a thread of its own, as in its process: a spectator or a person before a bunch."""
-
-    def __init__(self, bus, *, is_person=False, port=0):
-        scene = load_scene("demo")
-        model = generate(scene)
-        hangs = model.forward_kinematics(model.joint_settled)[model.bunch_body[BUNCH]]
-        self.bunch = frames.compose(hangs, frames.pose(np.array([0.06, 0.0, 0.0])))[:3]
-        person = None
-        if is_person:
-            start = frames.pose(np.array([self.bunch[0] - 0.75, self.bunch[1], 0.0]))
-            person = TrackedHuman(start, 1.75, gestures=Gestures(GESTURES, {"a": VICTORY}))
-            self.client = Client(scene, model, None, bus, name="viewer", pose=start, source=person)
-        else:
-            eye = frames.pose(self.bunch - np.array([0.7, 0.0, 0.0]))
-            self.client = Spectator(scene, model, None, bus, name="viewer", pose=eye)
-        self.world = PageWorld(self.client, person)
-        self.server = PageServer(self.world, port)
-        self.client.post_step.append(lambda _: self.world.collect(self.server))
-        self.due = []
-        """Called once before the next step."""
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="client")
-
-    @contextlib.contextmanager
-    def paused(self):
-        """The client stands still within the block."""
-        standing, go_on = threading.Event(), threading.Event()
-        self.due.append(lambda: (standing.set(), go_on.wait()))
-        standing.wait()
-        try:
-            yield
-        finally:
-            go_on.set()
-
-    def _run(self):
-        while not self._stop.wait(0.005):
-            while self.due:
-                self.due.pop()()
-            self.client.tick()
-
-    def __enter__(self):
-        self.server.__enter__()
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception):
-        self._stop.set()
-        self._thread.join()
-        self.server.__exit__(*exception)
 
 
 @pytest.fixture(scope="module")
@@ -144,30 +93,6 @@ def page():
     """One browser for all tests."""
     with browser_page() as page:
         yield page
-
-
-def open_page(page, live, before=""):
-    """Open the page, and let it draw little: the browser of a test has no graphics card."""
-    page.resize(320, 240)
-    page.open(live.server.address + "?triangles=10000&rate=10&shadows=0", before=before)
-    wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
-    assert page.run("vinesim.failure") is None
-    assert page.errors == []
-
-
-def look_at(page, point):
-    """Turn the page's eyes to a point [3] m; where they are [3] m."""
-    eye = np.array(page.run("vinesim.viewer.eyes.place"))
-    way = point - eye
-    pitch = np.arctan2(way[2], np.hypot(*way[:2]))
-    page.run(f"vinesim.viewer.eyes.yaw = {np.arctan2(way[1], way[0])}, vinesim.viewer.eyes.pitch = {pitch}, 0")
-    return eye
-
-
-def press(page, code):
-    """Press a key once."""
-    page.key(code, down=True)
-    page.key(code, down=False)
 
 
 @pytest.mark.slow
@@ -322,18 +247,6 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
         assert page.errors == []
 
 
-@contextlib.contextmanager
-def touch_screen(page, width, height):
-    """A phone without a mouse, within the block."""
-    page.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
-    metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": True}
-    page.call("Emulation.setDeviceMetricsOverride", **metrics)
-    try:
-        yield
-    finally:
-        page.call("Emulation.setTouchEmulationEnabled", enabled=False)
-
-
 def touch(page, kind, *points):
     """An event of some fingers [px]; kinds: touchStart, touchMove, touchEnd."""
     points = [{"x": float(x), "y": float(y), "id": k} for k, (x, y) in enumerate(points)]
@@ -356,12 +269,6 @@ def in_picture(page, point):
       const {{ x, y }} = viewer.project(world.place(0).set(...point));
       return [(x + 1) / 2 * innerWidth, (1 - y) / 2 * innerHeight];
     }})(vinesim.viewer, vinesim.viewer, {[float(value) for value in point]})""")
-
-
-def is_drawn_anew(page):
-    """Wait until pictures begun from now on are drawn."""
-    drawn = page.run("vinesim.frames")
-    wait(lambda: page.run("vinesim.frames") > drawn + 1, "two pictures later")
 
 
 @pytest.mark.slow

@@ -19,6 +19,8 @@ from vinesim.scene.appearance import load_shears
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, Snapshot
+from vinesim.sensors.camera.exposure import usual_exposure
+from vinesim.sensors.camera.sunlight import OutdoorLight
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.sensors.scene.static_primitives import row_layout
@@ -33,6 +35,9 @@ NEAR = 3.0
 """An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
 MAX_PRIMITIVES = 400_000
 """Of plants and ground that a page loads: 32 MB."""
+AMONG_VINES = 1.08
+"""Exposure of a page beside the usual one of the daylight: what cameras come to by themselves among vines, 1.06 to 1.12
+times it in the pictures of docs/web.md."""
 MAX_SENTENCES = 4
 """Closures of shears that a state tells of: pages learn of both hands, and of those between two states."""
 BLADE_STEPS = 5
@@ -174,12 +179,14 @@ class PageWorld:
             self._primitives = Primitives(self._client.model, grass=GRASS)
         primitives, scene = self._primitives, self._client.scene
         outline, hull = textures.leaf_outlines()
+        leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes have both signs
         ground = primitives.materials
         model = self._client.model
         sun = scene.sun.direction(0.0)
         return array_message.encode(
             {
-                "scene": scene.name, "seed": scene.seed, "sun": list(sun), "rows": list(row_layout(model)),
+                "scene": scene.name, "seed": scene.seed, "sun": list(sun), "light": _light(sun[2]),
+                "rows": list(row_layout(model)),
                 "bodies": len(model.body_mass), "dt": self._client.physics.dt,
                 "interest": self._client.replicator.interest_radius,
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
@@ -194,7 +201,7 @@ class PageWorld:
             _nearest(primitives, self._start_view()[:3], self._most)
             | {
                 "tree_first": model.tree_first.astype(np.uint32), "poses": self._at_rest.astype(np.float32),
-                "outline": outline, "hull": hull,
+                "outline": outline, "hull": hull, "noise": _bytes(textures.noise_texture()), "leaf": _bytes(leaf),
                 "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(self._start_view(), np.float32),
             } | ({} if self._person is None else _within_reach(model)),
         )  # fmt: skip
@@ -296,6 +303,18 @@ class PageWorld:
         name = next(iter(client.robots), client.name)
         root = client.physics.rigid.base_state(name)[0] if client.robots else client.humans[name].pose.root
         return follow_view(_towards_plants(np.asarray(root, float), client.model))
+
+
+def _light(height: float) -> dict[str, Any]:
+    """Light as cameras see it, by the sine of the sun's elevation; linear RGB."""
+    light = OutdoorLight.of(height)
+    colours = {name: getattr(light, name).tolist() for name in ("sun", "sky", "haze", "ground", "canopy", "balance")}
+    return colours | {"dim": light.dim, "exposure": AMONG_VINES * usual_exposure(light.brightness)}
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    """Values from 0 to 1 in bytes."""
+    return np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
 
 
 def _towards_plants(root: np.ndarray, model: Model) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Leaf blades: two quadratic half surfaces hinged at the midrib, cut out by an outline; their bounds, and rays that hit.
 
 A blade lives in its own frame and unit: u across, v along the midrib (from petiole, 0, to tip, 1), w along the normal;
-w = -(a u^2 + b v^2 + c |u|) with the curvatures ``bend`` = (a, b, c, age).
+w = a u^2 + b v^2 + c |u| with the curvatures ``bend`` = (a, b, c, age).
 """
 
 import warp as wp

@@ -33,6 +33,11 @@ _GLARE_REACH = 4.0
 """It reaches so many widths."""
 
 
+def usual_exposure(brightness: float) -> float:
+    """Exposure that suits daylight of this brightness beside that of a sunny noon."""
+    return NOON_EXPOSURE * max(brightness, 0.01) ** -LOW_SUN_SHARE
+
+
 class Exposure:
     """The exposure of one camera: automatic, unless ``fixed``."""
 
@@ -81,7 +86,7 @@ class Exposure:
                 deferred.update_exposure,
                 1,
                 inputs=[
-                    NOON_EXPOSURE * max(brightness, 0.01) ** -LOW_SUN_SHARE,
+                    usual_exposure(brightness),
                     KEY_VALUE,
                     ADAPTED_SHARE,
                     MIN_EXPOSURE,

@@ -6,6 +6,7 @@ anew only when the camera has left its middle, or when something inside it has m
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 
@@ -200,6 +201,43 @@ def daylight(height: float) -> tuple[np.ndarray, float]:
     return sun, 0.04 + 0.96 * float(np.clip((height + 0.1) / (_NOON_SINE + 0.1), 0.0, 1.0) ** 0.8)
 
 
+@dataclasses.dataclass(frozen=True)
+class OutdoorLight:
+    """Light by day, of one elevation of the sun: linear RGB [3] each."""
+
+    sun: np.ndarray
+    sky: np.ndarray
+    haze: np.ndarray
+    ground: np.ndarray
+    """From the ground."""
+    canopy: np.ndarray
+    """Through the canopy."""
+    dim: float
+    """How bright the sky is beside its usual self."""
+    brightness: float
+    """Light that falls on the ground, beside that of a high sun."""
+    balance: np.ndarray
+    """White balance of a camera: factors on linear light."""
+
+    @classmethod
+    def of(cls, height: float) -> OutdoorLight:
+        """The light by the sine of the sun's elevation."""
+        sun, dim = daylight(height)
+        falls = sun * max(height, 0.05) + _SKY_COLOUR * dim
+        usual = _NOON_SUN * _NOON_SINE + _SKY_COLOUR
+        brightness = float(falls.mean() / usual.mean())
+        return cls(
+            sun,
+            _SKY_COLOUR * dim,
+            _HAZE_COLOUR * dim,
+            _GROUND_COLOUR * brightness,
+            _CANOPY_COLOUR * brightness,
+            dim,
+            brightness,
+            (usual / usual.mean() / (falls / falls.mean())) ** _WHITE_BALANCE_SHARE,
+        )
+
+
 class Sunlight:
     """Light of one camera's surroundings."""
 
@@ -248,20 +286,14 @@ class Sunlight:
         if direction @ self._direction > _MIN_COS_CHANGE:
             return
         self._direction, light = direction, self.light
-        sun, dim = daylight(direction[2])
+        now = OutdoorLight.of(direction[2])
         light.sun = _vector(direction)
-        light.sun_colour = _vector(sun)
-        light.sky_colour, light.haze_colour = _vector(_SKY_COLOUR * dim), _vector(_HAZE_COLOUR * dim)
-        table = textures.sky_texture(tuple(direction), tuple(sun)) * np.float32(dim)
+        light.sun_colour = _vector(now.sun)
+        light.sky_colour, light.haze_colour = _vector(now.sky), _vector(now.haze)
+        light.ground_colour, light.canopy_colour = _vector(now.ground), _vector(now.canopy)
+        table = textures.sky_texture(tuple(direction), tuple(now.sun)) * np.float32(now.dim)
         light.sky_table = wp.array(table, dtype=wp.vec3, device=self._device)
-        falls = sun * max(direction[2], 0.05) + _SKY_COLOUR * dim
-        usual = _NOON_SUN * _NOON_SINE + _SKY_COLOUR
-        self.brightness = float(falls.mean() / usual.mean())
-        light.ground_colour, light.canopy_colour = (
-            _vector(_GROUND_COLOUR * self.brightness),
-            _vector(_CANOPY_COLOUR * self.brightness),
-        )
-        self.balance = (usual / usual.mean() / (falls / falls.mean())) ** _WHITE_BALANCE_SHARE
+        self.brightness, self.balance = now.brightness, now.balance
         raised = np.array([direction[0], direction[1], max(direction[2], 0.1)])
         raised /= np.linalg.norm(raised)
         self._near.set_sun(raised)

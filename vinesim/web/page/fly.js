@@ -2,6 +2,11 @@
 
 const KEYS = { KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1], KeyA: [1, 1], ArrowLeft: [1, 1],
   KeyD: [1, -1], ArrowRight: [1, -1], KeyE: [2, 1], KeyQ: [2, -1] };
+/** A stick that is less than this share off its middle rests. */
+const REST = 0.15;
+/** Numbers of buttons of a gamepad with the standard mapping. */
+const LEFT_TRIGGER = 6, RIGHT_TRIGGER = 7;
+const TURN = 1.8, NOD = 1.4; // rad/s of a stick that is pushed all the way
 
 export class FlyingEyes {
   constructor(element, pose) {
@@ -60,11 +65,10 @@ export class FlyingEyes {
     const way = [0, 0, 0];
     for (const code of this.held) way[KEYS[code][0]] += KEYS[code][1];
     for (const pad of navigator.getGamepads?.() ?? []) {
-      if (!pad) continue;
-      const [x, y, turn, nod] = pad.axes.map((value) => Math.abs(value) < 0.15 ? 0 : value);
-      way[0] -= y ?? 0;
-      way[1] -= x ?? 0;
-      this.look(-(turn ?? 0) * 1.8 * seconds, -(nod ?? 0) * 1.4 * seconds);
+      if (!pad?.connected) continue; // some browsers keep one that is gone, with its last axes
+      const { ahead, left, up, turn, nod } = wishOf(pad);
+      [ahead, left, up].forEach((value, axis) => { way[axis] += value; });
+      this.look(turn * TURN * seconds, nod * NOD * seconds);
     }
     if (!way.some((value) => value !== 0)) return false;
     this.move(...way.map((value) => value * this.speed * seconds));
@@ -87,4 +91,19 @@ export class FlyingEyes {
     const [cp, sp] = [Math.cos(-this.pitch / 2), Math.sin(-this.pitch / 2)];
     return [...this.place, -sy * sp, cy * sp, sy * cp, cy * cp];
   }
+}
+
+/**
+ * What a gamepad asks for, shares from -1 to 1: sticks move and turn, triggers sink and rise. Which axis is what is known
+ * of the standard mapping only; of other pads the first two count, for a trigger at rest may be an axis at -1.
+ */
+function wishOf({ axes, buttons, mapping }) {
+  const isStandard = mapping === "standard", axis = (k) => isStandard || k < 2 ? beyondRest(axes[k] ?? 0) : 0;
+  const trigger = (k) => isStandard ? beyondRest(buttons[k]?.value ?? 0) : 0;
+  return { ahead: -axis(1), left: -axis(0), up: trigger(RIGHT_TRIGGER) - trigger(LEFT_TRIGGER), turn: -axis(2), nod: -axis(3) };
+}
+
+/** The share of its way that a stick or trigger is beyond its rest: slow at first, not with a jerk. */
+function beyondRest(value) {
+  return Math.sign(value) * Math.max(Math.abs(value) - REST, 0) / (1 - REST);
 }

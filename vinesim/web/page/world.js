@@ -17,7 +17,7 @@ const SPHEROID = 1, LEAF = 2, BOX = 3, ELLIPSOID = 4, TRIANGLE = 6;
 const TRIANGLE_BUDGET = 300_000;
 /** The lists of what is drawn are made anew when the eye has moved so far [m]. */
 const STRIDE = 0.25;
-const SUN_SIZE = 2048, SUN_REACH = 9;
+const SUN_SIZE = 2048, SUN_REACH = 9, SUN_NEAR = 1, SUN_FAR = 60;
 /** Rigid primitives for which there is room from the start. */
 const RIGID_ROOM = 16384;
 
@@ -89,14 +89,19 @@ export class World {
     this.sunTarget = new THREE.WebGLRenderTarget(SUN_SIZE, SUN_SIZE, {
       depthTexture: new THREE.DepthTexture(SUN_SIZE, SUN_SIZE, THREE.UnsignedIntType),
       minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter });
-    this.sunCamera = new THREE.OrthographicCamera(-SUN_REACH, SUN_REACH, SUN_REACH, -SUN_REACH, 1, 60);
+    this.sunCamera = new THREE.OrthographicCamera(-SUN_REACH, SUN_REACH, SUN_REACH, -SUN_REACH, SUN_NEAR, SUN_FAR);
+    const noises = smoothTable(new THREE.DataTexture(arrays.noise, 256, 256, THREE.RGBAFormat));
+    noises.wrapS = noises.wrapT = THREE.RepeatWrapping;
+    const leaves = smoothTable(new THREE.DataArrayTexture(arrays.leaf, 128, 128, 6));
     const common = {
       eye: { value: this.eye }, sun: { value: new THREE.Vector3(...header.sun) }, outlines: { value: outlines },
+      noises: { value: noises }, ...lightOf(header.light),
       sunDepth: { value: this.sunTarget.depthTexture }, sunMatrix: { value: new THREE.Matrix4() },
+      sunTexel: { value: 2 * SUN_REACH / SUN_SIZE }, sunDeep: { value: SUN_FAR - SUN_NEAR },
     };
     this.common = common;
     const uniforms = { ...common, poses: { value: this.poses }, shapes: { value: this.shapes },
-      surfaces: { value: this.surfaces }, leafExtent: { value: extent } };
+      surfaces: { value: this.surfaces }, leafExtent: { value: extent }, leaves: { value: leaves } };
     this.shadowGroup = new THREE.Group();
     this.shadowGroup.rotation.x = -Math.PI / 2;
     this.draws = MESHES.map(({ name, levels }, kind) => {
@@ -324,6 +329,21 @@ function drawSingle({ geometry, list, count }) {
 /** Parts of the page's own person that would be before its eyes. */
 function partsBeforeEyes({ person }) {
   return new Set(person === null ? [] : ["head", "neck"].map((part) => `${person}/${part}`));
+}
+
+/** Uniforms of the light that cameras see. */
+function lightOf({ balance, exposure, dim, ...colours }) {
+  const uniforms = { gain: { value: new THREE.Vector3(...balance).multiplyScalar(exposure) }, skyDim: { value: dim } };
+  for (const [name, colour] of Object.entries(colours)) uniforms[`${name}Colour`] = { value: new THREE.Vector3(...colour) };
+  return uniforms;
+}
+
+/** A table whose mean is seen from far. */
+function smoothTable(texture) {
+  texture.minFilter = THREE.LinearMipmapLinearFilter;
+  texture.magFilter = THREE.LinearFilter;
+  texture.generateMipmaps = texture.needsUpdate = true;
+  return texture;
 }
 
 function makeSky(common) {
