@@ -79,6 +79,7 @@ def test_a_robot_without_truth_and_bad_values():
         "r", joints, base, np.zeros(6), drifted, np.zeros(6), np.zeros((2, 3, 3)), (), np.zeros((0, 7))
     )
     heard: dict[str, list] = {"tf": [], "truth": [], "contacts": [], "poles": [], "diagnostics": []}
+    heard["odometry"] = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     with RobotNode("r", "<robot name='r'/>", namespace="space") as node, StockNode() as peer:
         node.publish_environment_static(("pole_0",), REST[None])
@@ -87,6 +88,7 @@ def test_a_robot_without_truth_and_bad_values():
             (PointCloud2, "space/vine/contacts", "contacts", 10),
             (TFMessage, "space/tf_environment_static", "poles", latched),
             (DiagnosticArray, "/diagnostics", "diagnostics", 10),
+            (Odometry, "space/mobile_base_controller/odom", "odometry", 10),
         ):  # fmt: skip
             peer.node.create_subscription(message, topic, heard[name].append, qos)
 
@@ -124,17 +126,24 @@ def test_a_robot_without_truth_and_bad_values():
         assert put("publish_truth", True) == ""
         wait_until(lambda: len(heard["truth"]) > seen["truth"] + 20 and heard["poles"][-1].transforms, tick, "truth")
 
+        assert put("odom_frame_id", "anna/odom") == ""
+        wait_until(lambda: parents() == ["anna/odom"], tick, "tf with another frame of odometry")
+        wait_until(lambda: heard["odometry"][-1].header.frame_id == "anna/odom", tick, "odometry in that frame")
+
         assert put("environment_rate", 20.0) == ""
         for name, value in (
             ("environment_rate", 0.0), ("environment_rate", 1e9), ("environment_rate", float("nan")),
-            ("environment_rate", "fast"), ("publish_truth", 3),
+            ("environment_rate", "fast"), ("publish_truth", 3), ("odom_frame_id", ""), ("odom_frame_id", "/odom"),
+            ("odom_frame_id", 3),
         ):  # fmt: skip
             reason = put(name, value)
             assert reason, (name, value)
             assert "\n" not in reason
         assert node.environment_rate == 20.0
         kept = node.set_parameters
-    assert kept == {"publish_map_to_odom": False, "publish_truth": True, "environment_rate": 20.0}
+    assert kept == {
+        "publish_map_to_odom": False, "publish_truth": True, "environment_rate": 20.0, "odom_frame_id": "anna/odom",
+    }  # fmt: skip
     kept |= {"publish_truth": False}
     for one in heard.values():
         one.clear()
@@ -143,7 +152,7 @@ def test_a_robot_without_truth_and_bad_values():
         peer.node.create_subscription(TFMessage, "space/tf", heard["tf"].append, 10)
         peer.node.create_subscription(TFMessage, "space/tf_environment_static", heard["poles"].append, latched)
         wait_until(lambda: heard["tf"] and heard["poles"], tick, "topics of a node that was started again")
-        assert (parents(), len(heard["poles"][-1].transforms), node.environment_rate) == (["odom"], 0, 20.0)
+        assert (parents(), len(heard["poles"][-1].transforms), node.environment_rate) == (["anna/odom"], 0, 20.0)
 
 
 def test_odometry_without_the_slip_of_the_tracks():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -10,6 +11,9 @@ import rclpy.node
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.parameter import Parameter
+
+_FRAME = re.compile(r"[^/\s]\S*")
+"""Names of frames."""
 
 
 class Parameters:
@@ -29,12 +33,12 @@ class Parameters:
     def declare(
         self,
         name: str,
-        default: float,
+        default: float | str,
         description: str,
         between: tuple[float, float] | None = None,
         changed: Callable[[], None] | None = None,
     ) -> None:
-        """Declare a parameter of the type of its ``default``: bool, int or float.
+        """Declare a parameter of the type of its ``default``: bool, int, float, or str for the name of a frame.
 
         A value that was set before counts, else that of the node's parameter file; :class:`ValueError` if that is none.
 
@@ -73,6 +77,11 @@ class Parameters:
         for one in parameters:
             if isinstance(one.value, float) and not math.isfinite(one.value):
                 reason = f"parameter {one.name} is {one.value}; give a finite number"
+                return SetParametersResult(successful=False, reason=reason)
+            if one.name in self._values and isinstance(one.value, str) and not _FRAME.fullmatch(one.value):
+                reason = (
+                    f"parameter {one.name} is {one.value[:50]!r}; give the name of a frame: no blanks, no leading /"
+                )
                 return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 

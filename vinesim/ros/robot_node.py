@@ -27,7 +27,7 @@ from vinesim.ros.publishers.control import ControlPublisher
 from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
 from vinesim.ros.publishers.lights import LightsPublisher
 from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
-from vinesim.ros.publishers.robot import ODOMETRY, RobotPublisher
+from vinesim.ros.publishers.robot import ODOM_FRAME, ODOMETRY, RobotPublisher
 from vinesim.ros.publishers.sound import SoundPublisher
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage
 from vinesim.scene.values import ComponentStatus, ControllerSpec, HandGestures, Intention, RobotSample
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
 MAP_TO_ODOM, TRUTH, ENVIRONMENT_RATE = "publish_map_to_odom", "publish_truth", "environment_rate"
-EXACT_ODOMETRY = "exact_odometry"
+EXACT_ODOMETRY, ODOM_FRAME_ID = "exact_odometry", "odom_frame_id"
 """Names of parameters."""
 LOOK_PERIOD = 1.0
 """Wall time between two looks for another robot under the same names, and for commands of another type [s]."""
@@ -135,11 +135,18 @@ class RobotNode(Node):
             "Odometry of the motion of the base from now on, without the slip of its tracks.",
             changed=self._apply_parameters,
         )
+        declare(
+            ODOM_FRAME_ID,
+            ODOM_FRAME,
+            "Frame in which odometry measures, on /tf too.",
+            changed=self._apply_parameters,
+        )
         declare(ENVIRONMENT_RATE, 10.0, "Messages a second of tf_environment [Hz].", (0.1, 50.0))
 
     def _apply_parameters(self) -> None:
         self._robot.publishes_map_to_odom = self._parameters[MAP_TO_ODOM]
         self._robot.has_exact_odometry = self._parameters[EXACT_ODOMETRY]
+        self._robot.odom_frame = self._parameters[ODOM_FRAME_ID]
         for publisher in (self._ground_truth, self._contacts):
             publisher.mute(not self._parameters[TRUTH])
 

@@ -118,9 +118,10 @@ UNMEASURED = 1e6
 """Variance of z, roll and pitch in odometry, which tracks do not measure."""
 
 
-def odometry(sample: RobotSample, base: str) -> Odometry:
-    """Odometry of the base: pose in ``odom``, velocity in its own axes, both as measured, and their covariances."""
-    message = Odometry(header=header(sample.joints.time, "odom"), child_frame_id=base)
+def odometry(sample: RobotSample, base: str, odom: str = "odom") -> Odometry:
+    """Odometry of the base: pose in the frame ``odom``, velocity in its own axes, both as measured, and their
+    covariances."""
+    message = Odometry(header=header(sample.joints.time, odom), child_frame_id=base)
     pose = message.pose.pose
     set_vector(pose.position, sample.odom_q[:3])
     set_quaternion(pose.orientation, sample.odom_q[3:])

@@ -77,15 +77,15 @@ def joint_state_writer(first: JointSample) -> Callable[[JointSample], bytes]:
     return lambda one: template.message(one.time, np.concatenate([one.position, one.velocity, one.effort]))
 
 
-def odometry_writer(first: RobotSample, base: str) -> Callable[[RobotSample], bytes]:
-    """Writes nav_msgs/Odometry of samples of one robot."""
+def odometry_writer(first: RobotSample, base: str, odom: str = "odom") -> Callable[[RobotSample], bytes]:
+    """Writes nav_msgs/Odometry of samples of one robot, in the frame ``odom``."""
 
     def build(time: float, numbers: np.ndarray) -> Any:
         sample = dataclasses.replace(
             first, joints=dataclasses.replace(first.joints, time=time), odom_q=numbers[:7], odom_qd=numbers[7:13],
             odom_covariance=numbers[13:].reshape(2, 3, 3),
         )  # fmt: skip
-        return convert.odometry(sample, base)
+        return convert.odometry(sample, base, odom)
 
     template = SerializedMessage(build, 31)
     return lambda one: template.message(

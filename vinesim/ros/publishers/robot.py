@@ -38,16 +38,20 @@ class RobotPublisher:
         self._base = base
         self.publishes_map_to_odom = True
         """Whether ``tf`` holds the true pose of ``odom`` in the map, which else a localisation publishes."""
+        self.odom_frame = ODOM_FRAME
+        """Frame in which odometry measures, on ``tf`` too."""
         self.has_exact_odometry = False
         """Whether odometry measures the motion of the base from now on, without the slip of its tracks."""
         self._odom_q: np.ndarray | None = None
         """Pose [7] of ``odom`` in the map while odometry is exact: that when it became so."""
-        self._pairs: tuple[bool, tuple[tuple[str, str], ...]] | None = None
+        self._pairs: tuple[bool, str, tuple[tuple[str, str], ...]] | None = None
         self._transforms = SerializedTransforms([])
         self._names: tuple[str, ...] | None = None
         """Joints of the writers of messages."""
         self._write_joints: Callable[[JointSample], bytes]
         self._write_odometry: Callable[[RobotSample], bytes]
+        self._odometry_frame = ""
+        """That of :attr:`_write_odometry`."""
 
         self._joints = advertise(JointState, "joint_states", RELIABLE)
         self._tf = advertise(tf_message, "tf", RELIABLE)
@@ -64,7 +68,10 @@ class RobotPublisher:
         if sample.joints.names is not self._names:  # the same tuple every step
             self._names = sample.joints.names
             self._write_joints = joint_state_writer(sample.joints)
-            self._write_odometry = odometry_writer(sample, self._base)
+            self._odometry_frame = ""
+        if self._odometry_frame != self.odom_frame:
+            self._odometry_frame = self.odom_frame
+            self._write_odometry = odometry_writer(sample, self._base, self.odom_frame)
         yield self._joints, partial(self._write_joints, sample.joints)
         yield self._tf, partial(self._frames, sample)
         yield self._odometry, partial(self._write_odometry, sample)
@@ -86,10 +93,11 @@ class RobotPublisher:
 
     def _frames(self, sample: RobotSample) -> bytes:
         has_map = self.publishes_map_to_odom
-        if self._pairs is None or self._pairs[0] != has_map or self._pairs[1] is not sample.transforms:
-            above = [(MAP_FRAME, ODOM_FRAME)] * has_map
-            self._transforms = SerializedTransforms([*above, (ODOM_FRAME, self._base), *sample.transforms])
-            self._pairs = has_map, sample.transforms
+        names = has_map, self.odom_frame
+        if self._pairs is None or self._pairs[:2] != names or self._pairs[2] is not sample.transforms:
+            above = [(MAP_FRAME, self.odom_frame)] * has_map
+            self._transforms = SerializedTransforms([*above, (self.odom_frame, self._base), *sample.transforms])
+            self._pairs = *names, sample.transforms
         base, odom = np.asarray(sample.base_q, float), np.asarray(sample.odom_q, float)
         above = [frames.compose(base, frames.inverse(odom))] * has_map
         poses = np.concatenate([[*above, odom], np.reshape(sample.transform_q, (-1, 7))])
