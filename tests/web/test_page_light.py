@@ -29,7 +29,7 @@ KINDS = {
     "ground": (Organ.GROUND,),
 }  # fmt: skip
 MOST = 0.2
-"""Share by which the mean luminance of a kind may differ. 0.13 at most was seen: texels of the page's shadows are 9 mm
+"""Share by which the mean luminance of a kind may differ. 0.143 at most was seen: texels of the page's shadows are 9 mm
 wide, those of the camera 3.5 mm, and the page's exposure is fixed."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
