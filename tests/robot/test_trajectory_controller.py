@@ -90,17 +90,16 @@ def test_waypoints_are_reached_in_time(smooth: bool) -> None:
     np.testing.assert_allclose(np.array(arm.rows)[:, 0, others], arm.home[others] + 0 * position[:, :1], atol=2e-3)
 
 
-def test_controller_reports_desired_and_actual_state() -> None:
+def test_the_desired_state_is_that_of_the_end_of_the_step() -> None:
     arm = ControlledArm()
-    arm.controller.start(swing(arm), 0.0)
+    controller = arm.controller
+    controller.start(swing(arm), 0.0)
     arm.run(1.5)
-    state = arm.controller.state(arm.time)
-    assert state.joints == ARM
-    np.testing.assert_allclose(state.position, arm.at())
-    assert np.abs(state.error).max() < 2e-3  # both at the same time: 0.4 rad/s times a step were 4e-3 more
-    np.testing.assert_allclose(state.desired[[0, 3]], arm.robot.setpoint[arm.robot.joint_indices(TWO)])
-    assert np.abs(state.desired_velocity[[0, 3]]).min() > 0.05
-    assert (state.desired_velocity[[1, 2, 4, 5, 6]] == 0.0).all()
+    error = controller.desired - arm.at()
+    assert np.abs(error).max() < 2e-3  # both at the same time: 0.4 rad/s times a step were 4e-3 more
+    np.testing.assert_allclose(controller.desired[[0, 3]], arm.robot.setpoint[arm.robot.joint_indices(TWO)])
+    assert np.abs(controller.desired_velocity[[0, 3]]).min() > 0.05
+    assert (controller.desired_velocity[[1, 2, 4, 5, 6]] == 0.0).all()
 
 
 def test_a_trajectory_too_fast_for_the_drives_violates_its_path_tolerance() -> None:
@@ -187,11 +186,11 @@ def test_a_trajectory_may_start_later_but_not_be_over() -> None:
     run = arm.controller.start(later, 0.0)
     arm.run(0.4)
     np.testing.assert_allclose(arm.at(), arm.home, atol=1e-4)
-    assert not arm.controller.state(arm.time).desired_velocity.any()  # it waits
-    np.testing.assert_allclose(arm.controller.state(arm.time).desired, arm.robot.setpoint[arm.controller.indices])
+    assert not arm.controller.desired_velocity.any()  # it waits
+    np.testing.assert_allclose(arm.controller.desired, arm.robot.setpoint[arm.controller.indices])
     arm.run(1.5)
     run = arm.controller.start(dataclasses.replace(later, start_time=arm.time + 0.5), arm.time)
-    assert arm.controller.state(arm.time).desired_velocity.any()  # the older one goes on
+    assert arm.controller.desired_velocity.any()  # the older one goes on
     arm.run(0.45)
     arm.rows.clear()
     arm.run(4.0, until=run)

@@ -268,7 +268,7 @@ def test_odometry_is_what_was_measured_with_its_covariances():
     sample = RobotSample(
         "r", joint_sample(), at, actual, measured, odom_qd, covariance, (), np.zeros((0, 7)),
     )  # fmt: skip
-    message = over_the_wire(convert.odometry(sample, "base_footprint"))
+    message = over_the_wire(convert.odometry(sample, "base_footprint", "odom"))
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_footprint")
     assert message.pose.pose.position.x == 3.0
     twist = message.twist.twist
@@ -318,11 +318,11 @@ def test_messages_of_a_step_are_written_as_stock_serialisation_does():
         write = serialized.joint_state_writer(joints(names, 0.0))
         for one in (joints(names, 3.25), joints(names, 1234567.000000001)):
             check(write(one), convert.joint_state(one))
-    write_odometry = serialized.odometry_writer(robot(0.0), "base_footprint")
+    write_odometry = serialized.odometry_writer(robot(0.0), "base_footprint", "odom")
     write_wrench, write_imu = serialized.wrench_writer(wrench(0.0)), serialized.imu_writer(imu(0.0))
     write_clock = serialized.stamp_writer(convert.clock)
     for time in (0.0, 7.75, 98765.4321):
-        check(write_odometry(base := robot(time)), convert.odometry(base, "base_footprint"))
+        check(write_odometry(base := robot(time)), convert.odometry(base, "base_footprint", "odom"))
         check(write_wrench(read := wrench(time)), convert.wrench(read))
         check(write_imu(unit := imu(time)), convert.imu(unit))
         check(write_clock(time), convert.clock(time))

@@ -25,7 +25,34 @@ VICTORY = (1.0, 0.0, 0.0, 1.0, 1.0)
 CONTROLS = "[...document.querySelectorAll('button, input, select, summary')].filter((one) => one.checkVisibility())"
 
 
-class LiveVineyard:
+class SteppedPage:
+    """A page's server, and the clients behind it, which step in a thread of their own, as in their processes."""
+
+    def __init__(self, server, step):
+        self.server, self._step = server, step
+        self.due = []
+        """Called once before the next step."""
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="clients")
+
+    def _run(self):
+        while not self._stop.wait(0.005):
+            while self.due:
+                self.due.pop()()
+            self._step()
+
+    def __enter__(self):
+        self.server.__enter__()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exception):
+        self._stop.set()
+        self._thread.join()
+        self.server.__exit__(*exception)
+
+
+class LiveVineyard(SteppedPage):
     """A client that steps in a thread of its own, as in its process: a spectator or a person before a bunch."""
 
     def __init__(self, bus, *, is_person=False, port=0):
@@ -42,12 +69,8 @@ class LiveVineyard:
             eye = frames.pose(self.bunch - np.array([0.7, 0.0, 0.0]))
             self.client = Spectator(scene, model, None, bus, name="viewer", pose=eye)
         self.world = PageWorld(self.client, person)
-        self.server = PageServer(self.world, port)
+        super().__init__(PageServer(self.world, port), self.client.tick)
         self.client.post_step.append(lambda _: self.world.collect(self.server))
-        self.due = []
-        """Called once before the next step."""
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="client")
 
     @contextlib.contextmanager
     def paused(self):
@@ -59,22 +82,6 @@ class LiveVineyard:
             yield
         finally:
             go_on.set()
-
-    def _run(self):
-        while not self._stop.wait(0.005):
-            while self.due:
-                self.due.pop()()
-            self.client.tick()
-
-    def __enter__(self):
-        self.server.__enter__()
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception):
-        self._stop.set()
-        self._thread.join()
-        self.server.__exit__(*exception)
 
 
 def open_page(page, live, before=""):

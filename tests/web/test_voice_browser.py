@@ -1,6 +1,5 @@
 """Sound through a real browser: its microphone to a robot of another client, and a robot's loudspeaker to its ears."""
 
-import threading
 import time
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 
 from tests.audio.test_microphone import amplitude
 from tests.support.contact_scenes import cane
+from tests.support.live_page import SteppedPage
 from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.audio import opus
@@ -26,7 +26,7 @@ from vinesim.scene.values import LightPattern, Lights
 from vinesim.web.page_server import PageServer
 
 
-class LiveTalk:
+class LiveTalk(SteppedPage):
     """A person with a page, and a robot of another client 2 m away; both step in a thread."""
 
     def __init__(self):
@@ -39,33 +39,16 @@ class LiveTalk:
         self.bot = Client(scene, model, load_description("vinebot"), self.hub.bus("bot"), name="bot", pose=there)
         self.ear = Ear(self.bot, "bot", decodes_opus=opus.is_available())
         world = PageWorld(self.anna, source)
-        self.server = PageServer(world, sound=PageSound(self.anna))
+        super().__init__(PageServer(world, sound=PageSound(self.anna)), self._tick)
         self.anna.post_step.append(lambda _: world.collect(self.server))
-        self.due = []
-        """Called once before the next step."""
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="clients")
+        self._before = time.monotonic()
 
-    def _run(self):
-        before = time.monotonic()
-        while not self._stop.wait(0.005):
-            while self.due:
-                self.due.pop()()
-            self.anna.tick()
-            self.bot.tick()
-            now = time.monotonic()
-            self.hub.advance(now - before)
-            before = now
-
-    def __enter__(self):
-        self.server.__enter__()
-        self._thread.start()
-        return self
-
-    def __exit__(self, *exception):
-        self._stop.set()
-        self._thread.join()
-        self.server.__exit__(*exception)
+    def _tick(self):
+        """A step of both; messages travel for as long as it took."""
+        self.anna.tick()
+        self.bot.tick()
+        before, self._before = self._before, time.monotonic()
+        self.hub.advance(self._before - before)
 
     def loudness(self, frequency):
         """Amplitude of a tone in the purest 50 ms that the robot hears: on a busy machine a voice has gaps."""

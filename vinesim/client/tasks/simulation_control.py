@@ -34,8 +34,8 @@ class SimulationControl:
         self._requests: collections.deque[SimulationRequest] = collections.deque()
         self._stepping: SimulationRequest | None = None
         """A request whose steps are being simulated."""
-        self._told_steps = 0
-        """How many of its steps were told of."""
+        self._reported_steps = 0
+        """How many of its steps a :class:`StepProgress` has reported."""
 
     def put(self, request: SimulationRequest) -> None:
         """Add a request."""
@@ -56,13 +56,13 @@ class SimulationControl:
         self._answer(request, refusal=f"{reason} after {done} of {request.steps} steps", kind=Refusal.FAILED)
 
     def _follow_steps(self) -> None:
-        """Tell of the step that was done since the last call; answer the request after its last step."""
+        """Report the step that was done since the last call; answer the request after its last step."""
         if (request := self._stepping) is None:
             return
         remaining = self._client.steps_before_pause or 0
         done = request.steps - remaining
-        if request.wants_progress and done > self._told_steps:
-            self._told_steps = done
+        if request.wants_progress and done > self._reported_steps:
+            self._reported_steps = done
             self._reply(StepProgress(request.number, done, remaining))
         if not remaining:
             self._stepping = None
@@ -119,7 +119,7 @@ class SimulationControl:
         elif not 1 <= request.steps <= MAX_STEPS:
             raise RequestRefused(Refusal.FAILED, f"{request.steps} steps; give 1 to {MAX_STEPS}")
         else:
-            client.steps_before_pause, self._stepping, self._told_steps = request.steps, request, 0
+            client.steps_before_pause, self._stepping, self._reported_steps = request.steps, request, 0
 
     def _answer(self, request: SimulationRequest, **values: Any) -> None:
         client = self._client

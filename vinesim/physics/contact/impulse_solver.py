@@ -182,23 +182,26 @@ class ImpulseSolver:
     def _follow_constraints(self, count: int, island_count: int) -> None:
         """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve took them to.
 
-        The response to impulses is linear, but a support lets go of a body, and begins to slide under it. Had a light
-        body to be pushed as if its support held it, it would be thrown off. Each round is a Newton step: it starts from
-        the last impulses and the tangent stiffness of the constraints under them. The impulses of the best round count.
+        The response to impulses is linear, but contacts of a body with its support may open, or begin to slide. A light
+        body that is pushed as if its support held it gains energy. Each round is a Newton step from the last impulses,
+        with the tangent stiffness of the constraints under them. The impulses of the round with the least error are
+        kept.
         """
         rows, row_count, p = self.rows, 3 * count, self.parameters
         jacobian, response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
         impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
         kept = (impulse, velocity_free, response, rows.rigid_velocity)
-        free, best, best_error = self.rigid.velocity_free, tuple(values.copy() for values in kept), np.inf
+        free, best, best_error, error = self.rigid.velocity_free, (), np.inf, np.inf
         for round_number in range(p.solver_constraint_steps + 1):
             assert self.rigid_force is not None
             self.rigid.predict_with(self.rigid_force)
             velocity = self.rigid.velocity_free
             error = float(np.abs(jacobian @ (velocity - free + impulse @ response)).max())
+            if error < p.solver_constraint_tolerance:
+                return
             if error < best_error:
                 best, best_error = tuple(values.copy() for values in kept), error
-            if error < p.solver_constraint_tolerance or round_number == p.solver_constraint_steps:
+            if round_number == p.solver_constraint_steps:
                 break
             response[:] = self.rigid.impulse_response(jacobian).T
             free_before, free = free, velocity + impulse @ response

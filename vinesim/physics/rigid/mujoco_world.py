@@ -272,7 +272,7 @@ class WorldCore:
             actor.find_indices(m, self._names)
         self._link_sensors.find_indices(m, self._robots)
         self._pair_friction.find_materials(m)
-        self._speculative_contacts.find_crates(m, sorted(m.body(f"box/{number}").id for number in self._boxes))
+        self._speculative_contacts.find_crates(m, self._boxes)
         for human in self._humans.values():
             for hand in human.hands:
                 self._restore_grasp(hand)

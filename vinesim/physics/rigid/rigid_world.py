@@ -260,8 +260,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
             robot.find_indices(mj_model, self._names)
         self._link_sensors.find_indices(mj_model, self._robots)
         self._pair_friction.find_materials(mj_model)
-        crates = sorted(mj_model.body(f"box/{number}").id for number in self._boxes)
-        self._speculative_contacts.find_crates(mj_model, crates)
+        self._speculative_contacts.find_crates(mj_model, self._boxes)
 
     def _is_faulty(self) -> bool:
         """Whether a number is not finite, or a rate beyond :data:`MAX_RATE`."""

@@ -7,6 +7,8 @@ in a step. A contact within it lets its gap close, but no further (a *speculativ
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import mujoco
 import numpy as np
 
@@ -31,9 +33,9 @@ class SpeculativeContacts:
         self._dof = np.zeros((0, 6), int)
         self._radius = np.zeros(0)
 
-    def find_crates(self, m: mujoco.MjModel, crates: list[int]) -> None:
-        """Find the geoms of ``crates``, MuJoCo's bodies, ascending, in a world that was compiled anew."""
-        self._bodies = bodies = np.array(crates, int)
+    def find_crates(self, m: mujoco.MjModel, numbers: Iterable[int]) -> None:
+        """Find the bodies and geoms of the boxes of these ``numbers`` in a world that was compiled anew."""
+        self._bodies = bodies = np.array(sorted(m.body(f"box/{number}").id for number in numbers), int)
         self._dof = m.body_dofadr[bodies][:, None] + np.arange(6)
         self._geoms = np.flatnonzero(np.isin(m.geom_bodyid, bodies))
         self._crate_of_geom = np.searchsorted(bodies, m.geom_bodyid[self._geoms])

@@ -86,24 +86,6 @@ class Trajectory:
     """[s] Permitted delay of the arrival; 0: unlimited, as in ROS; None: the controller's."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class ControllerState:
-    """Desired and actual joint states (control_msgs/JointTrajectoryControllerState), each [joint] rad or m, or per
-    s."""
-
-    time: float
-    joints: tuple[str, ...]
-    desired: np.ndarray
-    desired_velocity: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-
-    @property
-    def error(self) -> np.ndarray:
-        """[joint] rad or m: desired less actual position."""
-        return self.desired - self.position
-
-
 @dataclasses.dataclass(slots=True, eq=False)
 class GoalHandle:
     """One accepted trajectory and its result."""
@@ -333,14 +315,6 @@ class TrajectoryController:
             self._fail(goal, Outcome.GOAL_TOLERANCE_VIOLATED, off[0], error, slip, f"{late:.2f} s after the end")
             return False
         return True
-
-    def state(self, time: float) -> ControllerState:
-        """Desired and actual joint states at ``time`` [s]."""
-        position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
-        return ControllerState(
-            time, self.joints, self.desired.copy(), self.desired_velocity.copy(), position[self.indices],
-            velocity[self.indices],
-        )  # fmt: skip
 
     def _sample(self, time: float, ahead: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions, velocities [joint] so far ``ahead`` of ``time`` [s], and whether each joint follows a spline."""

@@ -1,4 +1,4 @@
-"""The action simulate_steps (simulation_interfaces/SimulateSteps): steps of a paused simulation, told of one by one.
+"""The action simulate_steps (simulation_interfaces/SimulateSteps): steps of a paused simulation, each reported.
 
 A goal is executed by the simulation, and its handle waits without a thread of its own: the node goes on serving.
 """

@@ -270,7 +270,7 @@ class SimulationRequest:
     steps: int = 0
     """Of :attr:`SimulationAction.STEP`."""
     wants_progress: bool = False
-    """Of :attr:`SimulationAction.STEP`: whether each step is told of by a :class:`StepProgress`."""
+    """Of :attr:`SimulationAction.STEP`: whether the simulation sends a :class:`StepProgress` after each step."""
     entity: EntityArguments | None = None
     keep_state: bool = False
     """Of :attr:`SimulationAction.RESET`: only spawned entities go."""

@@ -118,7 +118,7 @@ UNMEASURED = 1e6
 """Variance of z, roll and pitch in odometry, which tracks do not measure."""
 
 
-def odometry(sample: RobotSample, base: str, odom: str = "odom") -> Odometry:
+def odometry(sample: RobotSample, base: str, odom: str) -> Odometry:
     """Odometry of the base: pose in the frame ``odom``, velocity in its own axes, both as measured, and their
     covariances."""
     message = Odometry(header=header(sample.joints.time, odom), child_frame_id=base)

@@ -77,7 +77,7 @@ def joint_state_writer(first: JointSample) -> Callable[[JointSample], bytes]:
     return lambda one: template.message(one.time, np.concatenate([one.position, one.velocity, one.effort]))
 
 
-def odometry_writer(first: RobotSample, base: str, odom: str = "odom") -> Callable[[RobotSample], bytes]:
+def odometry_writer(first: RobotSample, base: str, odom: str) -> Callable[[RobotSample], bytes]:
     """Writes nav_msgs/Odometry of samples of one robot, in the frame ``odom``."""
 
     def build(time: float, numbers: np.ndarray) -> Any:
