@@ -82,6 +82,15 @@ def test_diagnostics_warn_while_a_loop_is_behind_and_no_longer(client, monkeypat
         assert loop_status(status.current()).message == message
 
 
+def test_a_loop_that_was_asked_to_run_slowly_is_not_behind(client, monkeypatch) -> None:
+    """At a fifth of real time 20 steps are due in a second."""
+    loop = RateLoop(0.01, target_factor=0.2)
+    status, now = Status(client, loop), 1.0
+    monkeypatch.setattr(RateLoop, "elapsed", property(lambda _: now))
+    for now, loop.ticks, message in ((1.0, 20, "well"), (2.0, 30, "behind"), (3.0, 50, "well")):  # noqa: B007
+        assert loop_status(status.current()).message == message
+
+
 def test_what_cannot_be_read_from_another_actor_is_counted(client) -> None:
     client.replicator.counters.malformed += 3
     assert Status(client, RateLoop(0.01)).current()["faults"] == {"messages_refused": 3}

@@ -57,6 +57,19 @@ def test_real_time_factor_is_simulated_over_wall_time(clock):
     assert slow.overruns == 20
 
 
+def test_a_lower_target_spaces_the_steps_and_their_deadlines(clock):
+    """At a quarter of real time a step of 10 ms is due every 40 ms, and 25 ms of work are no overrun."""
+    loop = RateLoop(0.01, target_factor=0.25)
+    starts = run(loop, clock, [0.025, 0.1, 0.001, 0.001, 0.001])
+    assert starts == pytest.approx([0.0, 0.04, 0.14, 0.141, 0.16])
+    assert loop.overruns == 1
+    run(loop, clock, [0.002] * 100)
+    assert loop.real_time_factor == pytest.approx(0.25, rel=0.01)
+    clock.now += 40.0
+    run(loop, clock, [0.0] * 2)
+    assert loop.dropped in (999, 1000)
+
+
 def test_deadlines_of_a_long_stall_are_dropped_and_counted(clock):
     loop = RateLoop(0.01)
     starts = run(loop, clock, [0.001, 3.0] + [0.001] * 10)

@@ -288,7 +288,7 @@ def test_claims_are_decoded_and_invalid_ones_are_refused():
 
 
 def test_clock_messages_are_decoded():
-    assert messages.decode_time(messages.encode_time(1.5, 2.5)) == (1.5, 2.5)
+    assert messages.decode_time(messages.encode_time(1.5, 2.5, 0.2)) == (1.5, 2.5, 0.2)
     with pytest.raises(MessageError, match="finite"):
         messages.decode_time(messages.encode_time(float("nan")))
 

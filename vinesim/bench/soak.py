@@ -36,7 +36,7 @@ SAMPLE_PERIOD = 5.0
 POLL_PERIOD = 0.1
 """Between two looks at what the processes print [s]."""
 SENSOR_HZ = 1.0
-"""Pictures and scans a second of each robot [Hz]."""
+"""Pictures and scans of each robot in a second of real time [Hz]."""
 PERSON_DISTANCE = 1.5
 """From where a person starts to its bunch [m]."""
 GROWTH_BUDGET = 1.0
@@ -56,6 +56,8 @@ class Cast:
     robots: int = 4
     people: int = 2
     records: bool = True
+    real_time_factor: float = 1.0
+    """Of the world; below 1 where the machine cannot hold them at 100 Hz."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,9 +76,9 @@ class SoakResult:
         return [history for (name, _), history in self.histories.items() if name == kind]
 
 
-def soak(minutes: float, announce: Callable[[str], None]) -> Iterator[Measurement]:
+def soak(minutes: float, real_time_factor: float, announce: Callable[[str], None]) -> Iterator[Measurement]:
     """Run for ``minutes`` [min] and measure; ``announce`` takes a line now and then."""
-    yield from measurements(run_soak(Cast(), minutes, announce))
+    yield from measurements(run_soak(Cast(real_time_factor=real_time_factor), minutes, announce))
 
 
 def measurements(result: SoakResult) -> Iterator[Measurement]:
@@ -148,7 +150,7 @@ class _Run:
         self._folder = folder
         self.server = group.start(
             "server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json",
-            "--state-dir", str(folder / "state"),
+            "--state-dir", str(folder / "state"), "--real-time-factor", f"{cast.real_time_factor:g}",
         )  # fmt: skip
         self._figures: dict[str, Any] = json.loads(self.server.next_line(START_TIMEOUT))
         self._endpoint = self._figures["endpoints"][0]
@@ -172,10 +174,11 @@ class _Run:
         first = start_poses.start_pose(scene, 0)
         pushed = start_poses.find_reachable_bunch(model, first)
         with_ros = middleware.unavailable_reason() is None
+        sensor_hz = SENSOR_HZ / cast.real_time_factor  # of simulated time
         for i in range(cast.robots):
             name = f"robot_{i + 1}"
             pose = start_poses.start_pose(scene, 0, queue=i)
-            options = ["--namespace", name, "--sensor-hz", str(SENSOR_HZ), *_pose_option(pose[:2], to_yaw(pose[3:]))]
+            options = ["--namespace", name, "--sensor-hz", f"{sensor_hz:g}", *_pose_option(pose[:2], to_yaw(pose[3:]))]
             if with_ros:
                 topics = [f"/{name}/{topic}" for topic in TOPICS]
                 listener = RosListener(group, topics)

@@ -165,10 +165,11 @@ def _announce(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _soak(minutes: float | None = None) -> Iterator[Measurement]:
+def _soak(minutes: float | None = None, real_time_factor: float | None = None) -> Iterator[Measurement]:
     from vinesim.bench.soak import MINUTES, soak
 
-    return soak(MINUTES if minutes is None else minutes, _announce)
+    factor = 1.0 if real_time_factor is None else real_time_factor
+    return soak(MINUTES if minutes is None else minutes, factor, _announce)
 
 
 RAISED = {
@@ -213,6 +214,7 @@ def _measurements(
     plot: pathlib.Path | None,
     rows: Sequence[str],
     minutes: float | None,
+    real_time_factor: float | None,
     times: int,
     seed: int,
     messages: int,
@@ -223,7 +225,7 @@ def _measurements(
         if name == "live":
             yield from _live(rows)
         elif name == "soak":
-            yield from _soak(minutes)
+            yield from _soak(minutes, real_time_factor)
         elif name == "kill":
             yield from _kill(times, seed)
         elif name == "fuzz":
@@ -240,22 +242,25 @@ def _measurements(
 
 def run(
     names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = (),
-    minutes: float | None = None, times: int = 50, seed: int = 1, messages: int = 100_000, lies: int = 0,
+    minutes: float | None = None, real_time_factor: float | None = None, times: int = 50, seed: int = 1,
+    messages: int = 100_000, lies: int = 0,
 ) -> int:  # fmt: skip
     """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
     ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none;
-    ``minutes`` of soak; ``times`` and ``seed`` of kill; ``messages`` and ``lies`` of fuzz.
+    ``minutes`` and ``real_time_factor`` of soak; ``times`` and ``seed`` of kill; ``messages`` and ``lies`` of fuzz.
     """
     if rows and "live" not in names:
         raise NoSuchBench("--row chooses rows of the bench live; leave it out")
     if minutes is not None and "soak" not in names:
         raise NoSuchBench("--minutes is how long the bench soak runs; leave it out")
+    if real_time_factor is not None and "soak" not in names:
+        raise NoSuchBench("--real-time-factor is how fast the world of the bench soak runs; leave it out")
     for name in names:
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in _measurements(name, plot, rows, minutes, times, seed, messages, lies):
+        for m in _measurements(name, plot, rows, minutes, real_time_factor, times, seed, messages, lies):
             if as_json:
                 print(json.dumps(dataclasses.asdict(m)), flush=True)
             else:

@@ -81,6 +81,8 @@ class ClientOptions:
     """File of a person's own finger poses."""
     outfit: str | None = None
     """What a person wears, by name; None: what follows from its own name."""
+    real_time_factor: float = 1.0
+    """Simulated time over real time that the loop of a client without a server aims at; 1 at most."""
     world: str = DEFAULT_WORLD
     """Of the server's worlds; those in different ones do not meet."""
 
@@ -120,6 +122,11 @@ def check_options(options: ClientOptions) -> None:
     if options.world != DEFAULT_WORLD and options.tls is not None:
         raise UsageError(
             f"--world {options.world} --tls {options.tls}: a server with certificates has one world; leave --world out"
+        )
+    if options.real_time_factor != 1.0 and options.connect is not None:
+        raise UsageError(
+            f"--real-time-factor {options.real_time_factor:g} with --connect: a world runs as fast as its server says; "
+            "give it to vinesim server"
         )
     if options.params_file is not None and not options.params_file.is_file():
         raise UsageError(f"--params-file {options.params_file}: there is no such file; give a ROS 2 parameter file")

@@ -143,14 +143,21 @@ class ClientSession:
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
         sensors: Callable[[], dict[str, Any]] = dict, publish: Callable[[dict[str, Any]], Any] = lambda _: None,
     ) -> Status:  # fmt: skip
-        """Step in real time until a signal, the time limit or the end of the ``task``; returns the final status.
+        """Step at the asked real-time factor until a signal, the time limit or the end of the ``task``; returns the
+        final status.
 
         ``sent`` counts the ROS messages by topic, ``sensors`` gives the status of sensors, ``publish`` takes every
         status for /diagnostics.
         """
+        loop = RateLoop(client.physics.dt, self.options.real_time_factor)
         if self.options.connect is not None:
             client.wait_for_clock(CLOCK_TIMEOUT)
-        loop = RateLoop(client.physics.dt)
+
+            def follow_world() -> None:
+                loop.target_factor = client.replicator.real_time_factor
+
+            follow_world()
+            client.between_steps.append(follow_world)
         status = Status(client, loop, sent, task, sensors)
         reporter = threading.Thread(
             target=report_status, args=(status, publish, self.options.status, self._stop), name="status"
@@ -182,7 +189,9 @@ def run_loop(
     stop: threading.Event, step: Callable[[], None], loop: RateLoop, seconds: float | None, dt: float,
     is_done: Callable[[], bool] = lambda: False,
 ) -> None:  # fmt: skip
-    """Step in real time until ``stop`` (set by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until done."""
+    """Step at the loop's rate until ``stop`` (set by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until
+    done.
+    """
     allocator.release_free_memory()
     gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
     gc.enable()

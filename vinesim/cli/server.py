@@ -22,7 +22,7 @@ STATUS_PERIOD = 1.0
 def run(
     *, listen: list[str] | None, connect: list[str] | None, state_dir: pathlib.Path | None, scene: str | None,
     seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, insecure: bool,
-    status: str, spectators_speak_to: str = "people",
+    status: str, spectators_speak_to: str = "people", real_time_factor: float = 1.0,
 ) -> int:  # fmt: skip
     """Carry messages until SIGINT or SIGTERM."""
     if status not in ("text", "json", "none"):
@@ -40,7 +40,7 @@ def run(
     with Server(
         places, connect=connect or (), state_folder=state_dir, scene=plan,
         max_actors=max_clients, quota=Quota(*quota), certificates=tls,
-        spectators_speak_to=SpectatorsSpeakTo(spectators_speak_to),
+        spectators_speak_to=SpectatorsSpeakTo(spectators_speak_to), real_time_factor=real_time_factor,
     ) as server:  # fmt: skip
         if status != "json":
             print(f"listening on {', '.join(map(str, server.endpoints))}", flush=True)

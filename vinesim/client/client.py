@@ -256,7 +256,7 @@ class Client:
         now = self.clock()
         self.receive(now)
         if self.replicator.has_clock:
-            self.world_time.follow(self.physics.time, now + self.replicator.offset)
+            self.world_time.follow(self.physics.time, self.replicator.network_time(now))
         self.physics.wind_time_offset = self.world_time.offset
         self.control()
         self.physics.step()

@@ -48,20 +48,24 @@ class TickLog:
 
 
 class RateLoop:
-    """Waits for the next of a row of deadlines ``dt`` [s] apart, and measures the work of each step.
+    """Waits for the next of a row of deadlines, and measures the work of each step of ``dt`` [s].
 
     Deadlines are absolute, so a late step does not delay the ones after it. A process that fell far behind (it was
     stopped, or the machine slept) does not race to catch up: the missed deadlines are dropped.
+
+    Simulated time passes ``target_factor`` times as fast as real time: deadlines are ``dt / target_factor`` apart.
     """
 
     MAX_BACKLOG = 25
     """Largest backlog that is caught up [steps]; a longer one is dropped and counted."""
 
-    def __init__(self, dt: float, capacity: int = 1 << 16) -> None:
+    def __init__(self, dt: float, target_factor: float = 1.0, capacity: int = 1 << 16) -> None:
         self.dt = dt
+        self.target_factor = target_factor
+        """May be changed between steps."""
         self.ticks = 0
         self.overruns = 0
-        """Steps whose work took longer than ``dt``."""
+        """Steps whose work took longer than the period."""
         self.dropped = 0
         """Deadlines dropped after a stall."""
         # filled, not np.zeros: their pages are there from the start, and the memory of a run does not grow
@@ -69,18 +73,23 @@ class RateLoop:
         self._begins = np.full(capacity, 0.0)
         self._began = self._start = self._deadline = 0.0
 
+    @property
+    def period(self) -> float:
+        """From one deadline to the next [s]."""
+        return self.dt / self.target_factor
+
     def begin(self) -> None:
         """Wait until the next step is due, then start measuring its work."""
         now = time.perf_counter()
         if self.ticks == 0:
             self._start = self._deadline = now
         else:
-            self._deadline += self.dt
+            self._deadline += self.period
             late = now - self._deadline
-            if late > self.MAX_BACKLOG * self.dt:
-                skipped = int(late / self.dt)
+            if late > self.MAX_BACKLOG * self.period:
+                skipped = int(late / self.period)
                 self.dropped += skipped
-                self._deadline += skipped * self.dt
+                self._deadline += skipped * self.period
             while (wait := self._deadline - time.perf_counter()) > 0.0:
                 time.sleep(wait)
         self._began = time.perf_counter()
@@ -90,7 +99,7 @@ class RateLoop:
         work = time.perf_counter() - self._began
         self._work[self.ticks % len(self._work)] = work
         self._begins[self.ticks % len(self._work)] = self._began
-        self.overruns += work > self.dt
+        self.overruns += work > self.period
         self.ticks += 1
 
     @property

@@ -68,6 +68,7 @@ class Status:
             "overruns": loop.overruns,
             "real_time_factor": loop.real_time_factor,
             "recent_real_time_factor": recent_factor,
+            "target_real_time_factor": loop.target_factor,
             "awake": len(client.physics.plants.awake),
             "force": float(force),
             "displacement_mm": 1e3 * client.trace.displacement if client.trace is not None else 0.0,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Pose, Renderer, Scene, Seconds, Seed, StatusFormat, World
+from vinesim.cli.commands.options import Pose, RealTimeFactor, Renderer, Scene, Seconds, Seed, StatusFormat, World
 
 Role = Annotated[str, typer.Option(help="robot, human or spectator.")]
 Name = Annotated[str | None, typer.Option(help="The actor's unique name; ROLE-PID unless given.")]
@@ -100,7 +100,8 @@ def client(
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
     sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,
-    page_lan: PageLan = False, gestures: OwnGestures = None, outfit: Outfit = None, world: World = "vineyard",
+    page_lan: PageLan = False, gestures: OwnGestures = None, outfit: Outfit = None,
+    real_time_factor: RealTimeFactor = 1.0, world: World = "vineyard",
 ) -> None:  # fmt: skip
     """Join the vineyard as one actor, with a simulation of its own.
 

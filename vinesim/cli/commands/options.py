@@ -18,6 +18,14 @@ ImageSize = Annotated[
 ]
 Seconds = Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")]
 StatusFormat = Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")]
+RealTimeFactor = Annotated[
+    float,
+    typer.Option(
+        min=0.01, max=1.0,
+        help="Simulated time passes so many times as fast as real time: below 1 for machines that cannot hold 100 "
+        "steps a second. In a world with a server, the server's.",
+    ),
+]  # fmt: skip
 Insecure = Annotated[
     bool,
     typer.Option(

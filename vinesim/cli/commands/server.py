@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Insecure, StatusFormat
+from vinesim.cli.commands.options import Insecure, RealTimeFactor, StatusFormat
 
 
 def server(
@@ -45,6 +45,7 @@ def server(
         pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): all others are refused.")
     ] = None,
     insecure: Insecure = False,
+    real_time_factor: RealTimeFactor = 1.0,
     status: StatusFormat = "none",
 ) -> None:
     """Route messages between clients, and keep the retained state. The server simulates nothing.
@@ -56,6 +57,7 @@ def server(
       vinesim server
       vinesim server --listen tcp/127.0.0.1:0 --status text
       vinesim server --scene vsp --max-clients 12 --state-dir harvest/
+      vinesim server --real-time-factor 0.2
       vinesim server --tls certs/
       vinesim server --insecure
       vinesim server --connect tcp/192.168.1.5:7447

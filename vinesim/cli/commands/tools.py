@@ -18,6 +18,9 @@ def bench(
     minutes: Annotated[
         float | None, typer.Option(min=0.1, help="Of soak: how long it measures; 60 unless given.")
     ] = None,
+    real_time_factor: Annotated[
+        float | None, typer.Option(min=0.01, max=1.0, help="Of soak: of its world; 1 unless given.")
+    ] = None,
     plot: Annotated[
         pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
     ] = None,
@@ -52,11 +55,11 @@ def bench(
       vinesim bench fuzz --messages 1000000 --lies 2000
       vinesim bench sync --json --plot docs/pictures/network-sync.png
       vinesim bench sensors --plot docs/pictures
-      vinesim bench soak --minutes 20 --json
+      vinesim bench soak --minutes 20 --real-time-factor 0.1 --json
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json, plot, row or (), minutes, times, seed, messages, lies))
+    raise typer.Exit(run(names, json, plot, row or (), minutes, real_time_factor, times, seed, messages, lies))
 
 
 def doctor(

@@ -191,7 +191,7 @@ class ReplayBus:
     def query(self, key: str, payload: bytes = b"") -> None:
         family, _, rest = key.partition("/")
         if family == "clock":
-            asked, _ = messages.decode_time(payload)
+            asked, *_ = messages.decode_time(payload)
             self._reply(key, messages.encode_time(asked, self.time))
         elif family == "hello" and rest in self._playhead.live and rest in self._playhead.greetings:
             self._reply(key, self._playhead.greetings[rest])

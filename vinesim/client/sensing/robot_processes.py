@@ -143,7 +143,7 @@ class RobotProcesses:
 
 def loop_status(status: dict[str, Any]) -> ComponentStatus:
     """A client's loop for /diagnostics: a warning while it is behind and after recent faults, the counts of all."""
-    trouble = ["behind"] * (status["recent_real_time_factor"] < BEHIND)
+    trouble = ["behind"] * (status["recent_real_time_factor"] < BEHIND * status["target_real_time_factor"])
     trouble += [name.replace("_", " ") for name in status["recent_faults"]]
     values = {key: status[key] for key in _LOOP_VALUES} | status["faults"]
     return ComponentStatus("simulation", "warning" if trouble else "ok", ", ".join(trouble) or "well", values)

@@ -165,7 +165,7 @@ class SoundExchange:
         if not (self._listeners or self._speakers or self._loudspeakers):
             return
         client = self._client
-        now = client.clock() + client.replicator.offset
+        now = client.replicator.network_time(client.clock())
         said = self._send(now)
         tones = self._tones()
         to_world = client.physics.time + client.world_time.offset - now

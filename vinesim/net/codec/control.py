@@ -28,6 +28,9 @@ from vinesim.scene.ids import LABEL_STRIDE
 MAX_RECORDS = 4096
 """Retained records in one message."""
 
+MIN_FACTOR = 0.01
+"""Smallest real-time factor of a world; the largest is 1."""
+
 HEIGHT_RANGE = (1.0, 2.5)
 """Shortest and tallest person [m]. GUESSED."""
 
@@ -232,18 +235,20 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
     return records
 
 
-def encode_time(sent: float, server: float = 0.0) -> bytes:
+def encode_time(sent: float, server: float = 0.0, factor: float = 1.0) -> bytes:
     """Encode a clock query (own time ``sent`` [s]) or its reply, which repeats ``sent`` and adds the ``server``'s
-    time [s]."""
-    return pack(MessageKind.CLOCK, (float(sent), float(server)))
+    time [s] and how many times as fast as real time it passes."""
+    return pack(MessageKind.CLOCK, (float(sent), float(server), float(factor)))
 
 
-def decode_time(payload: bytes) -> tuple[float, float]:
-    """Own time of the query [s] and the server's time of the reply [s], both finite."""
-    sent, server = unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
+def decode_time(payload: bytes) -> tuple[float, float, float]:
+    """Own time of the query [s], the server's time of the reply [s] and its real-time factor, all finite."""
+    sent, server, factor = unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
     if not (math.isfinite(sent) and math.isfinite(server)):
         raise MessageError(f"clock message ({sent}, {server}) that is not finite")
-    return sent, server
+    if not MIN_FACTOR <= factor <= 1.0:
+        raise MessageError(f"clock message with the real-time factor {factor}, from {MIN_FACTOR:g} to 1")
+    return sent, server, factor
 
 
 _encoder = msgspec.msgpack.Encoder()
@@ -256,4 +261,4 @@ _claims_decoder = msgspec.msgpack.Decoder(list[tuple[int, int, int, str, bool]])
 
 _records_decoder = msgspec.msgpack.Decoder(list[RetainedRecord])
 
-_time_decoder = msgspec.msgpack.Decoder(tuple[float, float])
+_time_decoder = msgspec.msgpack.Decoder(tuple[float, float, float])

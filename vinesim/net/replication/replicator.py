@@ -38,8 +38,9 @@ class Replicator:
     """Replicates the objects of a scene for one actor. Call :meth:`receive` and :meth:`send` once a step, from one
     thread.
 
-    ``now`` is any clock of the client in seconds; the offset to the server's clock is kept inside. Objects are trees,
-    boxes and free bunches, by :func:`vinesim.scene.ids.object_id`.
+    ``now`` is any clock of the client in seconds; own time, which runs at the world's real-time factor, and its offset
+    to the server's clock are kept inside. Objects are trees, boxes and free bunches, by
+    :func:`vinesim.scene.ids.object_id`.
     """
 
     def __init__(
@@ -121,6 +122,15 @@ class Replicator:
         return self._state.peers.clock.offset
 
     @property
+    def real_time_factor(self) -> float:
+        """How many times as fast as real time the world's time passes; 1 unless a server says otherwise."""
+        return self._state.peers.clock.factor
+
+    def network_time(self, now: float) -> float:
+        """Network time [s] at the time ``now`` [s] of the client's clock."""
+        return self._state.peers.clock.own(now) + self.offset
+
+    @property
     def has_clock(self) -> bool:
         """Whether a server has told its clock, so that network time is its time."""
         return bool(self._state.peers.clock.estimate.pings)
@@ -137,7 +147,7 @@ class Replicator:
         it, people of other clients push nothing.
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
-        self._state.peers.clock.advance(now)
+        now = self._state.peers.clock.advance(now)
         self._follow_clock()
         return self._receiver.receive(now, self.offset, link_centre)
 
@@ -177,6 +187,7 @@ class Replicator:
         again, with the place where they are now.
         """
         state = self._state
+        now = state.peers.clock.own(now)
         self._follow_clock()
         time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
         state.cells.position = np.asarray(pose.base_q[:3], float)

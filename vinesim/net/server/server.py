@@ -75,6 +75,7 @@ class Server:
         quota: Quota = Quota(),
         certificates: pathlib.Path | None = None,
         world: str = WORLD,
+        real_time_factor: float = 1.0,
     ) -> None:
         """Listen on endpoints like ``tcp/0.0.0.0:7447``; port 0 chooses a free one, see :attr:`endpoint`.
 
@@ -83,7 +84,7 @@ class Server:
         server. ``scene``: the only one allowed. ``max_actors``: at a time. ``spectators_speak_to``:
         who hears them. ``certificates``: folder of a server, see
         :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate. It is read
-        again when its files change.
+        again when its files change. ``real_time_factor``: how many times as fast as real time its worlds run.
 
         Raises :class:`PortTaken`, :class:`vinesim.errors.UsageError` for an invalid endpoint or combination,
         :class:`vinesim.net.server.journal.JournalError` and
@@ -92,10 +93,10 @@ class Server:
         listen = (listen,) if isinstance(listen, str) else listen
         is_secured = certificates is not None
         linked = [endpoints.parse(text, secured=is_secured) for text in connect]
-        if linked and (state_folder is not None or scene is not None or max_actors is not None):
+        if linked and (state_folder, scene, max_actors, real_time_factor) != (None, None, None, 1.0):
             raise UsageError(
-                f"a server linked to {linked[0]} only carries: give --state-dir, --scene and --max-clients "
-                "to the one server that connects to no other"
+                f"a server linked to {linked[0]} only carries: give --state-dir, --scene, --max-clients and "
+                "--real-time-factor to the one server that connects to no other"
             )
         self._certificates, self._linked = certificates, linked
         self._root = f"{ROOT}/{'*' if certificates is None else world}"
@@ -106,8 +107,10 @@ class Server:
             self.endpoints = endpoints.resolve_ports(listen, secured=is_secured)
         except OSError as error:
             raise PortTaken(listen[0], str(error.strerror)) from error
-        self._clock_origin = time.time() - time.monotonic()
-        """Time of day [s] at the origin of the monotonic clock: a later step of the time of day moves no world."""
+        self.real_time_factor = real_time_factor
+        self._clock_origin = time.time() - real_time_factor * time.monotonic()
+        """Worlds' time [s] at the origin of the monotonic clock. It begins with the time of day, a later step of which
+        moves no world."""
         self.pings = 0
         """Queries of the clock."""
         self.foreign = 0
@@ -181,6 +184,11 @@ class Server:
     def malformed(self) -> int:
         """Messages and queries that could not be decoded."""
         return self._malformed + (self.store.counters.malformed if self.store is not None else 0)
+
+    @property
+    def time(self) -> float:
+        """The time of its worlds now [s]."""
+        return self._clock_origin + self.real_time_factor * time.monotonic()
 
     def figures(self) -> dict[str, Any]:
         """Content of a status line: live actors, links, and counters since the start."""
@@ -317,7 +325,7 @@ class Server:
     def _on_clock_query(self, query: zenoh.Query) -> None:
         with query:
             try:
-                asked, _ = messages.decode_time(_query_payload(query))
+                asked, *_ = messages.decode_time(_query_payload(query))
             except MessageError as error:
                 self._count_malformed(f"{_strip_root(query.key_expr)}", error)
                 return
@@ -325,7 +333,7 @@ class Server:
                 self._count_malformed(_strip_root(query.key_expr), MessageError("the question names no world"))
                 return
             self.pings += 1
-            query.reply(str(query.key_expr), messages.encode_time(asked, self._clock_origin + time.monotonic()))
+            query.reply(str(query.key_expr), messages.encode_time(asked, self.time, self.real_time_factor))
 
     def _on_join_query(self, query: zenoh.Query) -> None:
         with query:

@@ -1,0 +1,108 @@
+"""Worlds that run slower than real time, as their server says: copies stay as near as in real time."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from vinesim import frames
+from vinesim.bench.support.fake_client import FakeClient, tree_row
+from vinesim.client.rate_loop import RateLoop
+from vinesim.net.codec import messages
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.scene.values import POINT_NAMES, HumanUpdate
+
+DT = 0.01
+START = 1e6
+"""Of the worlds' time [s]."""
+SWING, RATE = 0.3, 4.0
+"""Of a hand: amplitude [m] and angular frequency [rad/s]; 1.2 m/s at most."""
+
+
+class Person(FakeClient):
+    """A person whose hand swings with the time of the world, which is simulated time."""
+
+    def pose(self, now: float) -> HumanUpdate:
+        """The velocity is that of simulated time, as a simulation has no other."""
+        time = self.replicator.network_time(now)
+        velocity = np.zeros((len(POINT_NAMES), 6))
+        velocity[2, 2] = SWING * RATE * np.cos(RATE * time)
+        still = super().pose(now)
+        assert isinstance(still, HumanUpdate)
+        left = frames.pose(self.place + np.array([0.0, 0.0, height_of_hand(time)]))
+        return HumanUpdate(self.name, now, dataclasses.replace(still.pose, left=left), velocity)
+
+
+def height_of_hand(time: float) -> float:
+    return 1.1 + SWING * np.sin(RATE * time)
+
+
+class World:
+    """Two people, and a server whose time passes ``factor`` times as fast as real time."""
+
+    def __init__(self, factor: float) -> None:
+        self.hub, self.factor, self._begun, self._time = MemoryHub(delay=0.02), factor, 0.0, START
+        self.hub.bus("server").declare_queryable(
+            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.time, self.factor)
+        )
+        model = tree_row(2)
+        self.ada, self.bob = (
+            Person(self.hub.bus(name), model, (x, 0.0), kind="human") for name, x in (("ada", 1.0), ("bob", 2.0))
+        )
+
+    @property
+    def time(self) -> float:
+        return self._time + self.factor * (self.hub.time - self._begun)
+
+    def change(self, factor: float) -> None:
+        """As by a server that is started again with another factor."""
+        self._time, self._begun, self.factor = self.time, self.hub.time, factor
+
+    def run(self, steps: int) -> float:
+        """Step both clients at the factor; how far bob's copy of ada's hand was from it at most [m]."""
+        worst = 0.0
+        for _ in range(steps):
+            self.hub.advance(DT / self.factor)
+            for client in (self.ada, self.bob):
+                client.tick(self.hub.time)
+            if (copy := self.bob.robots.get("ada")) is not None:
+                assert isinstance(copy, HumanUpdate)
+                worst = max(worst, abs(copy.pose.left[2] - height_of_hand(self.time)))
+        return worst
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.2, 0.05])
+def test_a_copy_in_a_slow_world_is_where_the_hand_is(factor: float) -> None:
+    """A copy that took velocities of simulated time for those of real time would lead by up to 0.15 s: 180 mm."""
+    world = World(factor)
+    world.run(200)
+    for client in (world.ada, world.bob):
+        assert client.replicator.real_time_factor == factor
+        assert client.replicator.network_time(world.hub.time) == pytest.approx(world.time, abs=0.021 * factor)
+        assert client.replicator.round_trip == pytest.approx(0.04, abs=DT / factor)
+    assert world.run(500) < 0.02
+
+
+def test_clients_follow_a_server_that_comes_back_with_another_factor() -> None:
+    world = World(1.0)
+    world.run(200)
+    world.change(0.1)
+    world.run(400)
+    assert world.ada.replicator.real_time_factor == 0.1
+    assert world.bob.replicator.network_time(world.hub.time) == pytest.approx(world.time, abs=0.01)
+    assert world.run(300) < 0.02
+    assert (world.ada.left_at, world.bob.left_at) == ({}, {})
+
+
+def test_a_loop_takes_another_factor_between_steps() -> None:
+    loop = RateLoop(DT)
+    loop.target_factor = 0.25
+    assert loop.period == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, 1.5, float("nan"), float("inf")])
+def test_an_impossible_factor_is_not_believed(factor: float) -> None:
+    with pytest.raises(messages.MessageError, match="real-time factor"):
+        messages.decode_time(messages.encode_time(1.0, 2.0, factor))
