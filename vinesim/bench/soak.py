@@ -232,10 +232,7 @@ class _Run:
         """One line: memory of all, rates of the clients, faults so far."""
         memory = self.sampler.memory()
         rates = " ".join(f"{values['tick_hz']:.0f}" for values in self._newest.values())
-        faults: dict[str, int] = {}
-        for values in self._newest.values():
-            for name, count in values["faults"].items():
-                faults[name] = faults.get(name, 0) + count
+        faults = {name: values["faults"] for name, values in self._newest.items() if values["faults"]}
         return f"{memory:.0f} MB in all, ticks {rates} Hz, faults {faults or 'none'}"
 
     def least_rate(self) -> float:

@@ -11,7 +11,9 @@ from vinesim.physics.rigid.mujoco_sleep import AWAKE_COUNTER
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
 _CONSTRAINT = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-_INIT, _ALLOWED = int(mujoco.mjtSleepPolicy.mjSLEEP_INIT), int(mujoco.mjtSleepPolicy.mjSLEEP_AUTO_ALLOWED)
+_NEVER, _INIT, _ALLOWED = (
+    int(getattr(mujoco.mjtSleepPolicy, f"mjSLEEP_{policy}")) for policy in ("NEVER", "INIT", "AUTO_ALLOWED")
+)
 DOF_ARRAYS = (
     "qvel", "qacc", "qacc_smooth", "qacc_warmstart", "qfrc_smooth", "qfrc_applied", "qfrc_gravcomp",
     "qfrc_actuator",
@@ -78,7 +80,8 @@ def transfer_state(
     of_free = np.repeat(free, np.where(free, 7, 1))
     new.qpos0[to_q[of_free]] = old_data.qpos[from_q[of_free]]
     for tree in np.unique(new.dof_treeid[new.jnt_dofadr[to[free]]]).tolist():
-        new.tree_sleep_policy[tree] = _INIT if tree in asleep else _ALLOWED
+        if new.tree_sleep_policy[tree] != _NEVER:  # parts of people, whose masses change
+            new.tree_sleep_policy[tree] = _INIT if tree in asleep else _ALLOWED
     new.opt.disableflags |= _CONSTRAINT
     data = mujoco.MjData(new)
     new.opt.disableflags &= ~_CONSTRAINT
