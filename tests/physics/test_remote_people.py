@@ -110,7 +110,7 @@ def test_people_are_awake_and_feel_what_falls_on_them_after_others_have_joined()
     step(rigid, 100)
     m, d = rigid.mj_model, rigid.mj_data
     assert not [name for name in asleep(rigid) if name.startswith("eva/")]
-    d.joint("box/0").qpos[:3] = d.body("eva/head").xpos + [0.0, 0.0, 0.5]
+    d.joint("box/0").qpos[:3] = d.body("eva/head").xpos + np.array([0.0, 0.0, 0.5])
     wake_body(m, d, m.body("box/0").id)
     fastest = 0.0
     for _ in range(100):

@@ -1,6 +1,7 @@
 // A person in a headset: WebXR poses of head and controllers, sticks to walk and turn, pulses for what the hands feel.
 
 import * as THREE from "./vendor/three.module.js";
+import { ViewportScale } from "./rate.js";
 
 const WALK = 1.4, TURN = Math.PI / 6, DEAD = 0.25; // m/s, rad, share of a stick's way
 const HALF = Math.SQRT1_2;
@@ -14,6 +15,7 @@ const FINGERS = ["thumb", "index-finger", "middle-finger", "ring-finger", "pinky
 const FULL_BEND = [1.6, 3.8, 3.8, 3.8, 3.8];
 const AIM = 0.7, FARTHEST = 8, FLATTEST = 0.1; // share of a stick's way; m; how steep a ray to the floor is at least
 const CLICK = [0.3, 30]; // amplitude and ms of the pulse for a choice
+const RATE = 72; // Hz, of a display that does not tell
 const STICK = 3; // number of the button under a stick, by the standard mapping of WebXR
 const PINCH = 0.025, CLOSED = 0.5; // m between the tips, mean bend of the fingers
 /** A palm is at the hip so far below the eyes and so far beside them [m]. GUESSED. */
@@ -39,6 +41,7 @@ export class Headset {
     this.rig = rig;
     this.turned = false;
     this.viewer = new THREE.Matrix4(); // between the eyes, on the rig
+    this.scale = new ViewportScale();
     renderer.xr.enabled = true;
     renderer.xr.addEventListener("sessionend", () => { this.mark.visible = false; });
     renderer.xr.setReferenceSpaceType("local-floor");
@@ -69,12 +72,17 @@ export class Headset {
   }
 
   /**
-   * Of one XRFrame: where the head is; sticks: left walks where the head looks, right turns by 30 degrees to a side,
+   * Of one XRFrame, a time `passed` after the last one, in which the person may move for `seconds`: where the head is,
+   * and how many pixels the next picture has; sticks: left walks where the head looks, right turns by 30 degrees to a side,
    * chooses when it is pulled back, and pushed ahead marks a place on the floor, to which letting go of it jumps.
    */
-  update(frame, seconds) {
+  update(frame, seconds, passed) {
     const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
-    if (viewer) this.viewer.fromArray(viewer.transform.matrix);
+    if (viewer) {
+      this.viewer.fromArray(viewer.transform.matrix);
+      this.scale.add(passed, frame.session.frameRate || RATE);
+      for (const view of viewer.views) view.requestViewportScale?.(this.scale.value); // of the next picture
+    }
     this.tracked = this.sources.map((source) => this.trackHand(frame, source?.hand));
     this.tracked.forEach((seen, k) => { if (seen !== null) this.takeFromHip(seen, k); });
     this.sources.forEach((source, k) => {

@@ -10,6 +10,7 @@ import { Absence, isUnusual, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { LateHands } from "./late.js";
 import { Pace, WalkingEyes } from "./person.js";
+import { FirstPictures } from "./rate.js";
 import { Shears } from "./shears.js";
 import { Timeline } from "./timeline.js";
 import { Voice } from "./voice.js";
@@ -23,7 +24,7 @@ const LONGEST = 0.1; // s: what moves by keys moves no further in one picture
 const FINGER = 22; // px: a tap so far beside a thing means it
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
-/** A browser that draws fewer pictures a second than this after so many draws less from then on. */
+/** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on. */
 const SLOW = 5, FIRST_PICTURES = 12, FEW_TRIANGLES = 60_000;
 const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser from now on.";
 const NOBODY = "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
@@ -81,6 +82,7 @@ class Viewer {
     this.lastFrame = performance.now();
     this.shortest = 0; // time between two pictures of a desktop at least [s]
     this.frame = 1 / 60; // time of a frame, smoothed [s]
+    this.first = new FirstPictures(FIRST_PICTURES);
     this.labels = new Map();
     addEventListener("resize", () => this.resize());
     addEventListener("keydown", (event) => { if (!event.repeat) this.press(event.code); });
@@ -218,6 +220,7 @@ class Viewer {
     const wasHidden = isUnusual(passed, this.frame);
     this.lastFrame = now;
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
+    if (page.drawn > 0) this.first.add(passed);
     const actors = this.actors();
     if (this.eyes.update(seconds)) this.followed = -1;
     element("follow").setAttribute("aria-pressed", String(this.followed >= 0));
@@ -226,7 +229,7 @@ class Viewer {
       this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
     }
     if (this.headset.isWorn) {
-      this.headset.update(frame, seconds);
+      this.headset.update(frame, seconds, passed);
       this.wrist.show(this.intention, element("notices").lastElementChild?.textContent ?? "");
     } else this.look(this.eyes.pose);
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
@@ -261,18 +264,19 @@ class Viewer {
       // the first picture after a hidden tab shows a state from when it was hidden
       const isKnown = this.newest.rigid === this.world.rigidVersion && !wasHidden;
       this.absence.drawn(this.newest.time, this.world.picked, isKnown ? actors.map(({ name }) => name) : null);
-      this.adviseOnce(actors, rate);
+      this.adviseOnce(actors);
       this.newest = null;
       if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(this.message(pose)));
     }
   }
 
   /** After the first pictures: what a newcomer may wonder about. */
-  adviseOnce(actors, rate) {
-    if (this.isAdvised || page.drawn < FIRST_PICTURES) return;
+  adviseOnce(actors) {
+    const { median } = this.first;
+    if (this.isAdvised || median === null) return;
     this.isAdvised = true;
     if (actors.length === 0 && this.timeline === null) say(NOBODY);
-    if (rate > SLOW || this.headset.isWorn || asked("triangles") !== null || asked("rate") !== null) return;
+    if (median < 1 / SLOW || this.headset.isWorn || asked("triangles") !== null || asked("rate") !== null) return;
     this.renderer.setPixelRatio(0.5);
     this.world.budget = FEW_TRIANGLES;
     this.world.listedAt = null;

@@ -1,0 +1,298 @@
+"""Pictures a second of the page on a graphics card, in JSON lines.
+
+    python benchmarks/gpu_page.py --record demo.page --scene demo    # where vinesim is installed
+    python benchmarks/gpu_page.py --play demo.page                   # where a browser and a graphics card are
+
+A recording holds what a spectator's page is sent: the vineyard, the shapes of a robot that pushes a bunch and of two
+people, and the states of some seconds. Playing needs aiohttp, msgspec, numpy and OpenCV, and sends the states through
+the product's own server to the product's own page. Each size is measured twice: pictures a second as the browser's
+clock asks for them, which it does as often as it can; and the time of a picture from the page's first line to the last
+pixel, with no other one beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import pathlib
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from vinesim.bench.support import browser
+from vinesim.web import array_message
+from vinesim.web.page_server import PageServer
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+VIEWS = {"demo": ((0.2, 0.9, 1.6), (3.0, 1.5, 1.25)), "vsp": ((1.2, 1.3, 1.6), (5.0, 1.3, 1.0)), "tendone": None}
+"""By scene: where the eyes are, and a point that they look at [m]; None: where the page begins."""
+RECORDED = 300
+"""States."""
+STEPS = 2
+"""Between two states."""
+STATE_PERIOD = 0.01
+"""Between two states that are played [s]: more than a page can draw, as in the product."""
+SIZES = {"phone": (390, 844, 2.0), "laptop": (1280, 720, 1.0), "desktop": (1920, 1080, 1.0)}
+"""[px, px, px] and how many pixels one of them has on the screen, each way."""
+EYES = (2 * 2064, 2208)
+"""[px] Of both eyes of a Quest 3."""
+SCALES = (1.0, 0.7, 0.5)
+"""Shares of a headset's rows and columns that are drawn: the page chooses less than 1 where pictures come too late."""
+BARS = {"phone": 30.0, "laptop": 60.0, "headset": 72.0}
+"""Pictures a second that the page has to reach there [Hz]."""
+SECONDS = 5.0
+GPU = (
+    "--use-angle=vulkan", "--enable-features=Vulkan", "--disable-vulkan-surface", "--ignore-gpu-blocklist",
+    "--enable-gpu", "--disable-frame-rate-limit", "--disable-gpu-vsync",
+)  # fmt: skip
+HEADSET = "window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
+HEADSET += "device.installRuntime({forceInstall: true});"
+CARD = """(() => {
+  const gl = vinesim.viewer.renderer.getContext(), names = gl.getExtension("WEBGL_debug_renderer_info");
+  return gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+})()"""
+WAIT_FOR_PIXELS = """(() => {
+  const { viewer } = vinesim, gl = viewer.renderer.getContext(), pixel = new Uint8Array(4), took = viewer.took = [];
+  viewer.draw = (frame) => {
+    const begin = performance.now();
+    Object.getPrototypeOf(viewer).draw.call(viewer, frame);
+    const drawn = performance.now(), bound = gl.getParameter(gl.FRAMEBUFFER_BINDING);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, bound);
+    took.push([performance.now() - begin, drawn - begin]);
+  };
+})()"""
+"""From now on every picture is waited for."""
+DURATIONS = """(() => {
+  const { viewer } = vinesim, { took } = viewer;
+  delete viewer.draw;
+  const middle = (k) => took.map((one) => one[k]).sort((a, b) => a - b)[took.length >> 1];
+  return [middle(0), middle(1)];
+})()"""
+"""[ms] Medians of a picture, to its last pixel, and of the script in it; pictures are not waited for any more."""
+
+
+def record(path: pathlib.Path, name: str) -> None:
+    """Write what a page of a scene is sent."""
+    from vinesim import frames
+    from vinesim.client.client import Client
+    from vinesim.client.page_world import PageWorld
+    from vinesim.client.tasks.motions import LookAt
+    from vinesim.client.tasks.start_poses import (
+        PlacementError,
+        bunch_centres,
+        find_reachable_bunch,
+        spawn_pose,
+        start_pose,
+    )
+    from vinesim.kernels.compilation import compile_kernels
+    from vinesim.net.transport.memory_bus import MemoryHub
+    from vinesim.physics.rigid.human_posture import standing_pose
+    from vinesim.robot.description.loader import load_description
+    from vinesim.robot.tasks.push import PushBunch
+    from vinesim.scene.generation.vineyard import generate
+    from vinesim.scene.spec import load_scene
+    from vinesim.scene.values import HumanSpec
+
+    scene = load_scene(name)
+    model, robot = generate(scene), load_description("vinebot")
+    compile_kernels()
+    client = Client(scene, model, robot, MemoryHub().bus("robot"), name="robot", pose=start_pose(scene, 0))
+    base = start_pose(scene, 0)
+    with contextlib.suppress(PlacementError):  # then the robot stands
+        bunch = find_reachable_bunch(model, spawn_pose(scene, 0))
+        centre = bunch_centres(model)[bunch]
+        push = PushBunch(client.robot, client.side_of(centre), lambda: centre)
+        client.pre_step += [push.control, LookAt(client.robot, lambda: centre)]
+    for k, who in enumerate(("anna", "bert")):
+        place = base[:3] + frames.rotate(base[3:], np.array([-0.8, 0.9 - 1.8 * k, 0.0]))
+        client.physics.add_human(HumanSpec(who, 100 + k, standing_pose(frames.pose(place)), 1.75))
+    world = PageWorld(client)
+
+    class Server:
+        """Nobody listens; states are asked for here."""
+
+        has_viewers = True
+
+        def notify(self) -> None:
+            """The recording asks by itself."""
+
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("scene", world.scene())
+        before = -1
+        for k in range(RECORDED):
+            for _ in range(STEPS):
+                client.tick()
+                world.collect(Server())  # pyright: ignore[reportArgumentType]
+            state = world.state(before)
+            assert state is not None
+            before = state[0]
+            archive.writestr(f"state{k:04d}", state[1])
+            if k % 50 == 0:
+                sys.stderr.write(f"{k} of {RECORDED} states\n")
+        archive.writestr("rigid", world.rigid())
+        archive.writestr("name", name)
+
+
+class Recorded:
+    """What a page is told: a recording, again and again, no state before the page asks for it."""
+
+    def __init__(self, path: pathlib.Path) -> None:
+        with zipfile.ZipFile(path) as archive:
+            self._scene, self._rigid = archive.read("scene"), archive.read("rigid")
+            self.name = archive.read("name").decode()
+            self._states = [archive.read(f"state{k:04d}") for k in range(RECORDED)]
+        self._count, self._sent = 0, 0
+
+    def advance(self) -> None:
+        """A state is new."""
+        self._count += 1
+
+    def scene(self) -> bytes:
+        """The vineyard."""
+        return self._scene
+
+    def rigid(self) -> bytes:
+        """Shapes of the robot and the people."""
+        return self._rigid
+
+    def state(self, since: int) -> tuple[int, bytes] | None:
+        """The next state, if one is due."""
+        if self._sent >= self._count:
+            return None
+        self._sent += 1
+        values, arrays = array_message.decode(self._states[self._sent % RECORDED])
+        return self._sent, array_message.encode(values | {"tick": self._sent}, arrays)
+
+    def take(self, page: int, said: Any) -> None:
+        """A spectator moves nothing."""
+
+    def leave(self, page: int) -> None:
+        """It may come again."""
+
+
+@contextlib.contextmanager
+def served(world: Recorded) -> Iterator[str]:
+    """Address of the page, whose states come while this lasts."""
+    stop = threading.Event()
+
+    def run() -> None:
+        while not stop.wait(STATE_PERIOD):
+            world.advance()
+            server.notify()
+
+    with PageServer(world) as server:
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            yield server.address
+        finally:
+            stop.set()
+            thread.join()
+
+
+def play(
+    path: pathlib.Path, options: tuple[str, ...], pictures: pathlib.Path | None, query: str
+) -> Iterator[dict[str, Any]]:
+    """Measure all sizes."""
+    import cv2
+
+    browser.OPTIONS = tuple(one for one in browser.OPTIONS if "swiftshader" not in one)
+    world = Recorded(path)
+    iwer = ROOT / "build" / "page" / "iwer.min.js"
+    runtime = iwer.read_text() + HEADSET if iwer.exists() else ""
+    with browser.browser_page(*options) as page, served(world) as address:
+        page.open(address + query, before=runtime)
+        _wait(page, "window.vinesim?.viewer !== undefined && vinesim.drawn > 20", 60.0)
+        if VIEWS[world.name] is not None:
+            page.run(f"Object.assign(vinesim.viewer.eyes, {_look(*VIEWS[world.name])}), 0")
+        yield {"case": f"{world.name}: drawn by", "value": page.run(CARD), "unit": ""}
+        sizes: list[tuple[str, tuple[int, int, float]]] = list(SIZES.items())
+        for kind, (width, height, ratio) in sizes:
+            page.call(
+                "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=ratio, mobile=False
+            )
+            page.run(f"vinesim.viewer.renderer.setPixelRatio(Math.min({ratio}, 2)), vinesim.viewer.resize(), 0")
+            yield from _measure(page, f"{world.name}, {kind}, {width}x{height}, {ratio:g}x", BARS.get(kind))
+            if pictures is not None:
+                cv2.imwrite(str(pictures / f"{world.name}-{kind}.jpg"), page.picture()[..., ::-1])
+        if runtime:
+            page.call(
+                "Emulation.setDeviceMetricsOverride", width=EYES[0], height=EYES[1], deviceScaleFactor=1, mobile=False
+            )
+            page.run("vinesim.viewer.renderer.setPixelRatio(1), vinesim.viewer.resize(), 0")
+            page.run("device.position.set(0, 1.6, 0), document.getElementById('enter').click()")
+            _wait(page, "vinesim.viewer.headset.isWorn")
+            for scale in SCALES:
+                page.run(f"Object.assign(vinesim.viewer.headset.scale, {{ value: {scale}, add() {{}} }}), 0")
+                case = f"{world.name}, headset, {EYES[0]}x{EYES[1]}, of it {scale:g} each way"
+                yield from _measure(page, case, BARS["headset"])
+            if pictures is not None:
+                cv2.imwrite(str(pictures / f"{world.name}-headset.jpg"), page.picture()[::2, ::2, ::-1])
+        for error in page.errors:
+            yield {"case": "error of the page", "value": error, "unit": ""}
+
+
+def _measure(page: browser.Page, case: str, bar: float | None) -> Iterator[dict[str, Any]]:
+    time.sleep(1.5)  # the list of what is drawn follows the size
+    before = page.run("[vinesim.frames, vinesim.states, performance.now()]")
+    time.sleep(SECONDS)
+    after = page.run("[vinesim.frames, vinesim.states, performance.now(), vinesim.calls, vinesim.triangles]")
+    seconds = 1e-3 * (after[2] - before[2])
+    rate = {"case": f"{case}: pictures", "value": (after[0] - before[0]) / seconds, "unit": "Hz"}
+    yield rate | ({} if bar is None else {"peer": "bar, at least", "peer_value": bar})
+    yield {"case": f"{case}: states", "value": (after[1] - before[1]) / seconds, "unit": "Hz"}
+    yield {"case": f"{case}: calls", "value": after[3], "unit": "1"}
+    yield {"case": f"{case}: triangles", "value": after[4], "unit": "1"}
+    page.run(WAIT_FOR_PIXELS)
+    time.sleep(SECONDS)
+    whole, script = page.run(DURATIONS)
+    yield {"case": f"{case}: a picture, to its last pixel, median", "value": whole, "unit": "ms"}
+    yield {"case": f"{case}: of it the page's script", "value": script, "unit": "ms"}
+
+
+def _look(eye: tuple[float, float, float], target: tuple[float, float, float]) -> str:
+    way = np.subtract(target, eye)
+    look: dict[str, Any] = {"place": list(eye), "yaw": float(np.arctan2(way[1], way[0]))}
+    return json.dumps(look | {"pitch": float(np.arctan2(way[2], np.hypot(way[0], way[1])))})
+
+
+def _wait(page: browser.Page, script: str, patience: float = 120.0) -> None:
+    end = time.monotonic() + patience
+    while not page.run(script):
+        if time.monotonic() > end:
+            raise SystemExit(f"waited {patience:.0f} s in vain for: {script}; the page says {page.run(FAILURE)}")
+        time.sleep(0.2)
+
+
+FAILURE = "window.vinesim?.failure ?? document.body.innerText.slice(0, 300)"
+
+
+def main() -> None:
+    """Record, or print a line for each figure."""
+    parser = argparse.ArgumentParser(description="Pictures a second of the page on a graphics card.")
+    parser.add_argument("--record", type=pathlib.Path)
+    parser.add_argument("--scene", default="demo", choices=sorted(VIEWS))
+    parser.add_argument("--play", type=pathlib.Path)
+    parser.add_argument("--software", action="store_true", help="without a graphics card")
+    parser.add_argument("--pictures", type=pathlib.Path, help="folder for what the page shows")
+    parser.add_argument("--query", default="", help="added to the page's address")
+    given = parser.parse_args()
+    if given.record is not None:
+        record(given.record, given.scene)
+    if given.play is not None:
+        options = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if given.software else GPU
+        for line in play(given.play, options, given.pictures, given.query):
+            sys.stdout.write(json.dumps({"bench": "gpu page", **line}) + "\n")
+            sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    main()
