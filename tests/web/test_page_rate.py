@@ -1,11 +1,12 @@
 """The page where pictures come too slowly: it draws less, but not because one picture had to wait."""
 
 import json
+from typing import cast
 
 import pytest
 
 from vinesim.bench.support.browser import browser_page
-from vinesim.web.page_server import PageServer
+from vinesim.web.page_server import PageServer, World
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
@@ -17,11 +18,12 @@ class NoWorld:
 @pytest.fixture(scope="module")
 def rates():
     """Evaluate a script in which everything of ``rate.js`` is known; its value."""
-    with browser_page() as page, PageServer(NoWorld()) as server:
+    with browser_page() as page, PageServer(cast(World, NoWorld())) as server:
         page.open(server.address + "package.json")  # of the page's files one that starts no script
 
         def run(script):
-            return page.run(f"import('/rate.js').then(({{ FirstPictures, ViewportScale }}) => {{ {script} }})")
+            names = "{ Detail, FirstPictures, PIXELS, TRIANGLES }"
+            return page.run(f"import('/rate.js').then(({names}) => {{ {script} }})")
 
         yield run
 
@@ -43,7 +45,7 @@ def scales(rates, cost, *, windows=40, rate=72.0):
     [s] and one with fewer pixels proportionally less; pictures come with the display."""
     return rates(
         f"""
-        const scale = new ViewportScale(), found = [];
+        const scale = new Detail(PIXELS), found = [];
         for (let k = 0; k < {windows}; ++k) {{
           for (let i = 0; i < 36; ++i)
             scale.add(Math.ceil({cost} * scale.value ** 2 * {rate} - 1e-9) / {rate}, {rate});
@@ -75,7 +77,7 @@ def test_a_finer_scale_that_proves_too_fine_is_tried_ever_more_rarely(rates):
     assert max(found[6:]) ** 2 * 0.028 < 1.3 / 72.0
     assert min(found) > 0.95 * found[5]
     easier = rates(
-        "const scale = new ViewportScale(); scale.value = 0.6;"
+        "const scale = new Detail(PIXELS); scale.value = 0.6;"
         "for (let k = 0; k < 300 * 36; ++k) scale.add(1 / 72, 72); return scale.value;"
     )
     assert easier == pytest.approx(1.0)
@@ -83,3 +85,19 @@ def test_a_finer_scale_that_proves_too_fine_is_tried_ever_more_rarely(rates):
 
 def test_a_scale_never_falls_below_half(rates):
     assert scales(rates, 1.0)[-1] == 0.5
+
+
+@pytest.mark.parametrize(("base", "each", "expected"), [(0.002, 0.001, 4.0), (0.005, 0.006, 2.0), (0.010, 0.020, 0.4)])
+def test_a_screen_shows_as_many_triangles_as_come_in_time(rates, base, each, expected):
+    """A picture takes ``base`` and ``each`` for every 300,000 triangles [s]; the display shows 60 a second."""
+    found = rates(
+        f"""
+        const detail = new Detail(TRIANGLES), found = [];
+        for (let k = 0; k < 200 * 36; ++k) {{
+          detail.add(Math.ceil(({base} + {each} * detail.value) * 60 - 1e-9) / 60, 60);
+          found.push(detail.value);
+        }}
+        return found;"""
+    )
+    settled = sorted(found[len(found) // 2 :])[len(found) // 4]
+    assert 0.7 * expected <= settled <= expected

@@ -47,6 +47,12 @@ function sphere(halvings) {
   return { points: points.flat(), faces: faces.flat() };
 }
 
+/** The coarsest sphere, as large as the octahedron beside it seems. */
+function tetrahedron() {
+  const s = 0.8;
+  return { points: [s, s, s, s, -s, -s, -s, s, -s, -s, -s, s], faces: [0, 1, 2, 0, 3, 1, 0, 2, 3, 1, 3, 2] };
+}
+
 /** Blade of so many strips on each side of the midrib and along it. */
 function blade(across, along) {
   const points = [], faces = [], columns = 2 * across + 1;
@@ -81,8 +87,8 @@ function cube() {
 /** By kind, in the order of its numbers (primitives.py); each from fine to coarse; single triangles have no mesh. */
 export const MESHES = [
   { name: "cone", levels: [tube(7, true, false), tube(4, false, false), tube(3, false, false)] },
-  { name: "spheroid", levels: [sphere(2), sphere(1), sphere(0)] },
-  { name: "leaf", levels: [blade(2, 4), blade(1, 2), blade(1, 1)] },
+  { name: "spheroid", levels: [sphere(2), sphere(1), sphere(0), tetrahedron()] },
+  { name: "leaf", levels: [blade(2, 4), blade(1, 2), blade(1, 1), blade(0.5, 1)] },
   { name: "box", levels: [cube()] },
   { name: "ellipsoid", levels: [sphere(3)] },
   { name: "cylinder", levels: [tube(16, true, true)] },

@@ -1,7 +1,7 @@
 // A person in a headset: WebXR poses of head and controllers, sticks to walk and turn, pulses for what the hands feel.
 
 import * as THREE from "./vendor/three.module.js";
-import { ViewportScale } from "./rate.js";
+import { Detail, PIXELS } from "./rate.js";
 
 const WALK = 1.4, TURN = Math.PI / 6, DEAD = 0.25; // m/s, rad, share of a stick's way
 const HALF = Math.SQRT1_2;
@@ -41,7 +41,7 @@ export class Headset {
     this.rig = rig;
     this.turned = false;
     this.viewer = new THREE.Matrix4(); // between the eyes, on the rig
-    this.scale = new ViewportScale();
+    this.scale = new Detail(PIXELS);
     renderer.xr.enabled = true;
     renderer.xr.addEventListener("sessionend", () => { this.mark.visible = false; });
     renderer.xr.setReferenceSpaceType("local-floor");

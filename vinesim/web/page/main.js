@@ -10,11 +10,11 @@ import { Absence, isUnusual, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { LateHands } from "./late.js";
 import { Pace, WalkingEyes } from "./person.js";
-import { FirstPictures } from "./rate.js";
+import { Detail, FirstPictures, TRIANGLES } from "./rate.js";
 import { Shears } from "./shears.js";
 import { Timeline } from "./timeline.js";
 import { Voice } from "./voice.js";
-import { World } from "./world.js";
+import { TRIANGLE_BUDGET, World } from "./world.js";
 import { Wrist } from "./wrist.js";
 
 const RETRY = 1000; // ms
@@ -25,7 +25,9 @@ const FINGER = 22; // px: a tap so far beside a thing means it
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
 /** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on. */
-const SLOW = 5, FIRST_PICTURES = 12, FEW_TRIANGLES = 60_000;
+const SLOW = 5, FIRST_PICTURES = 12, FEW = 0.2;
+/** Pictures a second on a screen, at which as much is drawn as they allow [Hz]. */
+const RATE = 60;
 const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser from now on.";
 const NOBODY = "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
 const element = (id) => document.getElementById(id);
@@ -83,6 +85,7 @@ class Viewer {
     this.shortest = 0; // time between two pictures of a desktop at least [s]
     this.frame = 1 / 60; // time of a frame, smoothed [s]
     this.first = new FirstPictures(FIRST_PICTURES);
+    this.detail = asked("triangles") === null && asked("rate") === null ? new Detail(TRIANGLES) : null; // null: fixed
     this.labels = new Map();
     addEventListener("resize", () => this.resize());
     addEventListener("keydown", (event) => { if (!event.repeat) this.press(event.code); });
@@ -124,6 +127,10 @@ class Viewer {
         { stays: true });
     button.hidden = !await navigator.xr?.isSessionSupported("immersive-vr");
     button.addEventListener("click", () => this.headset.enter(this.eyes.place, this.eyes.yaw).catch(fail));
+    for (const change of ["sessionstart", "sessionend"])
+      this.renderer.xr.addEventListener(change, () => {
+        if (this.detail) this.setBudget(Math.min(this.detail.value, this.headset.isWorn ? 1 : Infinity));
+      });
   }
 
   connect() {
@@ -221,6 +228,7 @@ class Viewer {
     this.lastFrame = now;
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
     if (page.drawn > 0) this.first.add(passed);
+    if (this.isAdvised && !this.headset.isWorn && this.detail?.add(passed, RATE)) this.setBudget(this.detail.value);
     const actors = this.actors();
     if (this.eyes.update(seconds)) this.followed = -1;
     element("follow").setAttribute("aria-pressed", String(this.followed >= 0));
@@ -270,6 +278,12 @@ class Viewer {
     }
   }
 
+  /** Triangles that are drawn from now on, as a multiple of those of a phone. */
+  setBudget(multiple) {
+    this.world.budget = multiple * TRIANGLE_BUDGET;
+    this.world.listedAt = null;
+  }
+
   /** After the first pictures: what a newcomer may wonder about. */
   adviseOnce(actors) {
     const { median } = this.first;
@@ -278,8 +292,8 @@ class Viewer {
     if (actors.length === 0 && this.timeline === null) say(NOBODY);
     if (median < 1 / SLOW || this.headset.isWorn || asked("triangles") !== null || asked("rate") !== null) return;
     this.renderer.setPixelRatio(0.5);
-    this.world.budget = FEW_TRIANGLES;
-    this.world.listedAt = null;
+    this.detail = null;
+    this.setBudget(FEW);
     say(TOO_SLOW);
   }
 

@@ -17,38 +17,49 @@ export class FirstPictures {
   }
 }
 
-const WINDOW = 36; // pictures by which a scale is judged
-const LATE = 1.4; // periods of the display: a picture that takes longer has missed one
+const WINDOW = 36; // pictures by which the detail is judged
+const LATE = 1.4; // periods: a picture that takes longer has missed one
 const MOST_LATE = 0.25; // share of a window
-const COARSER = 0.85, FINER = 1.06, COARSEST = 0.5;
-const CALM = 20, LONGEST_CALM = 320; // windows without a late picture before a finer scale is tried
+const STRAY = 1; // late pictures of a window that mean nothing: a collector ran, a list was made anew
+const LONGEST_CALM = 16; // times the calm at first
 
 /**
- * Of a headset's pictures: how many of the pixels' rows and columns are drawn, from COARSEST to 1, so that pictures come
- * with the display. A finer scale that proves too fine is tried again after twice as long.
+ * How much is drawn, 1 at first, so that pictures come at a rate: `less` times as much after a window with many late
+ * ones, `more` after `calm` windows without, between `least` and `most`. More that proves too much is tried again
+ * after twice as long.
  */
-export class ViewportScale {
-  constructor() {
+export class Detail {
+  constructor({ least, most, less, more, calm }) {
     this.value = 1;
+    this.limits = [least, most];
+    this.steps = [less, more];
     this.late = this.seen = this.calm = 0;
-    this.patience = CALM;
+    this.patience = calm;
+    this.longest = LONGEST_CALM * calm;
     this.isTrial = false;
   }
 
-  /** A picture came `seconds` after the last one, on a display with `rate` [Hz]. */
+  /** A picture came `seconds` after the last one, where `rate` [Hz] are wanted. Whether the value has changed. */
   add(seconds, rate) {
     this.late += seconds > LATE / rate;
-    if (++this.seen < WINDOW) return;
+    if (++this.seen < WINDOW) return false;
+    const before = this.value, [least, most] = this.limits, [less, more] = this.steps;
     if (this.late > MOST_LATE * WINDOW) {
-      if (this.isTrial) this.patience = Math.min(2 * this.patience, LONGEST_CALM);
-      this.value = Math.max(COARSEST, this.value * COARSER);
+      if (this.isTrial) this.patience = Math.min(2 * this.patience, this.longest);
+      this.value = Math.max(least, this.value * less);
     }
-    this.calm = this.late > 0 ? 0 : this.calm + 1;
-    this.isTrial = this.calm >= this.patience && this.value < 1;
+    this.calm = this.late > STRAY ? 0 : this.calm + 1;
+    this.isTrial = this.calm >= this.patience && this.value < most;
     if (this.isTrial) {
-      this.value = Math.min(1, this.value * FINER);
+      this.value = Math.min(most, this.value * more);
       this.calm = 0;
     }
     this.late = this.seen = 0;
+    return this.value !== before;
   }
 }
+
+/** Of a headset: share of the pixels' rows and columns. */
+export const PIXELS = { least: 0.5, most: 1, less: 0.85, more: 1.06, calm: 20 };
+/** On a screen: triangles, as a multiple of those that a phone draws. */
+export const TRIANGLES = { least: 0.4, most: 4, less: 0.7, more: 1.4, calm: 3 };

@@ -6,15 +6,20 @@ import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGME
 
 const SHAPE_SHIFT = 10, SURFACE_SHIFT = 9, POSE_SHIFT = 9;
 /** Distances [m] from which the next coarser level is drawn, in units of a cluster's thickness. */
-const LEVEL_DISTANCE = [60, 190];
+const LEVEL_DISTANCE = [60, 190, 400];
 const COARSEST = 1000;
+/** Where the budget is short, what is far goes rather than that what is near gets edges: levels are coarser by this at most. */
+const NEAR_COARSER = 1.5;
 /** Rigid bodies are drawn by these coarser levels once plants are coarser than asked for by so much. */
 const RIGID_COARSER = [3, 8];
 /** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
 const VANISHING = 2600;
+/** Of leaves and grass less: where some must be missing, bunches and posts are missed more. */
+const VANISHING_LEAVES = 1300;
 /** Numbers of kinds, as in `MESHES`. */
 const SPHEROID = 1, LEAF = 2, BOX = 3, ELLIPSOID = 4, TRIANGLE = 6;
-const TRIANGLE_BUDGET = 300_000;
+/** Of a phone, and of each eye of a headset. */
+export const TRIANGLE_BUDGET = 300_000;
 /** The lists of what is drawn are made anew when the eye has moved so far [m]. */
 const STRIDE = 0.25;
 const SUN_SIZE = 2048, SUN_REACH = 9, SUN_NEAR = 1, SUN_FAR = 60;
@@ -275,8 +280,9 @@ export class World {
       let level = fades ? 0 : Math.min(RIGID_COARSER.filter((most) => this.coarser > most).length, levels.length - 1);
       if (fades) {
         const away = Math.hypot(set.ball[4 * k] - x, set.ball[4 * k + 1] - y, set.ball[4 * k + 2] - z);
-        const ratio = Math.max(away - set.ball[4 * k + 3], 0.05) * this.coarser / set.thickness[k];
-        if (ratio > VANISHING) continue;
+        const sizes = Math.max(away - set.ball[4 * k + 3], 0.05) / set.thickness[k];
+        if (sizes * this.coarser > (kind === LEAF ? VANISHING_LEAVES : VANISHING)) continue;
+        const ratio = sizes * Math.min(this.coarser, NEAR_COARSER);
         while (level < levels.length - 1 && ratio > LEVEL_DISTANCE[level] * (kind === LEAF ? 0.35 : 1)) ++level;
       }
       const into = levels[level], end = into.count + set.size[k];
