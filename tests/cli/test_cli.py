@@ -285,6 +285,10 @@ def test_secured_from_certificate_to_client(tmp_path):
         (["server", "--connect", "tcp/127.0.0.1:1", "--state-dir", "kept"], ["only carries", "--state-dir"]),
         (["server", "--status", "xml"], ["xml", "json"]),
         (["server", "--quota", "0", "1"], ["--quota", "above zero"]),
+        (
+            ["client", "--real-time-factor", "0.5", "--connect", "tcp/h:1", "--no-ros"],
+            ["--real-time-factor 0.5", "give it to vinesim server"],
+        ),
         (["server", "--seed", "3"], ["--seed 3", "--scene"]),
         (["server", "--scene", "nowhere"], ["nowhere"]),
         (["certs", "new", "a/b"], ["a/b", "letters"]),

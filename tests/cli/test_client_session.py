@@ -25,7 +25,9 @@ def session(monkeypatch: pytest.MonkeyPatch) -> ClientSession:
     monkeypatch.setattr(client_session, "run_loop", fail)
     monkeypatch.setattr(client_session, "Status", lambda *_: SimpleNamespace(current=dict))
     one = ClientSession.__new__(ClientSession)
-    one.options = SimpleNamespace(device="cuda:0", status="none", seconds=None, tick_log=None, connect=None)
+    one.options = SimpleNamespace(
+        device="cuda:0", status="none", seconds=None, tick_log=None, connect=None, real_time_factor=1.0
+    )
     one._stop, one._stack = threading.Event(), contextlib.ExitStack()
     return one
 

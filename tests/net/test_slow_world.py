@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 
 import numpy as np
 import pytest
 
+from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.bench.support.fake_client import FakeClient, tree_row
 from vinesim.client.rate_loop import RateLoop
+from vinesim.errors import UsageError
 from vinesim.net.codec import messages
+from vinesim.net.server.server import Server
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
 
 DT = 0.01
@@ -94,6 +99,27 @@ def test_clients_follow_a_server_that_comes_back_with_another_factor() -> None:
     assert world.bob.replicator.network_time(world.hub.time) == pytest.approx(world.time, abs=0.01)
     assert world.run(300) < 0.02
     assert (world.ada.left_at, world.bob.left_at) == ({}, {})
+
+
+def test_a_client_learns_the_factor_of_its_server() -> None:
+    """By the messages of a real server; its time passes as slowly."""
+    with Server("tcp/127.0.0.1:0", real_time_factor=0.25) as server, ZenohBus("ada", connect=server.endpoint) as bus:
+        client = FakeClient(bus, tree_row(1), (0.0, 0.0))
+
+        def knows() -> bool:
+            client.tick(time.monotonic())
+            return client.replicator.has_clock
+
+        wait(knows, "the clock of the server")
+        assert client.replicator.real_time_factor == 0.25
+        before, now = server.time, time.monotonic()
+        away = client.replicator.network_time(now) - before
+        assert abs(away) < 0.25 * (client.replicator.round_trip or 0.0) + (server.time - before) + 0.05
+
+
+def test_a_linked_server_has_no_factor_of_its_own() -> None:
+    with pytest.raises(UsageError, match="--real-time-factor"):
+        Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], real_time_factor=0.5)
 
 
 def test_a_loop_takes_another_factor_between_steps() -> None:
