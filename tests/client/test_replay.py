@@ -137,7 +137,7 @@ def test_a_recorded_actor_name_is_taken(original):
 def test_the_clock_is_that_of_the_recording(original):
     bus = ReplayBus(original, "viewer", start=0.5)
     bus.query("clock", messages.encode_time(3.0))
-    assert messages.decode_time(bus.replies()[0].payload) == (3.0, pytest.approx(EPOCH + 0.6, abs=0.2))
+    assert messages.decode_time(bus.replies()[0].payload) == (3.0, pytest.approx(EPOCH + 0.6, abs=0.2), 1.0)
 
 
 class ReplayNetwork:

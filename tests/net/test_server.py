@@ -490,7 +490,7 @@ def test_a_relay_waits_for_its_hub():
 
 def test_a_relay_refuses_options_of_the_hub(tmp_path):
     with pytest.raises(
-        ValueError, match=r"only carries: give --state-dir, --scene and --max-clients to the one server"
+        ValueError, match=r"only carries: give --state-dir, --scene, --max-clients and --real-time-factor to"
     ):
         Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], state_folder=tmp_path)
 
