@@ -29,7 +29,6 @@ from vinesim.bench.support import browser
 from vinesim.web import array_message
 from vinesim.web.page_server import PageServer
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
 VIEWS = {"demo": ((0.2, 0.9, 1.6), (3.0, 1.5, 1.25)), "vsp": ((1.2, 1.3, 1.6), (5.0, 1.3, 1.0)), "tendone": None}
 """By scene: where the eyes are, and a point that they look at [m]; None: where the page begins."""
 RECORDED = 300
@@ -51,8 +50,6 @@ GPU = (
     "--use-angle=vulkan", "--enable-features=Vulkan", "--disable-vulkan-surface", "--ignore-gpu-blocklist",
     "--enable-gpu", "--disable-frame-rate-limit", "--disable-gpu-vsync",
 )  # fmt: skip
-HEADSET = "window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
-HEADSET += "device.installRuntime({forceInstall: true});"
 CARD = """(() => {
   const gl = vinesim.viewer.renderer.getContext(), names = gl.getExtension("WEBGL_debug_renderer_info");
   return gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
@@ -117,12 +114,12 @@ def record(path: pathlib.Path, name: str) -> None:
     world = PageWorld(client)
 
     class Server:
-        """Nobody listens; states are asked for here."""
+        """Takes the place of the page server: it has a viewer, so states are made."""
 
         has_viewers = True
 
         def notify(self) -> None:
-            """The recording asks by itself."""
+            """Told of each state; :func:`record` reads them from the world."""
 
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("scene", world.scene())
@@ -142,7 +139,8 @@ def record(path: pathlib.Path, name: str) -> None:
 
 
 class Recorded:
-    """What a page is told: a recording, again and again, no state before the page asks for it."""
+    """The world of a page server that plays a recording again and again: a state each time that :meth:`advance` is
+    called, never two at once."""
 
     def __init__(self, path: pathlib.Path) -> None:
         with zipfile.ZipFile(path) as archive:
@@ -199,40 +197,31 @@ def served(world: Recorded) -> Iterator[str]:
 
 
 def play(
-    path: pathlib.Path, options: tuple[str, ...], pictures: pathlib.Path | None, query: str
+    path: pathlib.Path, graphics: tuple[str, ...], pictures: pathlib.Path | None, query: str
 ) -> Iterator[dict[str, Any]]:
     """Measure all sizes."""
     import cv2
 
-    browser.OPTIONS = tuple(one for one in browser.OPTIONS if "swiftshader" not in one)
     world = Recorded(path)
-    iwer = ROOT / "build" / "page" / "iwer.min.js"
-    runtime = iwer.read_text() + HEADSET if iwer.exists() else ""
-    with browser.browser_page(*options) as page, served(world) as address:
-        page.open(address + query, before=runtime)
+    with browser.browser_page(graphics=graphics) as page, served(world) as address:
+        page.open(address + query, before=browser.emulated_headset())
         _wait(page, "window.vinesim?.viewer !== undefined && vinesim.drawn > 20", 60.0)
-        if VIEWS[world.name] is not None:
-            page.run(f"Object.assign(vinesim.viewer.eyes, {_look(*VIEWS[world.name])}), 0")
+        if (view := VIEWS[world.name]) is not None:
+            page.look(*map(np.array, view))
         yield {"case": f"{world.name}: drawn by", "value": page.run(CARD), "unit": ""}
-        sizes: list[tuple[str, tuple[int, int, float]]] = list(SIZES.items())
-        for kind, (width, height, ratio) in sizes:
-            page.call(
-                "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=ratio, mobile=False
-            )
-            page.run(f"vinesim.viewer.renderer.setPixelRatio(Math.min({ratio}, 2)), vinesim.viewer.resize(), 0")
+        for kind, (width, height, ratio) in SIZES.items():
+            page.resize(width, height, ratio)
+            page.run(f"vinesim.viewer.renderer.setPixelRatio({ratio}), vinesim.viewer.resize(), 0")
             yield from _measure(page, f"{world.name}, {kind}, {width}x{height}, {ratio:g}x", BARS.get(kind))
             if pictures is not None:
                 cv2.imwrite(str(pictures / f"{world.name}-{kind}.jpg"), page.picture()[..., ::-1])
-        if runtime:
-            page.call(
-                "Emulation.setDeviceMetricsOverride", width=EYES[0], height=EYES[1], deviceScaleFactor=1, mobile=False
-            )
-            page.run("vinesim.viewer.renderer.setPixelRatio(1), vinesim.viewer.resize(), 0")
-            page.run("device.position.set(0, 1.6, 0), document.getElementById('enter').click()")
-            _wait(page, "vinesim.viewer.headset.isWorn")
-            yield from _measure(page, f"{world.name}, headset, {EYES[0]}x{EYES[1]}", BARS["headset"])
-            if pictures is not None:
-                cv2.imwrite(str(pictures / f"{world.name}-headset.jpg"), page.picture()[::2, ::2, ::-1])
+        page.resize(*EYES)
+        page.run("vinesim.viewer.renderer.setPixelRatio(1), vinesim.viewer.resize(), 0")
+        page.run("device.position.set(0, 1.6, 0), document.getElementById('enter').click()")
+        _wait(page, "vinesim.viewer.headset.isWorn")
+        yield from _measure(page, f"{world.name}, headset, {EYES[0]}x{EYES[1]}", BARS["headset"])
+        if pictures is not None:
+            cv2.imwrite(str(pictures / f"{world.name}-headset.jpg"), page.picture()[::2, ::2, ::-1])
         for error in page.errors:
             yield {"case": "error of the page", "value": error, "unit": ""}
 
@@ -253,12 +242,6 @@ def _measure(page: browser.Page, case: str, bar: float | None) -> Iterator[dict[
     whole, script = page.run(DURATIONS)
     yield {"case": f"{case}: a picture, to its last pixel, median", "value": whole, "unit": "ms"}
     yield {"case": f"{case}: of it the page's script", "value": script, "unit": "ms"}
-
-
-def _look(eye: tuple[float, float, float], target: tuple[float, float, float]) -> str:
-    way = np.subtract(target, eye)
-    look: dict[str, Any] = {"place": list(eye), "yaw": float(np.arctan2(way[1], way[0]))}
-    return json.dumps(look | {"pitch": float(np.arctan2(way[2], np.hypot(way[0], way[1])))})
 
 
 def _wait(page: browser.Page, script: str, patience: float = 120.0) -> None:
@@ -285,8 +268,8 @@ def main() -> None:
     if given.record is not None:
         record(given.record, given.scene)
     if given.play is not None:
-        options = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader") if given.software else GPU
-        for line in play(given.play, options, given.pictures, given.query):
+        graphics = browser.SOFTWARE if given.software else GPU
+        for line in play(given.play, graphics, given.pictures, given.query):
             sys.stdout.write(json.dumps({"bench": "gpu page", **line}) + "\n")
             sys.stdout.flush()
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.avatar.gestures import GESTURES
-from vinesim.bench.support.browser import Page, browser_page
+from vinesim.bench.support.browser import Page, browser_page, emulated_headset
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -42,8 +42,6 @@ IN_HEADSET = (1280, 640)
 """Of both eyes [px]."""
 FIELD = 60.0
 """Vertical angle of view of the page [degrees]."""
-HEADSET = "window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
-HEADSET += "device.installRuntime({forceInstall: true});"
 PATIENCE = 300.0
 """[s]"""
 
@@ -102,14 +100,10 @@ class Photographer:
     def photographs(self, name: str) -> Iterator[tuple[str, np.ndarray]]:
         """Names and pictures of the page in all sizes, beside the camera's, and in a headset."""
         page, (eye, target) = self.page, map(np.array, VIEWS[name])
-        way = target - eye
-        runtime = (ROOT / "build" / "page" / "iwer.min.js").read_text()
-        look = {"place": eye.tolist(), "yaw": float(np.arctan2(way[1], way[0]))}
-        look["pitch"] = float(np.arctan2(way[2], np.hypot(way[0], way[1])))
         with PageServer(self.world) as self.server:
-            page.open(self.server.address + "?triangles=300000&rate=1", before=runtime + HEADSET)
+            page.open(self.server.address + "?triangles=300000&rate=1", before=emulated_headset())
             self.wait("window.vinesim?.viewer !== undefined")
-            page.run(f"Object.assign(vinesim.viewer.eyes, {look}), 0")
+            page.look(eye, target)
             for passing in ("notices", "state"):  # what they say is of this slow browser
                 page.run(f"document.getElementById('{passing}').style.visibility = 'hidden'")
             self.wait("vinesim.viewer.world.rigidVersion > 0")

@@ -117,6 +117,12 @@ def test_a_client_learns_the_factor_of_its_server() -> None:
         assert abs(away) < 0.25 * (client.replicator.round_trip or 0.0) + (server.time - before) + 0.05
 
 
+@pytest.mark.parametrize("factor", [0.0, 1.5, float("nan")])
+def test_a_server_refuses_a_factor_that_no_client_would_believe(factor: float) -> None:
+    with pytest.raises(UsageError, match=r"real-time factor is .*: give 0\.01 to 1"):
+        Server("tcp/127.0.0.1:0", real_time_factor=factor)
+
+
 def test_a_linked_server_has_no_factor_of_its_own() -> None:
     with pytest.raises(UsageError, match="--real-time-factor"):
         Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], real_time_factor=0.5)

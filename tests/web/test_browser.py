@@ -1,6 +1,5 @@
 """The page in a real browser: it draws the live vineyard within its budgets, and what happens there is seen."""
 
-import pathlib
 import threading
 
 import numpy as np
@@ -21,7 +20,7 @@ from tests.support.recorded_pick import PICKED_AT, replay_of_a_pick
 from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.avatar.gestures import GESTURES
-from vinesim.bench.support.browser import browser_page
+from vinesim.bench.support.browser import browser_page, emulated_headset
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene import appearance
@@ -31,7 +30,6 @@ from vinesim.web.page_server import WINDOW, PageServer
 
 MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
 """Of one picture for one eye, and of the vineyard that a page loads [B]."""
-HEADSET = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
 """Put there by tools/build_page."""
 
 MISPLACED = """
@@ -347,10 +345,8 @@ def pinch(page, place):
 @pytest.mark.xdist_group("browser")
 def test_a_headset_moves_head_and_hands(page):
     """An emulated headset (iwer) at known places: the person in the physics is there, in the world's axes."""
-    device = ";window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
-    device += "device.installRuntime({forceInstall: true});"
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live:
-        open_page(page, live, HEADSET.read_text() + device)
+        open_page(page, live, emulated_headset())
         human = live.client.humans["viewer"]
         start = human.pose.head.copy()
         page.run("vinesim.viewer.eyes.yaw = 0.5, 0")

@@ -55,9 +55,6 @@ def camera_picture(client, eye, target):
 
 def page_picture(page, client, eye, target):
     """What the page shows there, without its controls."""
-    way = target - eye
-    look = {"place": eye.tolist(), "yaw": float(np.arctan2(way[1], way[0]))}
-    look["pitch"] = float(np.arctan2(way[2], np.hypot(way[0], way[1])))
     world = PageWorld(client)
     with PageServer(world) as server:
         page.resize(*SIZE)
@@ -65,7 +62,8 @@ def page_picture(page, client, eye, target):
         wait(lambda: page.run("window.vinesim?.viewer !== undefined || window.vinesim?.failure"), "the page is there")
         assert page.run("vinesim.failure") is None
         page.run("['frame', 'names'].forEach((id) => { document.getElementById(id).style.visibility = 'hidden'; })")
-        page.run(f"Object.assign(vinesim.viewer.eyes, {look}), vinesim.viewer.world.listedAt = null, 0")
+        page.look(eye, target)
+        page.run("vinesim.viewer.world.listedAt = null, 0")
         drawn = page.run("vinesim.frames")
         wait(lambda: page.run("vinesim.frames") > drawn + 2, "a picture with shadows of what is drawn")
         failed = (

@@ -12,7 +12,7 @@ import subprocess
 import tempfile
 import threading
 import wave
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from subprocess import PIPE
 from typing import Any
 
@@ -27,9 +27,13 @@ TIMEOUT = 120.0
 PROGRAMS = ("chromium", "google-chrome")
 OPTIONS = (
     "--headless", "--no-sandbox", "--no-first-run", "--disable-quic", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-dev-shm-usage", "--remote-debugging-port=0", "--window-size=640,480",
+    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--remote-debugging-port=0",
+    "--window-size=640,480",
 )  # fmt: skip
+SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Options of a browser that draws without a graphics card."""
+IWER = pathlib.Path(__file__).parents[3] / "build" / "page" / "iwer.min.js"
+"""The emulator of headsets; ``tools/build_page`` puts it there."""
 
 GUARD = '"$@" & read -r _; kill -9 $!'
 """Script of a shell that runs a program until its own standard input ends: with this process, however that ends."""
@@ -63,6 +67,12 @@ def write_sound(path: pathlib.Path, samples: np.ndarray) -> pathlib.Path:
         file.setframerate(48_000)
         file.writeframes(to_pcm(samples))
     return path
+
+
+def emulated_headset() -> str:
+    """Script that runs before the page and gives the browser a Quest 3, ``device`` in further scripts."""
+    device = ";window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
+    return IWER.read_text() + device + "device.installRuntime({forceInstall: true});"
 
 
 def program() -> str | None:
@@ -102,9 +112,17 @@ class Page:
                 assert "error" not in answer, f"{method}: {answer['error']}"
                 return answer["result"]
 
-    def resize(self, width: int, height: int) -> None:
-        """Set the size of the page [px]."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+    def resize(self, width: int, height: int, ratio: float = 1.0) -> None:
+        """Set the size of the page [px], each pixel of which has ``ratio`` pixels of the screen each way."""
+        self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=ratio, mobile=False
+        )
+
+    def look(self, eye: np.ndarray, target: np.ndarray) -> None:
+        """Put the eyes of vinesim's page to a place ``eye`` [3] m in the world, looking at a point ``target`` [3] m."""
+        x, y, z = target - eye
+        look = {"place": eye.tolist(), "yaw": float(np.arctan2(y, x)), "pitch": float(np.arctan2(z, np.hypot(x, y)))}
+        self.run(f"Object.assign(vinesim.viewer.eyes, {json.dumps(look)}), 0")
 
     def open(self, address: str, *, before: str = "") -> None:
         """Go to an address; the script ``before`` runs before those of the page. Errors are counted from here on."""
@@ -136,13 +154,13 @@ class Page:
 
 
 @contextlib.contextmanager
-def browser_page(*options: str) -> Iterator[Page]:
-    """A page of a browser, started with these further options, that ends with the block."""
+def browser_page(*options: str, graphics: Sequence[str] = SOFTWARE) -> Iterator[Page]:
+    """A page of a browser, started with these further options and those for ``graphics``, that ends with the block."""
     path = program()
     if path is None:
         raise BrowserMissing(f"a browser is needed, one of {', '.join(PROGRAMS)}: install chromium")
     profile = tempfile.mkdtemp()
-    command = [path, *OPTIONS, *options, f"--user-data-dir={profile}", "about:blank"]
+    command = [path, *OPTIONS, *graphics, *options, f"--user-data-dir={profile}", "about:blank"]
     child = subprocess.Popen(["sh", "-c", GUARD, "sh", *command], stdin=PIPE, stderr=PIPE, text=True)
     loop = asyncio.new_event_loop()
     try:

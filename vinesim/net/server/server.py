@@ -93,6 +93,8 @@ class Server:
         listen = (listen,) if isinstance(listen, str) else listen
         is_secured = certificates is not None
         linked = [endpoints.parse(text, secured=is_secured) for text in connect]
+        if not messages.MIN_FACTOR <= real_time_factor <= 1.0:
+            raise UsageError(f"the real-time factor is {real_time_factor:g}: give {messages.MIN_FACTOR:g} to 1")
         if linked and (state_folder, scene, max_actors, real_time_factor) != (None, None, None, 1.0):
             raise UsageError(
                 f"a server linked to {linked[0]} only carries: give --state-dir, --scene, --max-clients and "

@@ -286,11 +286,10 @@ class Viewer {
 
   /** After the first pictures: what a newcomer may wonder about. */
   adviseOnce(actors) {
-    const { median } = this.first;
-    if (this.isAdvised || median === null) return;
+    if (this.isAdvised || this.first.median === null) return;
     this.isAdvised = true;
     if (actors.length === 0 && this.timeline === null) say(NOBODY);
-    if (median < 1 / SLOW || this.headset.isWorn || asked("triangles") !== null || asked("rate") !== null) return;
+    if (this.first.median < 1 / SLOW || this.headset.isWorn || this.detail === null) return;
     this.renderer.setPixelRatio(0.5);
     this.detail = null;
     this.setBudget(FEW);
