@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from vinesim.client.world_time import MAX_LAG, WorldTime
+from vinesim.client.world_time import MAX_LAG, OffsetHistory, WorldTime
 
 DT = 0.01
 
@@ -65,3 +66,25 @@ def test_a_clock_that_is_set_back_a_little_is_waited_for() -> None:
 def test_without_a_server_it_is_simulated_time() -> None:
     assert WorldTime(DT).offset == 0.0
     assert not WorldTime(DT).is_shared
+
+
+def test_what_is_ready_late_is_stamped_as_its_step_was() -> None:
+    """Also where the client stood for 250 ms and then caught up, so that its offset jumped up and fell since."""
+    passed = np.full(400, DT)
+    passed[200], passed[201:225] = 0.25, 3e-3
+    world, history, found = WorldTime(DT), OffsetHistory(len(passed)), []
+    for step, now in enumerate(100.0 + np.cumsum(passed)):
+        world.follow(step * DT, now)
+        history.add(step * DT, world.offset)
+        found.append(step * DT + world.offset)
+    late = [history.world_time(step * DT) for step in range(400)]
+    assert late == pytest.approx(found, abs=1e-9)
+    between = [history.world_time(time) for time in np.linspace(-0.1, 4.1, 1000)]
+    assert (np.diff(between) > 0.0).all()
+
+
+def test_offsets_after_a_time_that_is_set_back_are_forgotten() -> None:
+    history = OffsetHistory(4)
+    for time, offset in ((0.0, 7.0), (1.0, 7.0), (2.0, 7.0), (0.5, 9.0)):
+        history.add(time, offset)
+    assert [history.world_time(time) for time in (0.0, 0.5, 2.0)] == [7.0, 9.5, 11.0]

@@ -8,6 +8,9 @@ offset is 0.
 from __future__ import annotations
 
 import logging
+from collections import deque
+
+import numpy as np
 
 log = logging.getLogger(__name__)
 
@@ -52,3 +55,28 @@ class WorldTime:
                 change = min(change, max(passed, MIN_RATE * self._dt) - self._dt)
             self.offset += change
             self.offset = max(self.offset, clock - simulated - MAX_LAG)
+
+
+class OffsetHistory:
+    """Offsets of the world's time at recent simulated times, for the stamps of what is ready later than it happened."""
+
+    def __init__(self, length: int) -> None:
+        """Keeps the last ``length`` offsets."""
+        self._times: deque[float] = deque(maxlen=length)
+        self._offsets: deque[float] = deque(maxlen=length)
+
+    def add(self, simulated: float, offset: float) -> None:
+        """Add the ``offset`` [s] at ``simulated`` time [s]; those of later times are removed, as time was set back."""
+        while self._times and self._times[-1] >= simulated:
+            self._times.pop()
+            self._offsets.pop()
+        self._times.append(simulated)
+        self._offsets.append(offset)
+
+    def world_time(self, simulated: float) -> float:
+        """World's time [s] at ``simulated`` time [s]; beyond the known offsets the nearest of them holds.
+
+        Rises with ``simulated`` if the stamps of the steps rise, however late it is asked for. :class:`ValueError`
+        before the first offset.
+        """
+        return simulated + float(np.interp(simulated, self._times, self._offsets))

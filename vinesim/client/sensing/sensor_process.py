@@ -151,13 +151,12 @@ class SensorProcess:
                 shared["wind_time"][0] = wind.time
                 shared["tree_air"][:], shared["tree_drawn"][:] = wind.tree_air, wind.tree_drawn
             shared["time"][0], shared["tick"][0] = physics.time, physics.tick
-            shared["world_offset"][0] = client.world_time.offset
             shared["frame_score"][0] = client.frame_score()
             visual_q = physics.visual_q()
             self._visuals.memory["visual_q"][: len(visual_q)] = visual_q
             shared["visual_count"][0], shared["visuals_version"][0] = len(visual_q), self._visuals.version
             row = self._pose_count % POSE_HISTORY
-            shared["pose_time"][row] = physics.time
+            shared["pose_time"][row], shared["pose_world_offset"][row] = physics.time, client.world_time.offset
             for pose, frame in zip(shared["pose"][row], self._frames, strict=True):
                 pose[:] = self.robot.frame_pose(frame)
             self._pose_count += 1

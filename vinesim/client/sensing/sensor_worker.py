@@ -22,6 +22,7 @@ from vinesim.client.sensing.picture_keeper import PictureKeeper
 from vinesim.client.sensing.rigid_visual_list import VisualListMessage, VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.worker_process import report_ready, serve
+from vinesim.client.world_time import OffsetHistory
 from vinesim.physics.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
@@ -48,6 +49,8 @@ NICENESS = 10
 (docs/decisions/sensor-process.md)."""
 POSE_HISTORY = 128
 """Poses of the sensors that are kept for lidars: of 2.5 s."""
+OFFSET_HISTORY = 512
+"""Offsets of the world's time that are kept for the stamps of scans: of 10 s."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,7 +94,7 @@ class SensorChannel:
         bodies, trees, bunches = len(model.body_mass), len(model.tree_first), len(model.bunch_body)
         self.snapshot = SharedSnapshot(
             {
-                "time": ((1,), "f8"), "world_offset": ((1,), "f8"), "frame_score": ((1,), "f8"),
+                "time": ((1,), "f8"), "frame_score": ((1,), "f8"),
                 "tick": ((1,), "i8"), "number": ((1,), "i8"),  # counts snapshots from 1
                 "visuals_version": ((1,), "i8"), "visual_count": ((1,), "i8"),
                 "body_q": ((bodies, 7), "f4"), "bunch_attached": ((bunches,), "?"),
@@ -99,7 +102,7 @@ class SensorChannel:
                 "wind_time": ((1,), "f8"), "wind_strength": ((1,), "f8"),  # 0: calm
                 "tree_air": ((trees, 3), "f4"), "tree_drawn": ((trees,), "f4"),
                 "pose_count": ((1,), "i8"), "pose_time": ((POSE_HISTORY,), "f8"),  # a ring of sensor poses
-                "pose": ((POSE_HISTORY, sensors, 7), "f8"),
+                "pose": ((POSE_HISTORY, sensors, 7), "f8"), "pose_world_offset": ((POSE_HISTORY,), "f8"),
             },
             context,
         )  # fmt: skip
@@ -137,8 +140,7 @@ class SensorWorker:
         self._visuals = VisualListReceiver()
         self._missing_version: int | None = None
         """Version of the list of bodies that the newest snapshot belongs to, if that has not arrived."""
-        self._world_offset = 0.0
-        """World's time minus simulated time [s]."""
+        self._offsets = OffsetHistory(OFFSET_HISTORY)
         self._last_number = 0
         self._pose_count = 0
         self._keeper = PictureKeeper() if config.keep_pictures else None
@@ -310,11 +312,13 @@ class SensorWorker:
             self._frame_score = float(shared["frame_score"][0])
             self._time = time = float(shared["time"][0])
             tick = int(shared["tick"][0])
-            self._world_offset = float(shared["world_offset"][0])
             count = int(shared["pose_count"][0])
             rows = np.arange(max(self._pose_count, count - POSE_HISTORY), count) % POSE_HISTORY
             times, poses = shared["pose_time"][rows], shared["pose"][rows]
+            offsets = shared["pose_world_offset"][rows]
             self._pose_count = count
+        for t, offset in zip(times, offsets, strict=True):
+            self._offsets.add(float(t), float(offset))
         state, names = self._state, tuple(self.config.sensor_frames)
         snapshot = Snapshot(
             time, tick, state.body_q, state.bunch_attached, self._visuals.visuals, visual_q,
@@ -336,7 +340,7 @@ class SensorWorker:
     def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
         assert isinstance(frame, CameraFrame)
         if self.node is not None:
-            self.node.publish_camera(dataclasses.replace(frame, time=frame.time + self._world_offset))
+            self.node.publish_camera(dataclasses.replace(frame, time=self._offsets.world_time(frame.time)))
         keeper = self._keeper if frame.name == self.scheduler.sensors[0].name else None
         if keeper is not None and keeper.wants(frame.time, self._frame_score):
             keeper.keep(frame, self._frame_score)
@@ -344,7 +348,7 @@ class SensorWorker:
     def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
         assert isinstance(scan, LidarScan)
         if self.node is not None:
-            self.node.publish_lidar(dataclasses.replace(scan, time=scan.time + self._world_offset))
+            self.node.publish_lidar(dataclasses.replace(scan, time=self._offsets.world_time(scan.time)))
 
     def _save_kept_frame(self, folder: pathlib.Path) -> None:
         failure = ""

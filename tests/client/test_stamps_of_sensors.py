@@ -1,0 +1,106 @@
+"""Stamps of scans: those of the steps in which they began, however late they are computed."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import multiprocessing
+import types
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from tests.support.contact_scenes import cane
+from vinesim.client.client import Client
+from vinesim.client.sensing import sensor_process
+from vinesim.client.sensing.sensor_process import SensorProcess
+from vinesim.client.sensing.sensor_worker import SensorWorker
+from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.robot.description.loader import load_description
+from vinesim.scene.builder import assemble
+from vinesim.scene.spec import load_scene
+from vinesim.scene.values import CameraOutput, LidarScan
+
+STAND, CATCH_UP = 0.25, 3e-3
+"""How long the client stands once, and its steps while it catches up [s]."""
+SCAN_PERIOD = 0.1
+"""Of the robot's lidar [s]."""
+
+
+class Node:
+    """Stands for the ROS node of the sensors: the lidar has a subscriber, the camera has none."""
+
+    def __init__(self) -> None:
+        self.set_parameters: dict[str, object] = {}
+        self.scans: list[LidarScan] = []
+        self.publish_lidar = self.scans.append
+
+    def rate(self, _name: str) -> float:
+        return 1.0 / SCAN_PERIOD
+
+    def camera_outputs_wanted(self, _name: str) -> CameraOutput:
+        return CameraOutput.NONE
+
+    def lidar_outputs_wanted(self, _name: str) -> CameraOutput:
+        return CameraOutput.DEPTH
+
+
+class OneProcess:
+    """The client's writer of snapshots and the worker that reads them, in one process, by turns."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, stack: contextlib.ExitStack) -> None:
+        self.node = Node()
+        monkeypatch.setattr(SensorWorker, "_open_node", lambda *_: self.node)
+        monkeypatch.setattr(sensor_process, "WorkerProcess", self._worker_process)
+        scene, vinebot = load_scene("demo"), load_description("vinebot")
+        model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+        self.client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
+        self.sensors = stack.enter_context(SensorProcess("robot", scene, model, vinebot, ros=True))
+        self.sensors.attach(self.client)
+        self.worker = SensorWorker(self.config, self.channel, self.worker_pipe, stack)
+        self.channel.wanted["world"][0] = True
+
+    def _worker_process(self, _name, _modules, _entry, config, open_channel, _receive, rehearsal):
+        pipe, self.worker_pipe = multiprocessing.Pipe()
+        self.config, self.channel = config, open_channel(multiprocessing.get_context("spawn"))
+        run = types.SimpleNamespace(shared=self.channel, send=lambda kind, value: pipe.send((kind, value)))
+        return types.SimpleNamespace(
+            is_ready=True, current=lambda: run, wait_until_ready=lambda _timeout: None, close=self.channel.close
+        )
+
+    def render(self) -> None:
+        """Let the worker take the newest snapshot."""
+        assert self.worker._take_requests()
+        if (world := self.worker._read()) is not None:
+            snapshot, earlier = world
+            self.worker.scheduler.advance(snapshot, earlier.pop()[1], earlier)
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[OneProcess]:
+    with contextlib.ExitStack() as stack:
+        yield OneProcess(monkeypatch, stack)
+
+
+@pytest.mark.parametrize("turn", [2, 30], ids=["worker in time", "worker 0.3 s late"])
+def test_scans_are_stamped_when_they_began_while_a_client_catches_up(world: OneProcess, turn: int):
+    """Stamps rise, and are those of steps that are whole revolutions apart."""
+    client, steps = world.client, 120
+    passed = np.full(steps, client.physics.dt)
+    passed[steps // 2] = STAND
+    passed[steps // 2 + 1 :] = CATCH_UP
+    simulated, stamps = [], []
+    for step, now in enumerate(itertools.accumulate(passed, initial=1000.0)):
+        client.world_time.follow(client.physics.time, now)
+        client.tick()
+        simulated.append(client.physics.time)
+        stamps.append(client.physics.time + client.world_time.offset)
+        if step % turn == turn - 1:
+            world.render()
+    found = [scan.time for scan in world.node.scans]
+    assert len(found) >= 3
+    assert (np.diff(found) > 0.0).all()
+    revolutions = np.diff(np.interp(found, stamps, simulated)) / SCAN_PERIOD
+    np.testing.assert_allclose(revolutions, np.round(revolutions), atol=1e-3)
