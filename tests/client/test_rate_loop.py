@@ -65,6 +65,9 @@ def test_a_lower_target_spaces_the_steps_and_their_deadlines(clock):
     assert loop.overruns == 1
     run(loop, clock, [0.002] * 100)
     assert loop.real_time_factor == pytest.approx(0.25, rel=0.01)
+    log = loop.log().between(0.0, np.inf)
+    assert log["overruns"] == loop.overruns
+    assert log["real_time_factor"] == pytest.approx(0.25, rel=0.01)
     clock.now += 40.0
     run(loop, clock, [0.0] * 2)
     assert loop.dropped in (999, 1000)

@@ -18,7 +18,9 @@ class TickLog:
     work: np.ndarray
     """[step] how long it took [s]."""
     dt: float
-    """[s]"""
+    """Simulated time of a step [s]."""
+    period: float
+    """From one deadline to the next [s]: longer than ``dt`` where the world is slower than real time."""
 
     def between(self, since: float, until: float) -> dict[str, float]:
         """Rate, percentiles of the work, overruns and real-time factor of the steps that began in a span of time [s].
@@ -32,19 +34,19 @@ class TickLog:
         hz = float((len(begins) - 1) / (begins[-1] - begins[0]))
         p50, p99 = (1e3 * float(value) for value in np.percentile(work, (50, 99)))
         return {
-            "tick_hz": hz, "tick_p50_ms": p50, "tick_p99_ms": p99, "overruns": int((work > self.dt).sum()),
+            "tick_hz": hz, "tick_p50_ms": p50, "tick_p99_ms": p99, "overruns": int((work > self.period).sum()),
             "real_time_factor": hz * self.dt,
         }  # fmt: skip
 
     def save(self, path: pathlib.Path) -> None:
         """Write it as a NumPy archive."""
-        np.savez(path, begins=self.begins, work=self.work, dt=self.dt)
+        np.savez(path, begins=self.begins, work=self.work, dt=self.dt, period=self.period)
 
     @classmethod
     def load(cls, path: pathlib.Path) -> TickLog:
         """Read what :meth:`save` wrote."""
         with np.load(path) as archive:
-            return cls(archive["begins"], archive["work"], float(archive["dt"]))
+            return cls(archive["begins"], archive["work"], float(archive["dt"]), float(archive["period"]))
 
 
 class RateLoop:
@@ -122,7 +124,7 @@ class RateLoop:
     def log(self) -> TickLog:
         """When the last steps began and how long they took, as many as there was room for."""
         order = np.arange(max(self.ticks - len(self._work), 0), self.ticks) % len(self._work)
-        return TickLog(self._begins[order], self._work[order].astype(float), self.dt)
+        return TickLog(self._begins[order], self._work[order].astype(float), self.dt, self.period)
 
     def work_ms(self, *percentiles: float) -> list[float]:
         """Percentiles (0 to 100) of the work of a step [ms]."""
