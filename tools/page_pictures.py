@@ -93,8 +93,8 @@ class Photographer:
             time.sleep(0.2)
 
     def settled(self) -> np.ndarray:
-        """The page's picture when two more were drawn."""
-        self.wait(f"vinesim.frames > {self.page.run('vinesim.frames')} + 2")
+        """The page's picture when so many more were drawn that the shadows are of now."""
+        self.wait(f"vinesim.frames > {self.page.run('vinesim.frames')} + 5")
         return self.page.picture()
 
     def photographs(self, name: str) -> Iterator[tuple[str, np.ndarray]]:

@@ -12,7 +12,7 @@ from vinesim import frames
 from vinesim.avatar.gestures import GESTURES, Gestures
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
-from vinesim.client.page_world import PageWorld
+from vinesim.client.page_world import MAX_PRIMITIVES, PageWorld
 from vinesim.client.spectator import Spectator
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
@@ -55,7 +55,7 @@ class SteppedPage:
 class LiveVineyard(SteppedPage):
     """A client that steps in a thread of its own, as in its process: a spectator or a person before a bunch."""
 
-    def __init__(self, bus, *, is_person=False, port=0):
+    def __init__(self, bus, *, is_person=False, port=0, most=MAX_PRIMITIVES):
         scene = load_scene("demo")
         model = generate(scene)
         hangs = model.forward_kinematics(model.joint_settled)[model.bunch_body[BUNCH]]
@@ -68,7 +68,7 @@ class LiveVineyard(SteppedPage):
         else:
             eye = frames.pose(self.bunch - np.array([0.7, 0.0, 0.0]))
             self.client = Spectator(scene, model, None, bus, name="viewer", pose=eye)
-        self.world = PageWorld(self.client, person)
+        self.world = PageWorld(self.client, person, most)
         super().__init__(PageServer(self.world, port), self.client.tick)
         self.client.post_step.append(lambda _: self.world.collect(self.server))
 

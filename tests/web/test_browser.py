@@ -1,5 +1,6 @@
 """The page in a real browser: it draws the live vineyard within its budgets, and what happens there is seen."""
 
+import dataclasses
 import threading
 
 import numpy as np
@@ -21,11 +22,14 @@ from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.avatar.gestures import GESTURES
 from vinesim.bench.support.browser import browser_page, emulated_headset
+from vinesim.client.page_world import PageWorld
+from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import INTENTIONS, HumanSpec
+from vinesim.web.array_message import decode
 from vinesim.web.page_server import WINDOW, PageServer
 
 MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
@@ -515,7 +519,7 @@ def test_a_spectator_alone_and_a_slow_browser_are_told_so_and_buttons_follow_who
             page.run(slow)
         wait(lambda: "Nobody else is here yet" in page.run(notices), "a spectator without other actors is told so")
         assert "draws slowly" in page.run(notices)
-        wait(lambda: 0 < page.run("vinesim.triangles") <= 60_000, "fewer triangles")
+        wait(lambda: 0 < page.run("vinesim.triangles") <= 90_000, "fewer triangles")
         assert page.run("[vinesim.viewer.renderer.domElement.width, innerWidth]") == [195, 390]
 
         pose = standing_pose(frames.pose(np.array([-8.0, -3.0, 0.0])))
@@ -572,18 +576,92 @@ def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_pe
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
+@pytest.mark.parametrize(("yaw", "share"), [(0.0, 1.0), (1.5, 0.8), (4.0, 0.8)], ids=["into", "along", "out"])
+def test_what_the_eyes_can_see_is_drawn_and_what_is_behind_them_only_casts_shadows(page, yaw, share):
+    """Of all clusters that a list for every direction has, those left out are not in the picture, nor will be when the
+    eyes turn until the next list; and they are there for the sun."""
+    script = """(({ world, eyes, camera }) => {
+      const rows = (list) => new Set(world.draws.flatMap((levels, kind) => kind === 6 ? [] :
+        levels.flatMap((level) => [...level[list].rows.subarray(0, level[list].count)])));
+      const { first, ball } = world.plantClusters;
+      const ahead = camera.position.clone().set(Math.cos(eyes.yaw), Math.sin(eyes.yaw), 0);
+      const eye = camera.position.clone().set(...eyes.place), field = vinesim.viewer.diagonal, turn = 0.35;
+      const lists = [Math.PI, field + turn].map((angle) => {
+        world.listedAt = null;
+        world.coarser = 1;
+        world.budget = 1e7;
+        world.list(eye, ahead, angle, turn);
+        return [rows("seen"), rows("unseen")];
+      });
+      const [[all], [seen, unseen]] = lists, off = [];
+      let lost = 0;
+      first.forEach((row, k) => {
+        if (!all.has(row) || seen.has(row)) return;
+        const way = camera.position.clone().set(...ball.subarray(4 * k, 4 * k + 3)).sub(eye);
+        off.push(way.angleTo(ahead) - Math.asin(Math.min(1, ball[4 * k + 3] / way.length())));
+        lost += !unseen.has(row) && way.length() < 9;
+      });
+      return { all: all.size, seen: seen.size, least: Math.min(...off), bound: field + turn, lost };
+    })(vinesim.viewer)"""
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
+        open_page(page, live)
+        page.run(f"Object.assign(vinesim.viewer.eyes, {{ yaw: {yaw}, pitch: 0 }}), 0")
+        is_drawn_anew(page)
+        found = page.run(script)
+    assert 0 < found["seen"] < share * found["all"]
+    assert found["least"] >= found["bound"]
+    assert found["lost"] == 0
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_who_flies_on_in_a_large_vineyard_sees_what_grows_there(page):
+    """Of 5,000 primitives that a page may have, all within its reach; picked bunches stay where they are."""
+    loaded = """(({ plantClusters: { ball, size }, plants, around, reach }) => {
+      const { place } = vinesim.viewer.eyes;
+      const away = (k) => Math.hypot(...place.map((x, axis) => ball[4 * k + axis] - x));
+      return { within: size.reduce((sum, _, k) => sum + (away(k) < reach - 1e-6), 0), plants, reach,
+        off: Math.hypot(around.x - place[0], around.y - place[1], around.z - place[2]) };
+    })(vinesim.viewer.world)"""
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, most=5000) as live:
+        live.due.append(lambda: live.client.physics.pick(BUNCH))
+        open_page(page, live)
+        number = "vinesim.viewer.world.names.findIndex((name) => name.startsWith('bunch/'))"
+        wait(lambda: page.run(number) >= 0, "the picked bunch")
+        with live.paused():
+            balls = decode(PageWorld(live.client).scene())[1]["ball"].reshape(-1, 4)
+        assert page.run(loaded)["plants"] == 5000
+        bunches = bunch_centres(live.client.model)
+        there = bunches[np.argmax(np.linalg.norm(bunches - live.bunch, axis=1))] - [0.7, 0.0, 0.0]
+        page.run(f"Object.assign(vinesim.viewer.eyes, {{ place: {there.tolist()} }}), 0")
+        wait(lambda: page.run(loaded)["off"] < 1e-3, "the plants around another place")
+        found = page.run(loaded)
+        assert found["reach"] > 0.5
+        assert found["within"] == (np.linalg.norm(balls[:, :3] - there, axis=1) < found["reach"] - 1e-6).sum()
+        carrier = f"vinesim.viewer.world.bodies + 1 + {number}"
+        bunch = page.run(f"vinesim.viewer.world.place({carrier}).toArray()")
+        np.testing.assert_allclose(bunch[:2], live.bunch[:2], atol=0.3)
+        assert page.run("vinesim.viewer.world.rigidClusters.first.length") > 0
+        assert page.errors == []
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
 def test_names_stand_just_above_heads_near_and_far_and_stay_in_the_picture(page):
-    """By projection: eyes at a known place that look along x, and the highest point of a hat 0.14 m above its eyes."""
+    """By projection: eyes at a known place that look along x, and the highest point of a hat above its eyes. One person
+    has turned and tilted the head."""
     width, height, level = 480, 360, 1.65
     places = {"anna": (0.7, -0.1), "ben": (3.0, 0.8), "clara": (12.0, -3.0)}
+    tilted = {"ben": frames.exp(np.array([0.5, 0.3, 0.4]))}
     shapes = appearance.load_human_model(1.75).parts["head"]
-    hat = max(float(shape.mesh.corners[..., 2].max()) for shape in shapes if shape.mesh is not None)
-    top = standing_pose(frames.pose(np.zeros(3))).head[2] + hat
+    hat = np.concatenate([shape.mesh.corners.reshape(-1, 3) for shape in shapes if shape.mesh is not None])
     focal = height / 2 / np.tan(np.radians(30.0))
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
         x, y = live.client.pose[:2]
         for k, (name, (ahead, left)) in enumerate(places.items()):
             pose = standing_pose(frames.pose(np.array([x + ahead, y + left, 0.0]), frames.from_yaw(np.pi)))
+            head = frames.compose(pose.head, frames.pose(np.zeros(3), tilted.get(name, frames.IDENTITY)))
+            pose = dataclasses.replace(pose, head=head)
             live.due.append(lambda spec=HumanSpec(name, k + 1, pose): live.client.physics.add_human(spec))
         open_page(page, live)
         page.resize(width, height)
@@ -598,11 +676,15 @@ def test_names_stand_just_above_heads_near_and_far_and_stay_in_the_picture(page)
         for name, (ahead, left) in places.items():
             head = standing_pose(frames.pose(np.array([ahead, left, 0.0]), frames.from_yaw(np.pi))).head
             scale = focal / head[0]
+            top = head[2] + frames.rotate(tilted.get(name, frames.IDENTITY), hat)[:, 2].max()
             assert shown[name]["middle"] == pytest.approx(width / 2 - left * scale, abs=2.0), name
             above = height / 2 - (top - level) * scale - shown[name]["bottom"]
             assert 0.0 < above < 0.06 * scale + 2.0, (name, "less than 6 cm above the hat [px]", above)
             assert 14.0 < shown[name]["height"] < 26.0, name
         assert shown["anna"]["height"] > shown["ben"]["height"] > shown["clara"]["height"]
+        plants = "vinesim.viewer.world.draws.slice(1, 3).flat().reduce((sum, { triangles }) => sum + triangles, 0)"
+        assert page.run("vinesim.viewer.world.triangles") > 10_000, "people have more triangles than the page may draw"
+        assert 2_000 < page.run(plants) <= 5_000, "but berries and leaves are drawn, too"
 
         page.run("vinesim.viewer.eyes.pitch = -0.5, 0")  # the tops of near heads are above the picture
         is_drawn_anew(page)

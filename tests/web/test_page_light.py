@@ -65,7 +65,7 @@ def page_picture(page, client, eye, target):
         page.look(eye, target)
         page.run("vinesim.viewer.world.listedAt = null, 0")
         drawn = page.run("vinesim.frames")
-        wait(lambda: page.run("vinesim.frames") > drawn + 2, "a picture with shadows of what is drawn")
+        wait(lambda: page.run("vinesim.frames") > drawn + 5, "a picture with shadows of what is drawn")
         failed = (
             "vinesim.viewer.renderer.info.programs.filter(({ diagnostics }) => diagnostics?.runnable === false).length"
         )

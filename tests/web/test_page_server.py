@@ -32,6 +32,9 @@ class CountingWorld:
     def scene(self):
         return b"scene"
 
+    def plants(self, place):
+        return str(place.tolist()).encode()
+
     def rigid(self):
         return b"rigid"
 
@@ -68,8 +71,20 @@ def test_files_and_arrays_are_served(served):
     for path, part in (("", b"<title>vinesim</title>"), ("main.js", b"import"), ("vendor/three.module.js", b"WebGL")):
         assert part in urllib.request.urlopen(server.address + path, timeout=10).read()
     assert urllib.request.urlopen(server.address + "scene", timeout=10).read() == b"scene"
+    plants = urllib.request.urlopen(server.address + "plants?x=1.5&y=-2&z=1e1", timeout=10).read()
+    assert plants == b"[1.5, -2.0, 10.0]"
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(server.address + "..%2f..%2fpyproject.toml", timeout=10)
+
+
+@pytest.mark.parametrize(
+    "query", ["", "?x=1&y=2", "?x=1&y=2&z=nan", "?x=1&y=2&z=inf", "?x=1&y=2&z=1e6", "?x=1&y=2&z=b"]
+)
+def test_plants_around_no_place_are_refused(served, query):
+    _, server = served
+    with pytest.raises(urllib.error.HTTPError, match="400") as refused:
+        urllib.request.urlopen(server.address + "plants" + query, timeout=10)
+    assert b"give x, y and z in metres" in refused.value.read()
 
 
 def test_a_page_that_stalls_gets_no_more_than_the_window_and_then_the_newest_state(served):

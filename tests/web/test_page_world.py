@@ -305,21 +305,30 @@ def test_the_page_of_a_robot_far_away_looks_over_its_shoulder_to_the_vines():
 
 
 def test_of_a_large_vineyard_a_page_loads_what_is_nearest(shown):
+    """At first to where it looks from, later to where it has come."""
     client, _ = shown
     whole = decode(PageWorld(client).scene())[1]
-    part = decode(PageWorld(client, most=5000).scene())[1]
-    assert 4900 < len(part["material"]) <= 5000
-    np.testing.assert_array_equal(part["first"], np.cumsum(part["size"]) - part["size"])
+    world = PageWorld(client, most=5000)
+    first, later = decode(world.scene()), decode(world.plants(np.array([3.0, -1.0, 1.0])))
+    assert first[0]["room"] == 5000
+    assert later[0]["place"] == [3.0, -1.0, 1.0]
+    for (header, part), place in ((first, client.pose[:3]), (later, [3.0, -1.0, 1.0])):
+        assert 4900 < len(part["material"]) <= 5000
+        np.testing.assert_array_equal(part["first"], np.cumsum(part["size"]) - part["size"])
 
-    def away(arrays):
-        return np.linalg.norm(arrays["ball"].reshape(-1, 4)[:, :3] - client.pose[:3], axis=1)
+        def away(arrays, place=place):
+            return np.linalg.norm(arrays["ball"].reshape(-1, 4)[:, :3] - place, axis=1)
 
-    left_out = np.sort(away(whole))[len(part["size"]) :]
-    assert away(part).max() <= left_out.min() + 1e-6
-    cluster = len(part["size"]) // 2
-    same = np.flatnonzero((whole["ball"].reshape(-1, 4) == part["ball"].reshape(-1, 4)[cluster]).all(1))[0]
-    rows = [slice(int(a["first"][k]), int(a["first"][k] + a["size"][k])) for a, k in ((part, cluster), (whole, same))]
-    np.testing.assert_array_equal(part["shape"].reshape(-1, 16)[rows[0]], whole["shape"].reshape(-1, 16)[rows[1]])
+        left_out = np.sort(away(whole))[len(part["size"])]
+        assert away(part).max() <= left_out + 1e-6
+        assert header["reach"] == pytest.approx(left_out, abs=1e-5)
+        cluster = len(part["size"]) // 2
+        same = np.flatnonzero((whole["ball"].reshape(-1, 4) == part["ball"].reshape(-1, 4)[cluster]).all(1))[0]
+        rows = [
+            slice(int(a["first"][k]), int(a["first"][k] + a["size"][k])) for a, k in ((part, cluster), (whole, same))
+        ]
+        np.testing.assert_array_equal(part["shape"].reshape(-1, 16)[rows[0]], whole["shape"].reshape(-1, 16)[rows[1]])
+    assert decode(PageWorld(client).scene())[0]["reach"] is None
 
 
 def test_after_a_reset_a_page_is_told_of_all_trees_that_had_moved(shown):

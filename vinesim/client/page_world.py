@@ -34,7 +34,7 @@ GRASS = 25.0
 NEAR = 3.0
 """An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
 MAX_PRIMITIVES = 400_000
-"""Of plants and ground that a page loads: 32 MB."""
+"""Of plants and ground that a page has at a time: 32 MB."""
 AMONG_VINES = 1.08
 """Exposure of a page beside the usual one of the daylight: what cameras come to by themselves among vines, 1.06 to 1.12
 times it in the pictures of docs/web.md."""
@@ -70,7 +70,7 @@ class PageWorld:
         replay: Replay | None = None,
     ) -> None:  # fmt: skip
         """``person``: the source of the client's own human, whom the first page moves; ``most``: primitives of plants
-        and ground that a page loads, those nearest to where it looks from at first; ``replay``: the recording that the
+        and ground that a page has at a time, those nearest to where it looks from; ``replay``: the recording that the
         client is in, if it is in one."""
         self._client, self._person, self._most, self._replay = client, person, most, replay
         self._ticks_before = 0
@@ -173,20 +173,18 @@ class PageWorld:
 
     def scene(self) -> bytes:
         """Everything that stands or grows, at rest; tables of leaves' outlines; light of the ground."""
-        if self._primitives is None:
-            load_kernels()
-            self._sway = Sway(self._client.model)
-            self._primitives = Primitives(self._client.model, grass=GRASS)
-        primitives, scene = self._primitives, self._client.scene
+        primitives, scene = self._lay_out(), self._client.scene
         outline, hull = textures.leaf_outlines()
         leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes have both signs
         ground = primitives.materials
         model = self._client.model
         sun = scene.sun.direction(0.0)
+        start = self._start_view()
+        reach, plants = _nearest(primitives, start[:3], self._most)
         return array_message.encode(
             {
                 "scene": scene.name, "seed": scene.seed, "sun": list(sun), "light": _light(sun[2]),
-                "rows": list(row_layout(model)),
+                "rows": list(row_layout(model)), "room": min(primitives.plant_count, self._most), "reach": reach,
                 "bodies": len(model.body_mass), "dt": self._client.physics.dt,
                 "interest": self._client.replicator.interest_radius,
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
@@ -198,13 +196,26 @@ class PageWorld:
                 "gestures": {} if self._person is None else dict(self._person.gestures.poses),
                 "buttons": {} if self._person is None else dict(self._person.gestures.buttons),
             },
-            _nearest(primitives, self._start_view()[:3], self._most)
+            plants
             | {
                 "tree_first": model.tree_first.astype(np.uint32), "poses": self._at_rest.astype(np.float32),
                 "outline": outline, "hull": hull, "noise": _bytes(textures.noise_texture()), "leaf": _bytes(leaf),
-                "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(self._start_view(), np.float32),
+                "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(start, np.float32),
             } | ({} if self._person is None else _within_reach(model)),
         )  # fmt: skip
+
+    def plants(self, place: np.ndarray) -> bytes:
+        """Of a vineyard that is too large for a page the part around a ``place`` [3] m, as in :meth:`scene`."""
+        reach, plants = _nearest(self._lay_out(), place, self._most)
+        return array_message.encode({"reach": reach, "place": place.tolist()}, plants)
+
+    def _lay_out(self) -> Primitives:
+        """The primitives of plants and ground."""
+        if self._primitives is None:
+            load_kernels()
+            self._sway = Sway(self._client.model)
+            self._primitives = Primitives(self._client.model, grass=GRASS)
+        return self._primitives
 
     def rigid(self) -> bytes:
         """Robots, people, boxes and picked bunches that there are now."""
@@ -371,7 +382,7 @@ def _turns(pose: np.ndarray) -> np.ndarray:
     return np.round(pose[:, 3:] * _TURN_STEPS).astype(np.int16)
 
 
-def _columns(primitives: Primitives, rows: slice) -> dict[str, np.ndarray]:
+def _columns(primitives: Primitives, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
     """Values of primitives as a page needs them."""
     columns = primitives.local_columns(rows)
     shape = np.concatenate([columns[name] for name in "abcd"], 1).astype(np.float32)
@@ -384,21 +395,25 @@ def _columns(primitives: Primitives, rows: slice) -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
-def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> dict[str, np.ndarray]:
-    """Primitives of the clusters of plants and ground nearest to a ``place`` [3] m, at most ``most``; the clusters."""
+def _nearest(
+    primitives: Primitives, place: np.ndarray, most: int
+) -> tuple[float | None, dict[str, np.ndarray]]:  # fmt: skip
+    """Primitives of the clusters of plants and ground nearest to a ``place`` [3] m, at most ``most``, and the clusters;
+    before them how far from there none is missing [m], None: none is missing anywhere."""
     count = len(primitives.cluster_first) - len(primitives.rigid_clusters)
     clusters = _clusters(primitives, slice(0, count))
-    columns = _columns(primitives, slice(0, primitives.plant_count))
     if primitives.plant_count <= most:
-        return columns | clusters
-    order = np.argsort(np.linalg.norm(clusters["ball"][:, :3] - place, axis=1), kind="stable")
-    kept = np.sort(order[np.cumsum(clusters["size"][order]) <= most])
+        return None, _columns(primitives, slice(0, primitives.plant_count)) | clusters
+    away = np.linalg.norm(clusters["ball"][:, :3] - place, axis=1)
+    order = np.argsort(away, kind="stable")
+    fitting = int(np.searchsorted(np.cumsum(clusters["size"][order]), most, side="right"))
+    kept = np.sort(order[:fitting])
     clusters = {name: values[kept] for name, values in clusters.items()}
     first, size = clusters["first"].astype(int), clusters["size"].astype(int)
     start = np.cumsum(size) - size
     rows = np.repeat(first - start, size) + np.arange(size.sum())
     clusters["first"] = start.astype(np.uint32)
-    return {name: values[rows] for name, values in columns.items()} | clusters
+    return float(away[order[fitting]]), _columns(primitives, rows) | clusters
 
 
 def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, np.ndarray]:

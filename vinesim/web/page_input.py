@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated
 
 import msgspec
+import numpy as np
 
 _Coordinate = Annotated[float, msgspec.Meta(ge=-1e5, le=1e5)]
 _Component = Annotated[float, msgspec.Meta(ge=-1.01, le=1.01)]
@@ -75,3 +77,19 @@ def decode_input(text: str) -> PageInput | None:
         return None
     squares = (sum(value * value for value in pose[3:]) for pose in found.poses())
     return found if all(abs(square - 1.0) < 0.02 for square in squares) else None
+
+
+class _Place(msgspec.Struct, frozen=True):
+    x: _Coordinate
+    y: _Coordinate
+    z: _Coordinate
+
+
+def decode_place(query: Mapping[str, str]) -> np.ndarray | None:
+    """The place [3] m that the query of an address gives by x, y and z; None if it gives none."""
+    try:
+        found = msgspec.convert(dict(query), _Place, strict=False)
+    except msgspec.ValidationError:
+        return None
+    place = np.array([found.x, found.y, found.z])
+    return place if np.isfinite(place).all() else None

@@ -15,13 +15,14 @@ import threading
 from collections.abc import Callable
 from typing import Any, Protocol, Self
 
+import numpy as np
 from aiohttp import WSMsgType, web
 
 from vinesim.errors import UsageError
 from vinesim.web import page_files
 from vinesim.web.https_site import HttpsSite
 from vinesim.web.page_files import PAGE
-from vinesim.web.page_input import PageInput, decode_input
+from vinesim.web.page_input import PageInput, decode_input, decode_place
 from vinesim.web.voice_socket import Sound, VoiceSocket
 
 log = logging.getLogger(__name__)
@@ -47,6 +48,10 @@ class World(Protocol):
 
     def scene(self) -> bytes:
         """All that does not change (:mod:`vinesim.web.array_message`)."""
+        ...
+
+    def plants(self, place: np.ndarray) -> bytes:
+        """Of a vineyard that is not loaded as a whole the part around a ``place`` [3] m."""
         ...
 
     def rigid(self) -> bytes:
@@ -144,6 +149,7 @@ class PageServer:
         app = web.Application(middlewares=[_refuse_other_origins, self._refuse_strangers])
         app.router.add_get("/", self._index)
         app.router.add_get("/scene", self._scene)
+        app.router.add_get("/plants", self._plants)
         app.router.add_get("/rigid", self._rigid)
         app.router.add_get("/state", self._state)
         if self.voice is not None:
@@ -197,6 +203,11 @@ class PageServer:
 
     async def _scene(self, _: web.Request) -> web.Response:
         return _binary(self._world.scene())
+
+    async def _plants(self, request: web.Request) -> web.Response:
+        if (place := decode_place(request.query)) is None:
+            raise web.HTTPBadRequest(text="no place: give x, y and z in metres, each from -1e5 to 1e5")
+        return _binary(self._world.plants(place))
 
     async def _rigid(self, _: web.Request) -> web.Response:
         return _binary(self._world.rigid())

@@ -121,13 +121,13 @@ class Primitives:
         """Whether each cluster is drawn [cluster]; those of picked bunches are not."""
         return self.ball.numpy()[:, 3] > 0.0
 
-    def local_columns(self, rows: slice) -> dict[str, np.ndarray]:
+    def local_columns(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
         """Some primitives in the frames of their carriers: ``a`` to ``d`` [n, 4] (see
         :mod:`vinesim.kernels.raster.primitives`), ``tint`` [n, 3], ``sky``, ``material``, ``label``, ``carrier`` [n].
         """
         names = {name: f"local_{name}" for name in "abcd"}
         names |= {name: name for name in ("tint", "sky", "material", "label", "carrier")}
-        return {name: self._columns[column][rows].numpy() for name, column in names.items()}
+        return {name: self._columns[column].numpy()[rows] for name, column in names.items()}
 
     def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
         """Poses [..., 7] m, 1 of the carriers of some primitives [...]: a plant's body, a rigid body, or the world."""

@@ -84,7 +84,7 @@ function cube() {
   return { points, faces };
 }
 
-/** By kind, in the order of its numbers (primitives.py); each from fine to coarse; single triangles have no mesh. */
+/** By kind, in the order of its numbers (primitives.py); each from fine to coarse. */
 export const MESHES = [
   { name: "cone", levels: [tube(7, true, false), tube(4, false, false), tube(3, false, false)] },
   { name: "spheroid", levels: [sphere(2), sphere(1), sphere(0), tetrahedron()] },
@@ -92,5 +92,5 @@ export const MESHES = [
   { name: "box", levels: [cube()] },
   { name: "ellipsoid", levels: [sphere(3)] },
   { name: "cylinder", levels: [tube(16, true, true)] },
-  { name: "triangle", levels: [{ isSingle: true }] },
+  { name: "triangle", levels: [{ points: [0, 0, 0, 1, 0, 0, 2, 0, 0], faces: [0, 1, 2] }] },
 ];

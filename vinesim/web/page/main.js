@@ -19,13 +19,15 @@ import { Wrist } from "./wrist.js";
 
 const RETRY = 1000; // ms
 const SILENCE = 3; // s
-const SHADOW_PERIOD = 250; // ms
+const SHADOW_PERIOD = 250, SHADOW_PICTURES = 4; // what the sun sees is drawn anew after so many ms, and so many pictures
 const LONGEST = 0.1; // s: what moves by keys moves no further in one picture
 const FINGER = 22; // px: a tap so far beside a thing means it
+/** rad: eyes that have turned so far need another list of plants; in a headset, half of what the eyes see, corner to corner. */
+const TURN = 0.35, IN_HEADSET = { turn: 0.7, field: 1.2 };
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
 /** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on. */
-const SLOW = 5, FIRST_PICTURES = 12, FEW = 0.2;
+const SLOW = 5, FIRST_PICTURES = 12, FEW = 0.3;
 /** Pictures a second on a screen, at which as much is drawn as they allow [Hz]. */
 const RATE = 60;
 const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser from now on.";
@@ -79,6 +81,7 @@ class Viewer {
     this.heardAt = performance.now();
     this.pace = new Pace(LONGEST);
     this.followed = -1;
+    this.isLoadingPlants = false;
     this.isAdvised = false;
     this.shadowAt = asked("shadows") === 0 ? Infinity : -1e9;
     this.lastFrame = performance.now();
@@ -243,7 +246,10 @@ class Viewer {
     const pose = this.headset.isWorn ? this.headset.head() : this.eyes.pose;
     const eye = new THREE.Vector3(...pose.slice(0, 3));
     page.voice.listen(pose);
-    this.world.list(eye);
+    if (this.world.isLeft(eye)) this.loadPlants(eye);
+    const ahead = new THREE.Vector3(1, 0, 0).applyQuaternion(new THREE.Quaternion(...pose.slice(3)));
+    const { turn, field } = this.headset.isWorn ? IN_HEADSET : { turn: TURN, field: this.diagonal };
+    this.world.list(eye, ahead, field + turn, turn);
     this.overlays.draw(actors, this.camera);
     if (this.isPerson) {
       this.person = this.track(pose, seconds);
@@ -251,7 +257,7 @@ class Viewer {
       this.shears.draw([0, 1].map((k) => this.lateHands.palm(this.person, k)), facing(pose));
     }
     this.renderer.info.reset();
-    if (now - this.shadowAt > SHADOW_PERIOD) {
+    if (now - this.shadowAt > Math.max(SHADOW_PERIOD, 1000 * SHADOW_PICTURES * this.frame)) {
       this.shadowAt = now;
       this.world.renderShadow(this.renderer);
       this.renderer.info.reset();
@@ -278,10 +284,19 @@ class Viewer {
     }
   }
 
+  /** Of a vineyard that is too large for a page: the plants around the eye instead of those that it has left. */
+  async loadPlants({ x, y, z }) {
+    if (this.isLoadingPlants) return;
+    this.isLoadingPlants = true;
+    const plants = await load(`plants?x=${x}&y=${y}&z=${z}`).catch(() => null); // a client that goes is waited for by the socket
+    if (plants === null) await new Promise((tryAgain) => setTimeout(tryAgain, RETRY));
+    else this.world.setPlants(plants, plants.place);
+    this.isLoadingPlants = false;
+  }
+
   /** Triangles that are drawn from now on, as a multiple of those of a phone. */
   setBudget(multiple) {
-    this.world.budget = multiple * TRIANGLE_BUDGET;
-    this.world.listedAt = null;
+    this.world.setBudget(multiple * TRIANGLE_BUDGET);
   }
 
   /** After the first pictures: what a newcomer may wonder about. */
@@ -327,6 +342,11 @@ class Viewer {
     if (found === null) return;
     if (found.distance <= ARM) this.hand.reachFor(found);
     else say(`This ${found.what} is ${found.distance.toFixed(1)} m away, an arm reaches ${ARM} m: walk nearer.`);
+  }
+
+  /** Half of what the camera sees, corner to corner [rad]. */
+  get diagonal() {
+    return Math.atan(Math.tan(this.camera.fov / 2 * Math.PI / 180) * Math.hypot(1, this.camera.aspect));
   }
 
   /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
@@ -401,7 +421,7 @@ if (window.pageMisses) throw new Error(window.pageMisses);
 page.voice = new Voice();
 const header = await load("scene");
 const world = new World(header);
-if (asked("triangles") > 0) world.budget = asked("triangles");
+if (asked("triangles") > 0) world.setBudget(asked("triangles"));
 page.viewer = new Viewer(world, [...header.arrays.start]);
 if (asked("rate") > 0) page.viewer.shortest = 1 / asked("rate") - 0.002; // displays tick a little early
 window.pageStarted();

@@ -3,6 +3,9 @@
 
 import { BERRIES, GROUND, LEAVES, LIGHT, MATERIALS, SKY, SOLIDS } from "./light.js";
 
+/** Width of the texture with the rows of the primitives that are drawn. */
+export const LIST_WIDTH = 1024;
+
 const COMMON = /* glsl */ `
 precision highp float;
 precision highp int;
@@ -14,8 +17,11 @@ uniform usampler2D surfaces;  // one texel a primitive: colour and sky in bytes,
 uniform mat4 projectionMatrix;
 uniform mat4 modelViewMatrix;
 uniform float leafExtent[24]; // of each outline: largest |u|, lowest and highest v, unused
+uniform usampler2D listed;    // rows of the primitives that are drawn; largest number: none
+uniform int copies;           // of the mesh in an instance
 in vec3 position;
-in uint row;
+in uint copy;
+uint row;                     // of the primitive
 out vec3 vPlace;
 out vec3 vNormal;
 out vec3 vLocal;              // of leaves: u, v, outline; of berries: seed, depth, along; of others: place in the grain
@@ -50,6 +56,12 @@ const FINISH = /* glsl */ `
 
 const START = /* glsl */ `
 void main() {
+  int k = gl_InstanceID * copies + int(copy);
+  row = texelFetch(listed, ivec2(k % ${LIST_WIDTH}, k / ${LIST_WIDTH}), 0).x;
+  if (row == 0xffffffffu) { // out of the picture
+    gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
+    return;
+  }
   vSurface = texelFetch(surfaces, ivec2(int(row) & 511, int(row) >> 9), 0);
   vec4 a = shape(0), b = shape(1);
   vec3 p, n;
@@ -106,9 +118,9 @@ export const VERTEX = {
   p = a.xyz + turn(b, vLocal);
   n = turn(b, face);
 ` + FINISH,
-  // not instanced: three vertices after each other are the corners
+  // position: x is the number of the corner
   triangle: COMMON + START + /* glsl */ `
-  vec4 corner = shape(gl_VertexID % 3);
+  vec4 corner = shape(int(position.x));
   p = vLocal = corner.xyz;
   vSurface.w = 0u;
   n = unpackNormal(corner.w);

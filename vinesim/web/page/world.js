@@ -1,6 +1,8 @@
 // The vineyard on the graphics card: primitives and poses in textures, one draw call for each kind and level of detail.
 
 import * as THREE from "./vendor/three.module.js";
+import { Batches } from "./batches.js";
+import { boxAround, farthest, outermost } from "./extent.js";
 import { MESHES } from "./geometry.js";
 import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
 
@@ -8,7 +10,8 @@ const SHAPE_SHIFT = 10, SURFACE_SHIFT = 9, POSE_SHIFT = 9;
 /** Distances [m] from which the next coarser level is drawn, in units of a cluster's thickness. */
 const LEVEL_DISTANCE = [60, 190, 400];
 const COARSEST = 1000;
-/** Where the budget is short, what is far goes rather than that what is near gets edges: levels are coarser by this at most. */
+/** Where the budget is short, what is far goes rather than that what is near gets edges: levels are coarser by this at
+ * most, and by more with budgets below that of a phone, with which bunches go last. */
 const NEAR_COARSER = 1.5;
 /** Rigid bodies are drawn by these coarser levels once plants are coarser than asked for by so much. */
 const RIGID_COARSER = [3, 8];
@@ -16,13 +19,19 @@ const RIGID_COARSER = [3, 8];
 const VANISHING = 2600;
 /** Of leaves and grass less: where some must be missing, bunches and posts are missed more. */
 const VANISHING_LEAVES = 1300;
+/** Of the budget plants have this share at least, however many triangles robots and people have. */
+const LEAST_PLANTS = 0.5;
+/** A body that is so far from where it rests [m] is drawn wherever it may be. */
+const STRAY = 0.2;
 /** Numbers of kinds, as in `MESHES`. */
-const SPHEROID = 1, LEAF = 2, BOX = 3, ELLIPSOID = 4, TRIANGLE = 6;
+const SPHEROID = 1, LEAF = 2, TRIANGLE = 6;
 /** Of a phone, and of each eye of a headset. */
 export const TRIANGLE_BUDGET = 300_000;
 /** The lists of what is drawn are made anew when the eye has moved so far [m]. */
 const STRIDE = 0.25;
 const SUN_SIZE = 2048, SUN_REACH = 9, SUN_NEAR = 1, SUN_FAR = 60;
+/** Of how far plants are loaded around a place, the share after which those around another one are. */
+const LEFT = 0.4;
 /** Rigid primitives for which there is room from the start. */
 const RIGID_ROOM = 16384;
 
@@ -31,7 +40,7 @@ export class World {
     const { arrays } = header;
     this.header = header;
     this.bodies = header.bodies;
-    this.plants = arrays.material.length;
+    this.plants = header.room; // primitives of plants and ground, at most
     this.group = new THREE.Group();
     this.group.rotation.x = -Math.PI / 2; // the world's z is up, the browser's y
     this.rows = this.plants + RIGID_ROOM;
@@ -40,17 +49,17 @@ export class World {
     this.surfaces = dataTexture(THREE.RGBAIntegerFormat, THREE.UnsignedIntType, Uint32Array, 4, this.rows, SURFACE_SHIFT);
     this.poses = dataTexture(THREE.RGBAFormat, THREE.FloatType, Float32Array, 4, this.carriers * 2, POSE_SHIFT);
     for (let k = 0; k < this.carriers; ++k) this.poses.image.data[8 * k + 7] = 1;
+    this.strayed = new Set(); // bodies of plants
     this.rest(arrays.poses);
-    this.write(arrays, 0);
-    this.plantClusters = clusters(arrays);
+    this.setPlants(header, arrays.start);
     this.rigidClusters = clusters({ first: [], size: [], kind: [], bunch: [], ball: [], shape: [], carrier: [] });
     this.picked = new Set();
     this.names = [];
-    this.bounds = new Map(); // of rigid bodies: boxes around their primitives, by carrier, in its frame
+    this.outermost = new Map(); // of rigid bodies: points, by carrier, in its frame
+    this.bounds = new Map(); // boxes around them
     this.hidden = new Set(); // carriers whose rigid primitives are not drawn
     this.rigidVersion = 0;
     this.eye = new THREE.Vector3();
-    this.listedAt = null;
     this.coarser = 1;
     this.triangles = 0;
     this.budget = TRIANGLE_BUDGET;
@@ -58,8 +67,23 @@ export class World {
     this.poses.needsUpdate = this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
   }
 
+  /** What stands and grows around a place [3]; `reach`: how far from there none is missing [m], null: none is anywhere. */
+  setPlants({ arrays, reach }, place) {
+    this.write(arrays, 0);
+    this.plantClusters = clusters(arrays);
+    this.reach = reach;
+    this.around = new THREE.Vector3(...place.slice(0, 3));
+    this.listedAt = null;
+    this.surfaces.clearUpdateRanges(); // all of it
+    this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
+  }
+
+  /** Whether eyes have come so far that the plants around them should be loaded. */
+  isLeft(eye) { return this.reach !== null && eye.distanceTo(this.around) > LEFT * this.reach; }
+
   /** All plants to their poses [7] at rest. */
   rest(poses) {
+    this.strayed.clear();
     for (let k = 0; k < this.bodies; ++k) {
       const pose = poses.subarray(7 * k, 7 * k + 7);
       this.poses.image.data.set(pose.subarray(0, 3), 8 * k);
@@ -109,29 +133,20 @@ export class World {
       surfaces: { value: this.surfaces }, leafExtent: { value: extent }, leaves: { value: leaves } };
     this.shadowGroup = new THREE.Group();
     this.shadowGroup.rotation.x = -Math.PI / 2;
-    this.draws = MESHES.map(({ name, levels }, kind) => {
-      const side = name === "leaf" ? THREE.DoubleSide : THREE.FrontSide;
-      const make = (fragmentShader) => new THREE.RawShaderMaterial({
-        glslVersion: THREE.GLSL3, vertexShader: VERTEX[name], fragmentShader, uniforms, side });
-      const seen = make(fragment(name)), cast = make(depthOnly(name));
-      cast.side = THREE.DoubleSide;
-      return levels.map((level) => {
-        const geometry = level.isSingle ? new THREE.BufferGeometry() : new THREE.InstancedBufferGeometry();
-        geometry.setDrawRange(0, level.isSingle ? 0 : Infinity);
-        if (!level.isSingle) {
-          geometry.setAttribute("position", new THREE.Float32BufferAttribute(level.points, 3));
-          geometry.setIndex(level.faces);
-          geometry.instanceCount = 0;
-        }
-        for (const [group, material] of [[this.group, seen], [this.shadowGroup, cast]]) {
-          const mesh = new THREE.Mesh(geometry, material);
-          mesh.frustumCulled = false;
-          group.add(mesh);
-        }
-        return { geometry, kind, isSingle: level.isSingle, faces: level.isSingle ? 1 : level.faces.length / 3,
-          list: new Uint32Array(1024), count: 0 };
-      });
-    });
+    this.draws = MESHES.map(({ name, levels }) => levels.map((level) => {
+      const batches = new Batches(level), own = { ...uniforms, ...batches.uniforms };
+      const make = (fragmentShader, side) => new THREE.RawShaderMaterial({
+        glslVersion: THREE.GLSL3, vertexShader: VERTEX[name], fragmentShader, uniforms: own, side });
+      const seen = make(fragment(name), name === "leaf" ? THREE.DoubleSide : THREE.FrontSide);
+      const cast = make(depthOnly(name), THREE.DoubleSide);
+      for (const [group, geometry, material] of [
+        [this.group, batches.geometry, seen], [this.shadowGroup, batches.shadowGeometry, cast]]) {
+        const mesh = new THREE.Mesh(geometry, material);
+        mesh.frustumCulled = false;
+        group.add(mesh);
+      }
+      return batches;
+    }));
     this.group.add(this.makeGround(arrays, common), makeSky(common));
   }
 
@@ -158,7 +173,8 @@ export class World {
     this.write(arrays, this.plants);
     this.rigidClusters = clusters(arrays);
     this.names = header.names;
-    this.bounds = boundsOf(arrays);
+    this.outermost = outermost(arrays);
+    this.bounds = new Map([...this.outermost].map(([carrier, points]) => [carrier, boxAround(points)]));
     const own = partsBeforeEyes(this.header);
     this.hidden = new Set();
     this.names.forEach((name, k) => { if (own.has(name)) this.hidden.add(this.bodies + 1 + k); });
@@ -171,7 +187,16 @@ export class World {
   /** Poses of the trees that have moved, and what was picked. */
   apply(state) {
     const { body, place, turn, picked } = state.arrays;
-    for (let k = 0; k < body.length; ++k) this.pose(body[k], place, turn, k);
+    const atRest = this.header.arrays.poses;
+    for (let k = 0; k < body.length; ++k) {
+      this.pose(body[k], place, turn, k);
+      const [x, y, z] = [0, 1, 2].map((axis) => place[3 * k + axis] - atRest[7 * body[k] + axis]);
+      const isAway = x * x + y * y + z * z > STRAY ** 2;
+      if (isAway === this.strayed.has(body[k])) continue;
+      if (isAway) this.strayed.add(body[k]);
+      else this.strayed.delete(body[k]);
+      this.listedAt = null;
+    }
     this.poses.needsUpdate = true;
     if (picked.length !== this.picked.size || picked.some((bunch) => !this.picked.has(bunch))) {
       this.picked = new Set(picked);
@@ -228,13 +253,11 @@ export class World {
     return point.clone().applyQuaternion(this.turn(carrier)).add(this.place(carrier));
   }
 
-  /** Height of the highest point of the boxes around some carriers [m]. */
+  /** Height of the highest point of some carriers [m]. */
   top(carriers) {
-    return Math.max(...carriers.filter((carrier) => this.bounds.has(carrier)).map((carrier) => {
+    return Math.max(...carriers.filter((carrier) => this.outermost.has(carrier)).map((carrier) => {
       const up = new THREE.Vector3(0, 0, 1).applyQuaternion(this.turn(carrier).conjugate());
-      const { min, max } = this.bounds.get(carrier);
-      const over = ["x", "y", "z"].reduce((sum, axis) => sum + Math.max(up[axis] * min[axis], up[axis] * max[axis]), 0);
-      return this.place(carrier).z + over;
+      return this.place(carrier).z + farthest(this.outermost.get(carrier), up);
     }));
   }
 
@@ -244,55 +267,63 @@ export class World {
     return Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
   }
 
-  /** Choose what is drawn, and how finely, for the eye [3] in the world. */
-  list(eye) {
+  /** Triangles that are drawn at most, from the next list on. */
+  setBudget(triangles) {
+    if (triangles > this.budget) this.coarser = 1; // the list finds how much coarser it has to be
+    this.budget = triangles;
+    this.listedAt = null;
+  }
+
+  /**
+   * Choose what is drawn, and how finely, for the eye [3] in the world. Plants that are not within an `angle` of the
+   * direction `ahead` only cast shadows; the list is good until the eyes have turned by `turn`, which is part of it.
+   */
+  list(eye, ahead, angle, turn) {
     this.eye.copy(eye);
-    if (this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE) return;
+    if (this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE && this.listedAhead.angleTo(ahead) < turn) return;
     this.listedAt = eye.clone();
+    this.listedAhead = ahead.clone();
     for (;;) {
-      for (const level of this.draws.flat()) level.count = 0;
-      this.choose(this.plantClusters, 0, true);
-      this.choose(this.rigidClusters, this.plants, false);
-      this.triangles = this.draws.flat().reduce((sum, level) => sum + level.count * level.faces, 0);
-      if (this.triangles <= this.budget || this.coarser > COARSEST) break;
+      for (const level of this.draws.flat()) level.clear();
+      this.chooseRigid();
+      const rigid = this.countTriangles();
+      this.choosePlants(angle);
+      this.triangles = this.countTriangles();
+      if (this.triangles <= Math.max(this.budget, rigid + LEAST_PLANTS * this.budget) || this.coarser > COARSEST) break;
       this.coarser *= 1.3;
     }
     if (this.triangles < 0.6 * this.budget) this.coarser = Math.max(1, this.coarser / 1.3);
-    for (const level of this.draws.flat()) {
-      if (level.isSingle) { drawSingle(level); continue; }
-      let rows = level.geometry.getAttribute("row");
-      if (!rows || rows.array !== level.list) {
-        rows = new THREE.InstancedBufferAttribute(level.list, 1);
-        rows.gpuType = THREE.IntType;
-        level.geometry.setAttribute("row", rows);
-      }
-      rows.needsUpdate = true;
-      level.geometry.instanceCount = level.count;
+    for (const level of this.draws.flat()) level.update();
+  }
+
+  countTriangles() { return this.draws.flat().reduce((sum, level) => sum + level.triangles, 0); }
+
+  chooseRigid() {
+    const { first, size, kind, carrier } = this.rigidClusters, coarser = RIGID_COARSER.filter((most) => this.coarser > most).length;
+    for (let k = 0; k < first.length; ++k) {
+      if (this.hidden.has(carrier[k])) continue;
+      const levels = this.draws[kind[k]];
+      levels[Math.min(coarser, levels.length - 1)].seen.add(this.plants + first[k], size[k]);
     }
   }
 
-  choose(set, start, fades) {
-    const { x, y, z } = this.eye;
-    for (let k = 0; k < set.first.length; ++k) {
-      if (set.bunch[k] >= 0 && this.picked.has(set.bunch[k])) continue;
-      if (this.hidden.has(set.carrier[k])) continue;
-      const kind = set.kind[k], levels = this.draws[kind];
-      let level = fades ? 0 : Math.min(RIGID_COARSER.filter((most) => this.coarser > most).length, levels.length - 1);
-      if (fades) {
-        const away = Math.hypot(set.ball[4 * k] - x, set.ball[4 * k + 1] - y, set.ball[4 * k + 2] - z);
-        const sizes = Math.max(away - set.ball[4 * k + 3], 0.05) / set.thickness[k];
-        if (sizes * this.coarser > (kind === LEAF ? VANISHING_LEAVES : VANISHING)) continue;
-        const ratio = sizes * Math.min(this.coarser, NEAR_COARSER);
-        while (level < levels.length - 1 && ratio > LEVEL_DISTANCE[level] * (kind === LEAF ? 0.35 : 1)) ++level;
-      }
-      const into = levels[level], end = into.count + set.size[k];
-      if (end > into.list.length) {
-        const longer = new Uint32Array(2 * end);
-        longer.set(into.list);
-        into.list = longer;
-      }
-      for (let i = 0; i < set.size[k]; ++i) into.list[into.count + i] = start + set.first[k] + i;
-      into.count = end;
+  choosePlants(angle) {
+    const { first, size, kind, bunch, ball, thickness, carrier } = this.plantClusters, { x, y, z } = this.eye;
+    const ahead = this.listedAhead, short = Math.max(1, TRIANGLE_BUDGET / this.budget);
+    const vanishing = { [LEAF]: VANISHING_LEAVES, [SPHEROID]: VANISHING * short };
+    for (let k = 0; k < first.length; ++k) {
+      if (bunch[k] >= 0 && this.picked.has(bunch[k])) continue;
+      const dx = ball[4 * k] - x, dy = ball[4 * k + 1] - y, dz = ball[4 * k + 2] - z, radius = ball[4 * k + 3];
+      const away = Math.hypot(dx, dy, dz), sizes = Math.max(away - radius, 0.05) / thickness[k];
+      if (sizes * this.coarser > (vanishing[kind[k]] ?? VANISHING)) continue;
+      const ratio = sizes * Math.min(this.coarser, NEAR_COARSER * short), levels = this.draws[kind[k]];
+      let level = 0;
+      while (level < levels.length - 1 && ratio > LEVEL_DISTANCE[level] * (kind[k] === LEAF ? 0.35 : 1)) ++level;
+      const around = (radius + STRIDE) / away;
+      const isSeen = around >= 1 || this.strayed.has(carrier[k])
+        || Math.acos((dx * ahead.x + dy * ahead.y + dz * ahead.z) / away) < angle + Math.asin(around);
+      if (isSeen) levels[level].seen.add(first[k], size[k]);
+      else if (away - radius < SUN_REACH * Math.SQRT2) levels[level].unseen.add(first[k], size[k]);
     }
   }
 
@@ -317,19 +348,6 @@ export class World {
     this.common.sunMatrix.value.copy(camera.projectionMatrix).multiply(camera.matrixWorldInverse)
       .multiply(this.shadowGroup.matrixWorld);
   }
-}
-
-/** Triangles as one mesh: the row of each comes three times, for an instance with one triangle costs as one with many. */
-function drawSingle({ geometry, list, count }) {
-  let rows = geometry.getAttribute("row");
-  if (!rows || rows.array.length < 3 * count) {
-    rows = new THREE.BufferAttribute(new Uint32Array(3 * list.length), 1);
-    rows.gpuType = THREE.IntType;
-    geometry.setAttribute("row", rows);
-  }
-  for (let i = 0; i < 3 * count; ++i) rows.array[i] = list[Math.floor(i / 3)];
-  rows.needsUpdate = true;
-  geometry.setDrawRange(0, 3 * count);
 }
 
 /** Parts of the page's own person that would be before its eyes. */
@@ -367,30 +385,6 @@ function dataTexture(format, type, Kind, channels, texels, shift) {
   if (format === THREE.RGBAIntegerFormat) texture.internalFormat = "RGBA32UI";
   texture.minFilter = texture.magFilter = THREE.NearestFilter;
   return texture;
-}
-
-/** Boxes around the primitives of each carrier, in its frame. */
-function boundsOf({ shape, first, size, kind, carrier }) {
-  const bounds = new Map();
-  first.forEach((start, k) => {
-    for (let row = start; row < start + size[k]; ++row) {
-      const [a, b, c] = [0, 4, 8].map((at) => new THREE.Vector3().fromArray(shape, 16 * row + at));
-      const radius = shape[16 * row + 3], box = new THREE.Box3(), around = new THREE.Vector3();
-      if (kind[k] === TRIANGLE) box.setFromPoints([a, b, c]);
-      else if (kind[k] === BOX || kind[k] === ELLIPSOID) {
-        const turn = new THREE.Quaternion().fromArray(shape, 16 * row + 4);
-        [radius, c.x, c.y].forEach((half, axis) => {
-          const edge = new THREE.Vector3().setComponent(axis, half).applyQuaternion(turn);
-          around.add(edge.set(Math.abs(edge.x), Math.abs(edge.y), Math.abs(edge.z)));
-        });
-        box.setFromPoints([a]).expandByVector(around);
-      } else if (kind[k] === SPHEROID) box.setFromPoints([a]).expandByScalar(radius * Math.max(shape[16 * row + 7], 1));
-      else box.setFromPoints([a, b]).expandByScalar(radius);
-      const of = carrier[start];
-      bounds.set(of, (bounds.get(of) ?? new THREE.Box3()).union(box));
-    }
-  });
-  return bounds;
 }
 
 /** Runs of primitives, with the mean thickness of their parts [m]. */
