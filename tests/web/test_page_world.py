@@ -7,7 +7,7 @@ from vinesim import frames
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
-from vinesim.client.page_world import PageWorld
+from vinesim.client.page_world import ELSE_LOADED, LOADED, PageWorld
 from vinesim.client.spectator import FOLLOW_YAW, Spectator, standing_view
 from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -317,7 +317,9 @@ def test_of_a_large_vineyard_a_page_loads_what_is_nearest(shown):
         np.testing.assert_array_equal(part["first"], np.cumsum(part["size"]) - part["size"])
 
         def away(arrays, place=place):
-            return np.linalg.norm(arrays["ball"].reshape(-1, 4)[:, :3] - place, axis=1)
+            material = arrays["material"][arrays["first"]]
+            share = [LOADED.get(int(one), ELSE_LOADED) for one in material]
+            return np.linalg.norm(arrays["ball"].reshape(-1, 4)[:, :3] - place, axis=1) / share
 
         left_out = np.sort(away(whole))[len(part["size"])]
         assert away(part).max() <= left_out + 1e-6

@@ -13,6 +13,7 @@ from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 from vinesim.client import page_overlays
 from vinesim.client.client import Client
 from vinesim.client.spectator import Spectator, follow_view
+from vinesim.kernels.shading import materials
 from vinesim.physics.plants.sway import Sway
 from vinesim.physics.rigid.human_shapes import SIDES
 from vinesim.scene.appearance import load_shears
@@ -35,6 +36,10 @@ NEAR = 3.0
 """An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
 MAX_PRIMITIVES = 400_000
 """Of plants and ground that a page has at a time: 32 MB."""
+LOADED = {int(materials.STEM): 0.4, int(materials.GRASS): 0.5, int(materials.BERRY): 1.0}
+"""How far things are loaded by their material, berries being 1: about as far as a page draws them. GUESSED."""
+ELSE_LOADED = 2.0
+"""The same for leaves and wood."""
 AMONG_VINES = 1.08
 """Exposure of a page beside the usual one of the daylight: what cameras come to by themselves among vines, 1.06 to 1.12
 times it in the pictures of docs/web.md."""
@@ -399,19 +404,22 @@ def _nearest(
     primitives: Primitives, place: np.ndarray, most: int
 ) -> tuple[float | None, dict[str, np.ndarray]]:  # fmt: skip
     """Primitives of the clusters of plants and ground nearest to a ``place`` [3] m, at most ``most``, and the clusters;
-    before them how far from there none is missing [m], None: none is missing anywhere."""
+    before them how far from there no berry is missing [m], None: nothing is missing anywhere. :data:`LOADED` says how
+    far other things are loaded."""
     count = len(primitives.cluster_first) - len(primitives.rigid_clusters)
     clusters = _clusters(primitives, slice(0, count))
     if primitives.plant_count <= most:
         return None, _columns(primitives, slice(0, primitives.plant_count)) | clusters
-    away = np.linalg.norm(clusters["ball"][:, :3] - place, axis=1)
+    first, size = clusters["first"].astype(int), clusters["size"].astype(int)
+    material = primitives.local_columns(first)["material"]
+    share = np.select([material == one for one in LOADED], list(LOADED.values()), ELSE_LOADED)
+    away = np.linalg.norm(clusters["ball"][:, :3] - place, axis=1) / share
     order = np.argsort(away, kind="stable")
-    fitting = int(np.searchsorted(np.cumsum(clusters["size"][order]), most, side="right"))
+    fitting = int(np.searchsorted(np.cumsum(size[order]), most, side="right"))
     kept = np.sort(order[:fitting])
     clusters = {name: values[kept] for name, values in clusters.items()}
-    first, size = clusters["first"].astype(int), clusters["size"].astype(int)
-    start = np.cumsum(size) - size
-    rows = np.repeat(first - start, size) + np.arange(size.sum())
+    start = np.cumsum(size[kept]) - size[kept]
+    rows = np.repeat(first[kept] - start, size[kept]) + np.arange(size[kept].sum())
     clusters["first"] = start.astype(np.uint32)
     return float(away[order[fitting]]), _columns(primitives, rows) | clusters
 

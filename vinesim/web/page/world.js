@@ -30,8 +30,8 @@ export const TRIANGLE_BUDGET = 300_000;
 /** The lists of what is drawn are made anew when the eye has moved so far [m]. */
 const STRIDE = 0.25;
 const SUN_SIZE = 2048, SUN_REACH = 9, SUN_NEAR = 1, SUN_FAR = 60;
-/** Of how far plants are loaded around a place, the share after which those around another one are. */
-const LEFT = 0.4;
+/** Of how far berries are loaded around a place, the share after which the plants around another one are. */
+const LEFT = 0.5;
 /** Rigid primitives for which there is room from the start. */
 const RIGID_ROOM = 16384;
 
@@ -67,7 +67,7 @@ export class World {
     this.poses.needsUpdate = this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
   }
 
-  /** What stands and grows around a place [3]; `reach`: how far from there none is missing [m], null: none is anywhere. */
+  /** What stands and grows around a place [3]; `reach`: how far from there no berry is missing [m], null: nothing is anywhere. */
   setPlants({ arrays, reach }, place) {
     this.write(arrays, 0);
     this.plantClusters = clusters(arrays);
