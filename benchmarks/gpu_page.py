@@ -215,12 +215,12 @@ def play(
         yield {"case": f"{world.name}: drawn by", "value": page.run(CARD), "unit": ""}
         for kind, (width, height, ratio) in SIZES.items():
             page.resize(width, height, ratio)
-            page.run(f"vinesim.viewer.renderer.setPixelRatio({ratio}), vinesim.viewer.resize(), 0")
+            page.run(f"vinesim.viewer.resize(), 0")
             yield from _measure(page, f"{world.name}, {kind}, {width}x{height}, {ratio:g}x", BARS.get(kind))
             if pictures is not None:
                 cv2.imwrite(str(pictures / f"{world.name}-{kind}.jpg"), page.picture()[..., ::-1])
         page.resize(*EYES)
-        page.run("vinesim.viewer.renderer.setPixelRatio(1), vinesim.viewer.resize(), 0")
+        page.run("vinesim.viewer.resize(), 0")
         page.run("device.position.set(0, 1.6, 0), document.getElementById('enter').click()")
         _wait(page, "vinesim.viewer.headset.isWorn")
         yield from _measure(page, f"{world.name}, headset, {EYES[0]}x{EYES[1]}", BARS["headset"])

@@ -26,11 +26,13 @@ const FINGER = 22; // px: a tap so far beside a thing means it
 const TURN = 0.35, IN_HEADSET = { turn: 0.7, field: 1.2 };
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
-/** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on. */
-const SLOW = 5, FIRST_PICTURES = 12, FEW = 0.3;
+/** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on: so many
+ * triangles, as a share of a phone's, and so many pixels. One without a graphics card does from the start. */
+const SLOW = 5, FIRST_PICTURES = 12, FEW = 0.3, FEW_PIXELS = 250_000;
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 /** Pictures a second on a screen, at which as much is drawn as they allow [Hz]. */
 const RATE = 60;
-const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser from now on.";
+const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser.";
 const NOBODY = "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
 const element = (id) => document.getElementById(id);
 
@@ -43,8 +45,9 @@ const page = (window.vinesim = { states: 0, drawn: 0, tick: -1, frames: 0, calls
 class Viewer {
   constructor(world, start) {
     this.world = world;
-    this.renderer = new THREE.WebGLRenderer({ canvas: element("view"), antialias: true, powerPreference: "high-performance" });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
+    this.detail = asked("triangles") === null && asked("rate") === null ? new Detail(TRIANGLES) : null; // null: fixed
+    this.isSlow = this.detail !== null && SOFTWARE.test(graphicsCard());
+    this.renderer = new THREE.WebGLRenderer({ canvas: element("view"), antialias: !this.isSlow, powerPreference: "high-performance" });
     this.renderer.info.autoReset = false;
     this.scene = new THREE.Scene();
     this.scene.add(world.group);
@@ -88,7 +91,7 @@ class Viewer {
     this.shortest = 0; // time between two pictures of a desktop at least [s]
     this.frame = 1 / 60; // time of a frame, smoothed [s]
     this.first = new FirstPictures(FIRST_PICTURES);
-    this.detail = asked("triangles") === null && asked("rate") === null ? new Detail(TRIANGLES) : null; // null: fixed
+    if (this.isSlow) this.drawLess();
     this.labels = new Map();
     addEventListener("resize", () => this.resize());
     addEventListener("keydown", (event) => { if (!event.repeat) this.press(event.code); });
@@ -304,11 +307,19 @@ class Viewer {
     if (this.isAdvised || this.first.median === null) return;
     this.isAdvised = true;
     if (actors.length === 0 && this.timeline === null) say(NOBODY);
-    if (this.first.median < 1 / SLOW || this.headset.isWorn || this.detail === null) return;
-    this.renderer.setPixelRatio(0.5);
+    if (!this.isSlow) {
+      if (this.first.median < 1 / SLOW || this.headset.isWorn || this.detail === null) return;
+      this.drawLess();
+      this.resize();
+    }
+    say(TOO_SLOW);
+  }
+
+  /** Few triangles and pixels, for good. */
+  drawLess() {
+    this.isSlow = true;
     this.detail = null;
     this.setBudget(FEW);
-    say(TOO_SLOW);
   }
 
   /** What the client is told: the state that was drawn, where the eyes are, and the person's head and hands. */
@@ -397,6 +408,8 @@ class Viewer {
   }
 
   resize() {
+    const few = Math.min(1, Math.sqrt(FEW_PIXELS / (innerWidth * innerHeight)));
+    this.renderer.setPixelRatio(this.isSlow ? few : Math.min(devicePixelRatio, 2));
     this.renderer.setSize(innerWidth, innerHeight, false);
     this.camera.aspect = innerWidth / innerHeight;
     this.camera.updateProjectionMatrix();
@@ -406,6 +419,14 @@ class Viewer {
 /** Quaternion, in the world, of something flat that faces eyes at a pose [7]. */
 function facing(pose) {
   return new THREE.Quaternion(...pose.slice(3)).multiply(new THREE.Quaternion(0, -Math.SQRT1_2, 0, Math.SQRT1_2));
+}
+
+/** What draws in this browser; empty if it does not say. */
+function graphicsCard() {
+  const gl = document.createElement("canvas").getContext("webgl2"), names = gl?.getExtension("WEBGL_debug_renderer_info");
+  const card = gl?.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER) ?? "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return card;
 }
 
 function fail(failure) {
