@@ -215,7 +215,7 @@ def play(
         yield {"case": f"{world.name}: drawn by", "value": page.run(CARD), "unit": ""}
         for kind, (width, height, ratio) in SIZES.items():
             page.resize(width, height, ratio)
-            page.run(f"vinesim.viewer.resize(), 0")
+            page.run("vinesim.viewer.resize(), 0")
             yield from _measure(page, f"{world.name}, {kind}, {width}x{height}, {ratio:g}x", BARS.get(kind))
             if pictures is not None:
                 cv2.imwrite(str(pictures / f"{world.name}-{kind}.jpg"), page.picture()[..., ::-1])
