@@ -12,7 +12,7 @@ const LEVEL_DISTANCE = [60, 190, 400];
 const COARSEST = 1000;
 /** Where the budget is short, what is far goes rather than that what is near gets edges: levels are coarser by this at
  * most, and by more with budgets below that of a phone, with which bunches go last. */
-const NEAR_COARSER = 1.5;
+const NEAR_COARSER = 1.5, MOST_SHORT = 5;
 /** Rigid bodies are drawn by these coarser levels once plants are coarser than asked for by so much. */
 const RIGID_COARSER = [3, 8];
 /** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
@@ -309,7 +309,7 @@ export class World {
 
   choosePlants(angle) {
     const { first, size, kind, bunch, ball, thickness, carrier } = this.plantClusters, { x, y, z } = this.eye;
-    const ahead = this.listedAhead, short = Math.max(1, TRIANGLE_BUDGET / this.budget);
+    const ahead = this.listedAhead, short = Math.min(Math.max(TRIANGLE_BUDGET / this.budget, 1), MOST_SHORT);
     const vanishing = { [LEAF]: VANISHING_LEAVES, [SPHEROID]: VANISHING * short };
     for (let k = 0; k < first.length; ++k) {
       if (bunch[k] >= 0 && this.picked.has(bunch[k])) continue;
