@@ -598,13 +598,14 @@ def test_what_the_eyes_can_see_is_drawn_and_what_is_behind_them_only_casts_shado
       const { first, ball } = world.plantClusters;
       const ahead = camera.position.clone().set(Math.cos(eyes.yaw), Math.sin(eyes.yaw), 0);
       const eye = camera.position.clone().set(...eyes.place), field = vinesim.viewer.diagonal, turn = 0.35;
-      const lists = [Math.PI, field + turn].map((angle) => {
+      const list = (way, field) => {
         world.listedAt = null;
         world.coarser = 1;
         world.budget = 1e7;
-        world.list(eye, ahead, angle, turn);
+        world.list(eye, way, { field, turn });
         return [rows("seen"), rows("unseen")];
-      });
+      };
+      const lists = [list(ahead, Math.PI), list(ahead, field)];
       const [[all], [seen, unseen]] = lists, off = [];
       let lost = 0;
       first.forEach((row, k) => {
@@ -613,7 +614,11 @@ def test_what_the_eyes_can_see_is_drawn_and_what_is_behind_them_only_casts_shado
         off.push(way.angleTo(ahead) - Math.asin(Math.min(1, ball[4 * k + 3] / way.length())));
         lost += !unseen.has(row) && way.length() < 9;
       });
-      return { all: all.size, seen: seen.size, least: Math.min(...off), bound: field + turn, lost };
+      const straight = [...first.keys()].filter((k) => all.has(first[k]) && k % 100 === 0).every((k) => {
+        const way = camera.position.clone().set(...ball.subarray(4 * k, 4 * k + 3)).sub(eye);
+        return list(way.normalize().multiplyScalar(1 + 1e-7), field)[0].has(first[k]);
+      });
+      return { all: all.size, seen: seen.size, least: Math.min(...off), bound: field + turn, lost, straight };
     })(vinesim.viewer)"""
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
         open_page(page, live)
@@ -623,6 +628,7 @@ def test_what_the_eyes_can_see_is_drawn_and_what_is_behind_them_only_casts_shado
     assert 0 < found["seen"] < share * found["all"]
     assert found["least"] >= found["bound"]
     assert found["lost"] == 0
+    assert found["straight"], "also what is right before the eyes, whatever is rounded"
 
 
 @pytest.mark.slow

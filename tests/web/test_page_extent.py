@@ -1,14 +1,12 @@
 """How far the page takes rigid bodies to extend: beside the exact support function of each kind of primitive."""
 
 import json
-from typing import cast
 
 import numpy as np
 import pytest
 
+from tests.support.page_module import page_module
 from vinesim import frames
-from vinesim.bench.support.browser import browser_page
-from vinesim.web.page_server import PageServer, World
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
@@ -38,33 +36,27 @@ def exact(kind: int, u: np.ndarray) -> np.ndarray:
     }[kind]
 
 
-class NoWorld:
-    """Nothing to show: only the page's files are asked for."""
-
-
 @pytest.fixture(scope="module")
 def extents():
     """How far all primitives reach in directions [k, 3], and the boxes around them, by their kind."""
-    with browser_page() as page, PageServer(cast(World, NoWorld())) as server:
-        page.open(server.address + "package.json")  # of the page's files one that starts no script
+    shape = np.zeros((len(PRIMITIVES), 16))
+    for row, values in zip(shape, PRIMITIVES.values(), strict=True):
+        row[: len(values)] = values
+    numbers = list(range(len(shape)))
+    arrays = {"shape": shape.ravel().tolist(), "first": numbers, "size": [1] * len(shape), "carrier": numbers}
+    arrays["kind"] = list(PRIMITIVES)
+    with page_module("extent.js", "boxAround", "farthest", "outermost") as run:
 
-        def run(directions):
-            shape = np.zeros((len(PRIMITIVES), 16))
-            for row, values in zip(shape, PRIMITIVES.values(), strict=True):
-                row[: len(values)] = values
-            numbers = list(range(len(shape)))
-            arrays = {"shape": shape.ravel().tolist(), "first": numbers, "size": [1] * len(shape), "carrier": numbers}
-            arrays["kind"] = list(PRIMITIVES)
-            script = f"""
+        def reach(directions):
+            found = run(f"""
                 const hulls = outermost({json.dumps(arrays)}), u = {json.dumps(directions.tolist())};
                 return [...hulls.values()].map((points) => {{
                   const {{ min, max }} = boxAround(points);
                   return [u.map(([x, y, z]) => farthest(points, {{ x, y, z }})), [...min, ...max]];
-                }});"""
-            found = page.run(f"import('/extent.js').then(({{ boxAround, farthest, outermost }}) => {{ {script} }})")
+                }});""")
             return dict(zip(PRIMITIVES, found, strict=True))
 
-        yield run
+        yield reach
 
 
 def test_bodies_reach_as_far_as_their_primitives(extents):

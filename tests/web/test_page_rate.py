@@ -1,30 +1,18 @@
 """The page where pictures come too slowly: it draws less, but not because one picture had to wait."""
 
 import json
-from typing import cast
 
 import pytest
 
-from vinesim.bench.support.browser import browser_page
-from vinesim.web.page_server import PageServer, World
+from tests.support.page_module import page_module
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
-
-
-class NoWorld:
-    """Nothing to show: only the page's files are asked for."""
 
 
 @pytest.fixture(scope="module")
 def rates():
     """Evaluate a script in which everything of ``rate.js`` is known; its value."""
-    with browser_page() as page, PageServer(cast(World, NoWorld())) as server:
-        page.open(server.address + "package.json")  # of the page's files one that starts no script
-
-        def run(script):
-            names = "{ Detail, FirstPictures, PIXELS, TRIANGLES }"
-            return page.run(f"import('/rate.js').then(({names}) => {{ {script} }})")
-
+    with page_module("rate.js", "Detail", "FirstPictures", "PIXELS", "TRIANGLES") as run:
         yield run
 
 

@@ -1,9 +1,8 @@
 // How far rigid bodies extend: their outermost points in many directions, whatever their primitives are.
 
 import * as THREE from "./vendor/three.module.js";
+import { BOX, ELLIPSOID, SPHEROID, TRIANGLE } from "./geometry.js";
 
-/** Numbers of kinds, as in `MESHES`. */
-const SPHEROID = 1, BOX = 3, ELLIPSOID = 4, TRIANGLE = 6;
 /** Directions: x y z of one after the other, both of each axis first. With so many a head's top is found within 2 mm. */
 const AROUND = directions(122);
 

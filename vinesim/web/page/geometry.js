@@ -94,3 +94,6 @@ export const MESHES = [
   { name: "cylinder", levels: [tube(16, true, true)] },
   { name: "triangle", levels: [{ points: [0, 0, 0, 1, 0, 0, 2, 0, 0], faces: [0, 1, 2] }] },
 ];
+
+/** Numbers of kinds. */
+export const [, SPHEROID, LEAF, BOX, ELLIPSOID, , TRIANGLE] = MESHES.keys();

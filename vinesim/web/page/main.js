@@ -23,7 +23,7 @@ const SHADOW_PERIOD = 250, SHADOW_PICTURES = 4; // what the sun sees is drawn an
 const LONGEST = 0.1; // s: what moves by keys moves no further in one picture
 const FINGER = 22; // px: a tap so far beside a thing means it
 /** rad: eyes that have turned so far need another list of plants; in a headset, half of what the eyes see, corner to corner. */
-const TURN = 0.35, IN_HEADSET = { turn: 0.7, field: 1.2 };
+const TURN = 0.35, IN_HEADSET = { field: 1.2, turn: 0.7 };
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
 /** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on: so many
@@ -250,9 +250,7 @@ class Viewer {
     const eye = new THREE.Vector3(...pose.slice(0, 3));
     page.voice.listen(pose);
     if (this.world.isLeft(eye)) this.loadPlants(eye);
-    const ahead = new THREE.Vector3(1, 0, 0).applyQuaternion(new THREE.Quaternion(...pose.slice(3)));
-    const { turn, field } = this.headset.isWorn ? IN_HEADSET : { turn: TURN, field: this.diagonal };
-    this.world.list(eye, ahead, field + turn, turn);
+    this.world.list(eye, ahead(pose), this.headset.isWorn ? IN_HEADSET : { field: this.diagonal, turn: TURN });
     this.overlays.draw(actors, this.camera);
     if (this.isPerson) {
       this.person = this.track(pose, seconds);
@@ -362,12 +360,11 @@ class Viewer {
 
   /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
   look(pose) {
-    const turn = new THREE.Quaternion(...pose.slice(3));
-    const ahead = new THREE.Vector3(1, 0, 0).applyQuaternion(turn).applyEuler(this.world.group.rotation);
+    const target = ahead(pose).applyEuler(this.world.group.rotation);
     this.rig.position.set(0, 0, 0);
     this.rig.rotation.y = 0;
     this.camera.position.set(pose[0], pose[1], pose[2]).applyEuler(this.world.group.rotation);
-    this.camera.lookAt(ahead.add(this.camera.position));
+    this.camera.lookAt(target.add(this.camera.position));
     this.rig.updateMatrixWorld();
   }
 
@@ -414,6 +411,11 @@ class Viewer {
     this.camera.aspect = innerWidth / innerHeight;
     this.camera.updateProjectionMatrix();
   }
+}
+
+/** Where eyes at a pose [7] look, in the world. */
+function ahead(pose) {
+  return new THREE.Vector3(1, 0, 0).applyQuaternion(new THREE.Quaternion(...pose.slice(3)));
 }
 
 /** Quaternion, in the world, of something flat that faces eyes at a pose [7]. */

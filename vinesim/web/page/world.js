@@ -3,7 +3,7 @@
 import * as THREE from "./vendor/three.module.js";
 import { Batches } from "./batches.js";
 import { boxAround, farthest, outermost } from "./extent.js";
-import { MESHES } from "./geometry.js";
+import { LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
 import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
 
 const SHAPE_SHIFT = 10, SURFACE_SHIFT = 9, POSE_SHIFT = 9;
@@ -23,8 +23,6 @@ const VANISHING_LEAVES = 1300;
 const LEAST_PLANTS = 0.5;
 /** A body that is so far from where it rests [m] is drawn wherever it may be. */
 const STRAY = 0.2;
-/** Numbers of kinds, as in `MESHES`. */
-const SPHEROID = 1, LEAF = 2, TRIANGLE = 6;
 /** Of a phone, and of each eye of a headset. */
 export const TRIANGLE_BUDGET = 300_000;
 /** The lists of what is drawn are made anew when the eye has moved so far [m]. */
@@ -187,11 +185,12 @@ export class World {
   /** Poses of the trees that have moved, and what was picked. */
   apply(state) {
     const { body, place, turn, picked } = state.arrays;
-    const atRest = this.header.arrays.poses;
+    const rest = this.header.arrays.poses;
     for (let k = 0; k < body.length; ++k) {
       this.pose(body[k], place, turn, k);
-      const [x, y, z] = [0, 1, 2].map((axis) => place[3 * k + axis] - atRest[7 * body[k] + axis]);
-      const isAway = x * x + y * y + z * z > STRAY ** 2;
+      const at = 7 * body[k];
+      const away = Math.hypot(place[3 * k] - rest[at], place[3 * k + 1] - rest[at + 1], place[3 * k + 2] - rest[at + 2]);
+      const isAway = away > STRAY;
       if (isAway === this.strayed.has(body[k])) continue;
       if (isAway) this.strayed.add(body[k]);
       else this.strayed.delete(body[k]);
@@ -275,10 +274,11 @@ export class World {
   }
 
   /**
-   * Choose what is drawn, and how finely, for the eye [3] in the world. Plants that are not within an `angle` of the
-   * direction `ahead` only cast shadows; the list is good until the eyes have turned by `turn`, which is part of it.
+   * Choose what is drawn, and how finely, for the eye [3] in the world that sees what is within an angle `field` of the
+   * direction `ahead`. The list is good until the eyes have turned by `turn`; what they cannot see until then only casts
+   * shadows.
    */
-  list(eye, ahead, angle, turn) {
+  list(eye, ahead, { field, turn }) {
     this.eye.copy(eye);
     if (this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE && this.listedAhead.angleTo(ahead) < turn) return;
     this.listedAt = eye.clone();
@@ -287,7 +287,7 @@ export class World {
       for (const level of this.draws.flat()) level.clear();
       this.chooseRigid();
       const rigid = this.countTriangles();
-      this.choosePlants(angle);
+      this.choosePlants(field + turn);
       this.triangles = this.countTriangles();
       if (this.triangles <= Math.max(this.budget, rigid + LEAST_PLANTS * this.budget) || this.coarser > COARSEST) break;
       this.coarser *= 1.3;
@@ -320,8 +320,9 @@ export class World {
       let level = 0;
       while (level < levels.length - 1 && ratio > LEVEL_DISTANCE[level] * (kind[k] === LEAF ? 0.35 : 1)) ++level;
       const around = (radius + STRIDE) / away;
+      const cosine = (dx * ahead.x + dy * ahead.y + dz * ahead.z) / away; // beyond 1 by rounding
       const isSeen = around >= 1 || this.strayed.has(carrier[k])
-        || Math.acos((dx * ahead.x + dy * ahead.y + dz * ahead.z) / away) < angle + Math.asin(around);
+        || Math.acos(Math.max(-1, Math.min(1, cosine))) < angle + Math.asin(around);
       if (isSeen) levels[level].seen.add(first[k], size[k]);
       else if (away - radius < SUN_REACH * Math.SQRT2) levels[level].unseen.add(first[k], size[k]);
     }

@@ -1,0 +1,22 @@
+"""Modules of the page in a real browser, without a page: for tests of their functions."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any, cast
+
+from vinesim.bench.support.browser import browser_page
+from vinesim.web.page_server import PageServer, World
+
+
+class _NoWorld:
+    """Nothing to show: only the page's files are asked for."""
+
+
+@contextlib.contextmanager
+def page_module(name: str, *imported: str) -> Iterator[Callable[[str], Any]]:
+    """A function that evaluates a script in which what is ``imported`` from a module is known, and gives its value."""
+    with browser_page() as page, PageServer(cast(World, _NoWorld())) as server:
+        page.open(server.address + "package.json")  # of the page's files one that starts no script
+        yield lambda script: page.run(f"import('/{name}').then(({{ {', '.join(imported)} }}) => {{ {script} }})")
