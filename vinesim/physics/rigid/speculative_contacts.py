@@ -21,6 +21,8 @@ MAX_MARGIN = 0.1
 
 PASSING = 0.1
 """[1] A crate whose motion relative to another points so little towards it passes it. TUNED."""
+STIFFNESS = 100.0
+"""[1] times an effective mass over dt^2: of a gap that would close further, so much is left as 1 is to it."""
 NEVER_REACHED = 1e4
 """[m] No gap closes by as much in a step."""
 
@@ -32,6 +34,7 @@ class SpeculativeContacts:
         self._bodies = self._geoms = self._crate_of_geom = np.zeros(0, int)
         self._dof = np.zeros((0, 6), int)
         self._radius = np.zeros(0)
+        self._has_margins = False
 
     def find_crates(self, m: mujoco.MjModel, numbers: Iterable[int]) -> None:
         """Find the bodies and geoms of the boxes of these ``numbers`` in a world that was compiled anew."""
@@ -47,7 +50,10 @@ class SpeculativeContacts:
         """Before ``mj_step1``: the margin of each crate; whether one has any."""
         if len(self._bodies) == 0:
             return False
-        linear, angular = np.split(d.qvel[self._dof], 2, axis=1)
+        velocity = d.qvel[self._dof]
+        if not self._has_margins and not velocity.any():
+            return False
+        linear, angular = velocity[:, :3], velocity[:, 3:]
         step = m.opt.timestep * (np.linalg.norm(linear, axis=1) + np.linalg.norm(angular, axis=1) * self._radius)
         margin = np.zeros(len(step))
         for crate in np.flatnonzero(step > MAX_STEP).tolist():
@@ -55,7 +61,8 @@ class SpeculativeContacts:
                 margin[crate] = min(1.5 * step[crate], MAX_MARGIN)
         m.body_margin[self._bodies] = margin
         m.geom_margin[self._geoms] = margin[self._crate_of_geom]
-        return bool(margin.any())
+        self._has_margins = bool(margin.any())
+        return self._has_margins
 
     def _is_approaching(self, crate: int, velocity: np.ndarray, step: np.ndarray, position: np.ndarray) -> bool:
         """Whether a crate is near another in the next step, and not just passing it."""
@@ -69,13 +76,12 @@ class SpeculativeContacts:
         """After the constraints are made: contacts that are open may close, and no further, within the step.
 
         Those that do not close at the speed of now are given up: MuJoCo's friction would push a body away from what it
-        slides along. MuJoCo computes reference accelerations from these arrays whenever it needs them.
+        slides along. MuJoCo computes stiffness and damping anew from ``solref`` whenever it solves. Without damping
+        there is no friction either.
         """
         contact, dt = d.contact, m.opt.timestep
         is_open = np.flatnonzero((contact.dist > 0.0) & (contact.efc_address >= 0))
         row, gap = contact.efc_address[is_open], contact.dist[is_open]
         is_closing = d.efc_vel[row] * dt < -gap
         d.efc_margin[row] = np.where(is_closing, d.efc_pos[row] - gap, -NEVER_REACHED)
-        d.efc_KBIP[row, 0], d.efc_KBIP[row, 1], d.efc_KBIP[row, 2] = dt**-2, is_closing / dt, 1.0
-        sliding = row[contact.dim[is_open] > 1]
-        d.efc_KBIP[sliding + 1, 1] = d.efc_KBIP[sliding + 2, 1] = 0.0
+        contact.solref[is_open] = -STIFFNESS / dt**2, 0.0
