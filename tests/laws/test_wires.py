@@ -49,7 +49,8 @@ def row_of_shoots(
         trees, tie_body=np.arange(count), tie_point=np.tile([ARM, 0.0, 0.0], (count, 1)),
         tie_anchor=[[tree.pose[0], tree.pose[1] + ARM, 1.0] for tree in trees], tie_stiffness=np.full(count, tie),
         tie_damping=np.full(count, 0.5 * beta * tie), tie_wire=np.repeat([0, 1], [len(along), others]),
-        fixed_start=[[0.0, there, 1.0]] * 2, fixed_end=[[LENGTH, there, 1.0]] * 2,
+        fixed_start=[[0.0, there, 1.0], [0.0, there + 0.5, 1.0]],
+        fixed_end=[[LENGTH, there, 1.0], [LENGTH, there + 0.5, 1.0]],
         fixed_radius=np.full((2, 2), 0.0014), fixed_organ=[int(Organ.WIRE)] * 2, fixed_index=[0, 1],
         fixed_tension=[tension] * 2,
     )  # fmt: skip

@@ -278,7 +278,7 @@ def test_a_step_is_a_list_of_stages_and_trees_fall_asleep():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
         "wind", "grasps", "rigid", "contacts", "detail", "elastic supports", "plants", "contacts", "plants",
-            "rigid", "faults",
+            "rigid", "wires", "faults",
         "detachment",
         "grasps", "sleep",
     ]  # fmt: skip

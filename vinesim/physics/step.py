@@ -12,6 +12,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
+from vinesim.physics.contact.deflected_wires import DeflectedWires
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.detachment import Blade, DetachmentMonitor
@@ -68,12 +69,14 @@ class Physics:
         self.plants = ArticulationSolver(model, self.state, p, device=device, threads=threads)
         warn_of_raised_damping(model, p.dt, p.phi)
         self.rigid = RigidWorld(model, parameters=p)
-        self.contact_solver = ContactSolver(model, self.plants, self.rigid)
+        self.elastic_supports = ElasticSupports(self.plants, p)
+        self.wires = DeflectedWires(model, self.elastic_supports, p.dt)
+        self.rigid.let_wires_give(self.wires)
+        self.contact_solver = ContactSolver(model, self.plants, self.rigid, self.wires)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)
         self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
-        self.elastic_supports = ElasticSupports(self.plants, p)
         self.level_of_detail = LevelOfDetail(self.plants, p)
         self.sleep_monitor = SleepMonitor(self.plants, p)
         self.fault_guard = FaultGuard(self.plants)
@@ -108,6 +111,7 @@ class Physics:
             ("contacts: wake trees that others touch, solve all together", self.contact_solver.solve),
             ("plants: integrate with contact wrenches", self._integrate_plants),
             ("rigid: integrate with contact forces", self._integrate_rigid),
+            ("wires: follow what presses on them", self._deflect_wires),
             ("faults: stop trees with invalid rates", self.fault_guard.stop_faulty_trees),
             ("detachment: detach what broke or was cut", self._detach),
             ("grasps: place hands on held plants, measure forces", self._end_grasps),
@@ -157,6 +161,10 @@ class Physics:
 
     def _integrate_rigid(self) -> None:
         self.rigid.integrate(self.contact_solver.rigid_force)
+
+    def _deflect_wires(self) -> None:
+        self.contact_solver.report_wires()
+        self.wires.end_step(self.state.tree_awake, self.rigid.mj_data.tree_asleep)
 
     def _detach(self) -> None:
         self.detachments = self.detachment_monitor.update(check_load=self._detachment)

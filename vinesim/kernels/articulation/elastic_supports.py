@@ -6,7 +6,7 @@ G J / l), K u = f, where K is tridiagonal. The force of node i is f_i = k_i (s_i
 displacement s of its point across the wire, or the moment along the arm of the spring of a root's joint. With the rest of
 that spring turned by u e in the joint's axes, e along the arm, its energy is (theta - u e)^T K_joint (theta - u e) / 2, so that
 k = e^T K_joint e and k s = e^T K_joint (theta - theta_drawn). What shoots feel is (K^-1 + k^-1)^-1 s: symmetric, and less stiff than ties
-and joints alone. Along itself a wire does not give. It ends at posts; an arm is clamped at the trunk and free at its end.
+and joints alone. What else presses on a wire (*loads*) adds to f. Along itself a wire does not give. It ends at posts; an arm is clamped at the trunk and free at its end.
 
 Ties and joints are implicit in the prediction of each tree, with anchors and rest on the support; that follows the trees'
 state at the start of the step, and moves on as fast as they do. Against a solve of all trees of a support at once only
@@ -47,11 +47,22 @@ class SupportNodes:
 class SupportState:
     """How supports lie, and what the solve needs on its way. [node]"""
 
+    load: wp.array(dtype=wp.vec3d)  # [N] on a wire at the node, but for ties; in the world
     deflection: wp.array(dtype=wp.vec3d)  # [m] in the world; [rad, 0, 0] for an arm
     reference: wp.array(dtype=wp.vec3d)  # the deflection when the node's tree was last awake or put somewhere
     ratio: wp.array(dtype=wp.float64)  # [1] of a node's deflection to that of the next
     velocity: wp.array(dtype=wp.vec3d)  # [m/s], [rad/s, 0, 0]
     share: wp.array(dtype=wp.float64)  # [1] deflection if all awake trees move as one, by the same
+
+
+@wp.struct
+class Wires:
+    """Pieces of wire under tension. [piece], of all fixed pieces, unless said otherwise."""
+
+    tension: wp.array(dtype=wp.float64)  # [N]
+    length: wp.array(dtype=wp.float64)  # [m]
+    support: wp.array(dtype=wp.int32)  # its number; -1: no tie is bound to it
+    node_along: wp.array(dtype=wp.float64)  # [node] m from the start of its piece
 
 
 @wp.struct
@@ -184,6 +195,7 @@ def balance_supports(
         else:
             stiffness = wp.float64(springs_out.stiffness[springs_out.span[nodes.body[i]][0] + nodes.number[i]])
             stiffness, moved, motion = pull_of_tie(i, stiffness, nodes, bodies)
+            moved = moved + state_out.load[i]
         pivot = one / (left + right + stiffness - left * ratio)
         deflection = pivot * (moved + left * deflection)
         velocity = pivot * (motion + left * velocity)
@@ -217,3 +229,87 @@ def balance_supports(
         elif wp.length(deflection - state_out.reference[i]) > nodes.wake_distance[i]:
             is_moved_out[tree] = True
             wp.atomic_add(moved_count_out, 0, 1)
+
+
+@wp.func
+def pull_of_node(i: int, nodes: SupportNodes, bodies: SupportedBodies, springs: SupportedSprings):
+    """Stiffness k [N/m] of the tie of a wire's node, and k s [N]; see :func:`pull_of_tie`."""
+    stiffness = wp.float64(springs.stiffness[springs.span[nodes.body[i]][0] + nodes.number[i]])
+    stiffness, moved, _ = pull_of_tie(i, stiffness, nodes, bodies)
+    return stiffness, moved
+
+
+@wp.func
+def in_series(a: wp.float64, b: wp.float64):
+    """Stiffness of two springs in series."""
+    return a * b / (a + b)
+
+
+@wp.kernel
+def find_wire_springs(
+    # model
+    least_share: wp.float64,
+    wires: Wires,
+    nodes: SupportNodes,
+    # in
+    pieces: wp.array(dtype=wp.int32),
+    along: wp.array(dtype=wp.float64),
+    bodies: SupportedBodies,
+    springs: SupportedSprings,
+    loads: wp.array(dtype=wp.vec3d),
+    # out
+    stiffness_out: wp.array(dtype=wp.float64),
+    rest_out: wp.array(dtype=wp.vec3d),
+    deflection_out: wp.array(dtype=wp.vec3d),
+):
+    """One thread finds the spring that a wire is at one point, across itself, while its shoots stay where they are.
+
+    least_share: of the length, the least distance from a post. pieces, along: [thread] which wire, and where [m] from its
+    start. loads: [node] N. stiffness_out: [thread] N/m. rest_out: [thread] m, where the point is without loads, from
+    where it was drawn. deflection_out: [thread] m by which the loads on nodes move it from there.
+    """
+    thread = wp.tid()
+    piece = pieces[thread]
+    x = along[thread]
+    tension = wires.tension[piece]
+    length = wires.length[piece]
+    least = least_share * length
+    support = wires.support[piece]
+    first = int(0)
+    end = int(0)
+    if support >= 0:
+        first = nodes.first[support]
+        end = nodes.first[support + 1]
+    left = tension / wp.max(x, least)
+    left_rest = wp.vec3d()
+    left_deflection = wp.vec3d()
+    behind = wp.float64(0.0)  # stiffness of all up to a node, its tie included
+    right_first = end
+    for i in range(first, end):
+        if wires.node_along[i] <= x:
+            between = nodes.stiffness[i]
+            if i > first:
+                between = in_series(between, behind)
+            stiffness, pull = pull_of_node(i, nodes, bodies, springs)
+            behind = stiffness + between
+            left_rest = (pull + between * left_rest) / behind
+            left_deflection = (loads[i] + between * left_deflection) / behind
+            left = in_series(tension / wp.max(x - wires.node_along[i], least), behind)
+        elif right_first == end:
+            right_first = i
+    right = tension / wp.max(length - x, least)
+    right_rest = wp.vec3d()
+    right_deflection = wp.vec3d()
+    for j in range(end - right_first):
+        i = end - 1 - j
+        between = nodes.last_stiffness[support]
+        if j > 0:
+            between = in_series(nodes.stiffness[i + 1], behind)
+        stiffness, pull = pull_of_node(i, nodes, bodies, springs)
+        behind = stiffness + between
+        right_rest = (pull + between * right_rest) / behind
+        right_deflection = (loads[i] + between * right_deflection) / behind
+        right = in_series(tension / wp.max(wires.node_along[i] - x, least), behind)
+    stiffness_out[thread] = left + right
+    rest_out[thread] = (left * left_rest + right * right_rest) / (left + right)
+    deflection_out[thread] = (left * left_deflection + right * right_deflection) / (left + right)

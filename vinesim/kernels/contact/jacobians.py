@@ -78,12 +78,24 @@ def write_material_numbers(c: int, material: int, other: int, pairs: MaterialPai
 
 
 @wp.func
+def write_wire_numbers(c: int, parameters: Parameters, contacts_out: Contacts):
+    """Put the spring of a wire behind that of the contact."""
+    one = wp.float64(1.0)
+    stiffness = one / (one / contacts_out.stiffness[c] + one / contacts_out.wire_stiffness[c])
+    damping = parameters.wire_damping_time * stiffness
+    contacts_out.stiffness[c] = stiffness
+    contacts_out.damping[c] = damping
+    contacts_out.compliance[c] = one / (parameters.dt * (stiffness * parameters.dt + damping))
+
+
+@wp.func
 def write_bias(
     c: int, parameters: Parameters, end_gap: wp.float64, contacts: Contacts, warm_start: WarmStart, rows_out: Rows
 ):
     """Write bias velocities and the guess of the impulses of one contact.
 
-    The spring of an open gap does not push yet: the gap only must not close further within the step.
+    The spring of an open gap does not push yet: the gap only must not close further within the step. That of a wire may
+    push what presses on it back as fast as it likes.
     """
     feature = contacts.feature[c]
     other = contacts.other[c]
@@ -93,7 +105,9 @@ def write_bias(
     if end_gap > wp.float64(0.0):
         rows_out.bias[3 * c] = end_gap / parameters.dt
     else:
-        rows_out.bias[3 * c] = wp.max(end_gap * stiffness / share, -parameters.max_separation_speed)
+        rows_out.bias[3 * c] = end_gap * stiffness / share
+        if contacts.wire_stiffness[c] == wp.float64(0.0):
+            rows_out.bias[3 * c] = wp.max(rows_out.bias[3 * c], -parameters.max_separation_speed)
     t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
     count = warm_start.count[0]
@@ -147,6 +161,8 @@ def write_rows(
         write_material_numbers(c, material, geoms.material[g], pairs, contacts_out)
         if geoms.friction[g] > wp.float64(0.0):
             contacts_out.friction[c] = geoms.friction[g]
+        if contacts_out.wire_stiffness[c] > wp.float64(0.0):
+            write_wire_numbers(c, parameters, contacts_out)
         last_dof = geoms.dof[g]
         arm = x - rigid.subtree_com[geoms.root[g]]
     else:
@@ -168,7 +184,8 @@ def write_rows(
         rows_out.velocity_free[row] = wp.dot(axis, velocity) - rigid_velocity
         rows_out.bias[row] = wp.float64(0.0)
         rows_out.impulse[row] = wp.float64(0.0)
-    write_bias(c, parameters, candidates.end_gap[tree_row, slot], contacts_out, warm_start, rows_out)
+    end_gap = candidates.end_gap[tree_row, slot] + contacts_out.wire_shift[c]
+    write_bias(c, parameters, end_gap, contacts_out, warm_start, rows_out)
 
 
 @wp.kernel

@@ -1,7 +1,8 @@
 """Narrowphase of plants and rigid geoms: where a tree's capsules touch them, or may touch them before the step ends.
 
 Two shapes that overlap while all plants rest as generated, or are that near, are in contact only from there on. What was
-cut off may overlap less by as much as it has moved since: what grew about a wire does not fall through it. A bunch
+cut off may overlap less by as much as it has moved since: what grew about a wire does not fall through it. A deflected wire
+is in contact with what it would press on where it was drawn. A bunch
 that overlaps a tree when it is picked passes through that tree until it is clear of it.
 """
 
@@ -229,7 +230,7 @@ def rigid_candidate(
             geoms.kind[g],
             geoms.size[g],
             pair.rotation,
-            geom_states.center[g],
+            geom_states.center[g] - geom_states.offset[g],
             to_double(capsules.rest_start[s]),
             to_double(capsules.rest_end[s]),
         )
@@ -242,7 +243,8 @@ def rigid_candidate(
         candidate.gap = candidate.gap + overlap
         free = velocity_at(bodies.q[body], bodies.qd_free[body], candidate.point)
         soonest = wp.min(wp.min(approach, dt * wp.dot(candidate.normal, free)), zero)
-        candidate.exists = candidate.gap + soonest < parameters.static_margin
+        deflected = wp.min(wp.dot(candidate.normal, geom_states.offset[g]), zero)
+        candidate.exists = candidate.gap + deflected + soonest < parameters.static_margin
     if candidate.exists:
         candidate = follow_contact(
             is_round, parameters, candidate, pair, nearest, t, approach, relative, velocity, bodies, capsule_states, geoms,

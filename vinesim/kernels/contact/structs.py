@@ -46,6 +46,8 @@ class Parameters:
     """[m/s]"""
     impact_speed: wp.float64
     """[m/s] A contact that closes faster is an impact."""
+    wire_damping_time: wp.float64
+    """[s] damping of a wire over its stiffness."""
 
 
 @wp.struct
@@ -236,6 +238,8 @@ class GeomStates:
     """[rad/s]"""
     speed: wp.array(dtype=wp.float64)
     """[m/s] likely bound of the speed of all its points in the step."""
+    offset: wp.array(dtype=wp.vec3d)
+    """[m] of a deflected wire: its centre, from where it was drawn."""
     low: wp.array(dtype=wp.vec3)
     """[m] box of the space that it can sweep in the step."""
     high: wp.array(dtype=wp.vec3)
@@ -355,6 +359,10 @@ class Contacts:
     """[N s/m]"""
     compliance: wp.array(dtype=wp.float64)
     """[m/(N s^2)] see :class:`MaterialPairs`."""
+    wire_stiffness: wp.array(dtype=wp.float64)
+    """[N/m] of the wire that is its other side; 0: of none, or one that does not give."""
+    wire_shift: wp.array(dtype=wp.float64)
+    """[m] gap to that wire without load, less that to its geom."""
     point: wp.array(dtype=wp.vec3d)
     axes: wp.array(dtype=wp.mat33d)
     """rows: normal, first and second tangent."""

@@ -73,6 +73,8 @@ def view_contacts(s: Contacts, tree: int, trees: int):
         view_double(s.stiffness, tree, trees),
         view_double(s.damping, tree, trees),
         view_double(s.compliance, tree, trees),
+        view_double(s.wire_stiffness, tree, trees),
+        view_double(s.wire_shift, tree, trees),
         view_vec3d(s.point, tree, trees),
         view_mat33d(s.axes, tree, trees),
         s.island,

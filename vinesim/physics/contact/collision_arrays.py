@@ -18,6 +18,7 @@ from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.berry_clusters import spans
+from vinesim.physics.plants.elastic_supports import WIRE_DAMPING_TIME
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.physics.rigid.static_world import FIRST_FIXED_GEOM
 from vinesim.scene.materials import pair_table
@@ -30,6 +31,7 @@ def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
     made.dt = p.dt
     made.margin, made.static_margin = p.contact_margin, p.static_contact_margin
     made.max_separation_speed, made.impact_speed = p.max_separation_speed, p.impact_speed
+    made.wire_damping_time = WIRE_DAMPING_TIME
     return made
 
 
@@ -150,6 +152,11 @@ class RigidArrays:
             structs.Actors, self.capacity, start=np.zeros(self.capacity + 1, np.int32), count=np.zeros(1, np.int32)
         )
         self.hulls = rigid.hulls
+        self._is_wire = rigid.model.fixed_tension > 0.0
+        self.wire_of_geom = np.full(self.capacity + 1, -1)
+        """[geom] the fixed piece, where that is a wire that gives; -1 for others, and at the end for other plants."""
+        self.geom_of_wire = np.full(len(self._is_wire), -1)
+        """[fixed piece] the geom of a wire that gives, -1 for others."""
         self._list(rigid, remote_actors)
         self.dof_names = rigid.dof_names
         velocity, correction, before = rigid.velocity_free, np.zeros(world.nv), np.zeros(world.nv)
@@ -201,6 +208,11 @@ class RigidArrays:
         is_remote[:count] = [name in remote_actors for name in actor]
         self.bunch_of_geom[:count] = [int(name[6:]) if name.startswith("bunch/") else -1 for name in actor]
         self.geoms.count[:] = movable, count
+        fixed = np.flatnonzero(self._is_wire) + FIRST_FIXED_GEOM
+        of_fixed = movable + np.searchsorted(rigid.static_geoms.id, fixed)
+        self.wire_of_geom[:] = self.geom_of_wire[:] = -1
+        self.wire_of_geom[of_fixed] = fixed - FIRST_FIXED_GEOM
+        self.geom_of_wire[fixed - FIRST_FIXED_GEOM] = of_fixed
         first = [i for i in range(movable) if i == 0 or actor[i] != actor[i - 1]]
         self.actor_count = self.actors.count[0] = len(first)
         self.actors.start[: len(first) + 1] = [*first, movable]

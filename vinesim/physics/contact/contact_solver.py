@@ -14,6 +14,7 @@ import numpy as np
 
 from vinesim.kernels.contact import structs
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters
+from vinesim.physics.contact.deflected_wires import DeflectedWires
 from vinesim.physics.contact.detection import ContactDetection
 from vinesim.physics.contact.impulse_solver import ImpulseSolver
 from vinesim.physics.contact.plant_capsules import nearest_body, plant_capsules
@@ -35,7 +36,10 @@ class ContactSolver:
     ``contact_capacity``, the deepest are kept, and ``dropped_contacts`` and ``overflow_message`` report it.
     """
 
-    def __init__(self, model: Model, plants: ArticulationSolver, rigid: RigidWorld) -> None:
+    def __init__(
+        self, model: Model, plants: ArticulationSolver, rigid: RigidWorld, wires: DeflectedWires | None = None
+    ) -> None:
+        """``wires``: those that give to what presses on them; without, none does."""
         self.model, self.plants, self.rigid, self.parameters = model, plants, rigid, rigid.parameters
         self.capsules = plant_capsules(model)
         self.plant_plant_contacts = True
@@ -64,7 +68,8 @@ class ContactSolver:
         self._arrays = PlantArrays(model, plants, self.capsules)
         self._rigid_arrays: RigidArrays | None = None
         self.detection = ContactDetection(plants, self._arrays, self.parameters, numbers)
-        self.impulses = ImpulseSolver(plants, rigid, self._arrays, self.parameters, numbers)
+        self.impulses = ImpulseSolver(plants, rigid, self._arrays, self.parameters, numbers, wires)
+        self._wires, self._deflected = wires, np.zeros(0, int)
         self._update_rigid_world()
         self.update_tree_bounds(np.arange(len(model.tree_first), dtype=np.int32))
 
@@ -80,6 +85,9 @@ class ContactSolver:
             self.update_tree_bounds(fallen_asleep)
         assert self._rigid_arrays is not None
         self._rigid_arrays.begin_step()
+        if self._wires is not None and (len(self._deflected) or len(self._wires.deflected)):
+            self.detection.move_wires(np.union1d(self._deflected, self._wires.deflected), self._wires)
+            self._deflected = self._wires.deflected
         self.near_trees = self.detection.find_near_trees()
         if len(self.near_trees) and not tree_awake[self.near_trees].all():
             self.plants.wake(self.near_trees)
@@ -147,6 +155,11 @@ class ContactSolver:
             if len(changed):
                 self.plants.use_backward_euler(impacted)
                 self.plants.predict(changed)
+
+    def report_wires(self) -> None:
+        """Tell the wires what plants pressed on them in the last step."""
+        if self.count:
+            self.impulses.report_wires()
 
     # ------------------------------------------------------------------ results
 

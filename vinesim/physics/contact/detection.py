@@ -25,6 +25,7 @@ from vinesim.kernels.contact import (
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
+from vinesim.physics.contact.deflected_wires import DeflectedWires
 from vinesim.physics.contact.warp_arrays import SharedArrays, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
@@ -125,9 +126,28 @@ class ContactDetection:
         self._mark_near_trees(len(self._blocks))
         return self._is_near.nonzero()[0]
 
+    def move_wires(self, pieces: np.ndarray, wires: DeflectedWires) -> None:
+        """Bring the geoms of wires [k] to where these are deflected to."""
+        if not self._static_bounded:
+            self._geom_aabbs(self.rigid_arrays.count)
+            self._bound_static_geoms()
+        arrays, states, boxes = self.rigid_arrays, self.rigid_arrays.geom_states, self._static_blocks
+        geoms = arrays.geom_of_wire[pieces]
+        ends = np.stack([wires.start[pieces], wires.end[pieces]], 1) + wires.offset[pieces]
+        states.offset[geoms] = wires.offset[pieces].mean(1)
+        states.center[geoms] = ends.mean(1)
+        # it may spring back within the step
+        states.speed[geoms] = np.linalg.norm(wires.offset[pieces], axis=2).max(1) / self.parameters.dt
+        grown = (arrays.geoms.size[geoms, 0] + self.parameters.contact_margin)[:, None]
+        states.low[geoms], states.high[geoms] = ends.min(1) - grown, ends.max(1) + grown
+        block = (geoms - arrays.movable) // AABB_BLOCK
+        np.minimum.at(boxes.low, block, states.low[geoms])
+        np.maximum.at(boxes.high, block, states.high[geoms])
+
     def _bound_static_geoms(self) -> None:
         """Boxes around blocks of static geoms; the ground reaches down without end."""
         first, states, boxes = self.rigid_arrays.movable, self.rigid_arrays.geom_states, self._static_blocks
+        states.offset[:] = 0.0  # move_wires() follows
         ground = np.flatnonzero(self.rigid_arrays.geoms.kind[first:] == 0) + first
         states.low[ground, 2] = -PLANE_HALF_SIZE
         for block in range(len(boxes.low)):
