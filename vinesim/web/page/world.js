@@ -275,13 +275,15 @@ export class World {
 
   /**
    * Choose what is drawn, and how finely, for the eye [3] in the world that sees what is within an angle `field` of the
-   * direction `ahead`. The list is good until the eyes have turned by `turn`; what they cannot see until then only casts
-   * shadows.
+   * direction `ahead`. The list is good until the eyes have turned by `turn` or see more or less at once; what they cannot
+   * see until then only casts shadows.
    */
   list(eye, ahead, { field, turn }) {
     this.eye.copy(eye);
-    if (this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE && this.listedAhead.angleTo(ahead) < turn) return;
+    const isNear = this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE && this.listedAhead.angleTo(ahead) < turn;
+    if (isNear && this.listedField === field) return;
     this.listedAt = eye.clone();
+    this.listedField = field;
     this.listedAhead = ahead.clone();
     for (;;) {
       for (const level of this.draws.flat()) level.clear();
