@@ -40,12 +40,16 @@ STATE_PERIOD = 0.01
 SIZES = {"phone": (390, 844, 2.0), "laptop": (1280, 720, 1.0), "desktop": (1920, 1080, 1.0)}
 """[px, px, px] and how many pixels one of them has on the screen, each way."""
 EYES = (2 * 2064, 2208)
-"""[px] Of both eyes of a Quest 3, as iwer emulates it; all of them are drawn, whatever scale the page asks for."""
+"""[px] Of both eyes of a Quest 3, as iwer emulates it; a headset with half of the rows and columns is measured, too."""
+FEWER_TRIANGLES = 150_000
+"""That a headset is asked to draw for each eye in one case, to tell the time of triangles from that of pixels."""
 BARS = {"phone": 30.0, "laptop": 60.0, "headset": 72.0}
 """Pictures a second that the page has to reach there [Hz]."""
 SECONDS = 5.0
 SETTLING = 10.0
 """[s] In which the page finds out how much it can draw."""
+UNCHANGED, PATIENCE = 75, 60.0
+"""A headset's scale has settled when so many pictures had the same; and [s] for which that is waited for."""
 GPU = (
     "--use-angle=vulkan", "--enable-features=Vulkan", "--disable-vulkan-surface", "--ignore-gpu-blocklist",
     "--enable-gpu", "--disable-frame-rate-limit", "--disable-gpu-vsync",
@@ -54,6 +58,20 @@ CARD = """(() => {
   const gl = vinesim.viewer.renderer.getContext(), names = gl.getExtension("WEBGL_debug_renderer_info");
   return gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
 })()"""
+VIEWPORT_SCALE = """(() => {
+  const asked = {}, { getViewport } = XRWebGLLayer.prototype;
+  device.givesScale = false;
+  XRView.prototype.requestViewportScale = function (scale) {
+    if (scale > 0 && scale <= 1) asked[this.eye] = scale;
+  };
+  XRWebGLLayer.prototype.getViewport = function (view) {
+    const { x, y, width, height } = getViewport.call(this, view), scale = device.givesScale ? asked[view.eye] ?? 1 : 1;
+    return { x, y, width: Math.floor(scale * width), height: Math.floor(scale * height) };
+  };
+})();"""
+"""Runs before the page: where ``device.givesScale`` is set, the emulated headset has views of as many rows and columns
+as the page asks for, from the next picture on (WebXR Device API, dynamic viewport scaling). iwer takes the request and
+ignores it."""
 WAIT_FOR_PIXELS = """(() => {
   const { viewer } = vinesim, gl = viewer.renderer.getContext(), pixel = new Uint8Array(4), took = viewer.took = [];
   viewer.draw = (frame) => {
@@ -157,7 +175,7 @@ class Recorded:
         """The vineyard."""
         return self._scene
 
-    def plants(self, _: Any) -> bytes:
+    def plants(self, place: Any) -> bytes:
         """Nothing else: the page's eyes stay where they are."""
         return self._scene
 
@@ -204,30 +222,93 @@ def play(
     path: pathlib.Path, graphics: tuple[str, ...], pictures: pathlib.Path | None, query: str
 ) -> Iterator[dict[str, Any]]:
     """Measure all sizes."""
-    import cv2
-
     world = Recorded(path)
     with browser.browser_page(graphics=graphics) as page, served(world) as address:
-        page.open(address + query, before=browser.emulated_headset())
-        _wait(page, "window.vinesim?.viewer !== undefined && vinesim.drawn > 20", 60.0)
-        if (view := VIEWS[world.name]) is not None:
-            page.look(*map(np.array, view))
+        _open(page, world, address + query)
         yield {"case": f"{world.name}: drawn by", "value": page.run(CARD), "unit": ""}
         for kind, (width, height, ratio) in SIZES.items():
             page.resize(width, height, ratio)
             page.run("vinesim.viewer.resize(), 0")
             yield from _measure(page, f"{world.name}, {kind}, {width}x{height}, {ratio:g}x", BARS.get(kind))
-            if pictures is not None:
-                cv2.imwrite(str(pictures / f"{world.name}-{kind}.jpg"), page.picture()[..., ::-1])
-        page.resize(*EYES)
-        page.run("vinesim.viewer.resize(), 0")
-        page.run("device.position.set(0, 1.6, 0), document.getElementById('enter').click()")
-        _wait(page, "vinesim.viewer.headset.isWorn")
-        yield from _measure(page, f"{world.name}, headset, {EYES[0]}x{EYES[1]}", BARS["headset"])
-        if pictures is not None:
-            cv2.imwrite(str(pictures / f"{world.name}-headset.jpg"), page.picture()[::2, ::2, ::-1])
-        for error in page.errors:
-            yield {"case": "error of the page", "value": error, "unit": ""}
+            _save(page, pictures, f"{world.name}-{kind}")
+        yield from _errors(page)
+        for eyes in (EYES, (EYES[0] // 2, EYES[1] // 2)):
+            yield from _headset(page, world, address + query, eyes, pictures)
+        _wear(page, world, f"{address}?triangles={FEWER_TRIANGLES}", EYES)
+        case = f"{world.name}, headset, {EYES[0]}x{EYES[1]}, all pixels, triangles={FEWER_TRIANGLES}"
+        yield from _measure(page, case, BARS["headset"])
+        yield from _errors(page)
+
+
+def _headset(
+    page: browser.Page, world: Recorded, address: str, eyes: tuple[int, int], pictures: pathlib.Path | None
+) -> Iterator[dict[str, Any]]:
+    """Measure a headset whose canvas has these pixels: all of them drawn, and as many as the page asks for; at last the
+    canvas alone, which the emulator copies and whose edges the browser smoothes."""
+    case = f"{world.name}, headset, {eyes[0]}x{eyes[1]}"
+    _wear(page, world, address, eyes)
+    yield from _measure(page, f"{case}, all pixels", BARS["headset"])
+    _save(page, pictures, f"{world.name}-headset-{eyes[0]}")
+    page.run("device.givesScale = true, 0")
+    _wait_for_scale(page)
+    yield {"case": f"{case}, scale asked for: scale", "value": page.run(SCALE), "unit": "1"}
+    yield {"case": f"{case}, scale asked for: pixels", "value": page.run(PIXELS), "unit": "1"}
+    yield from _measure(page, f"{case}, scale asked for", BARS["headset"])
+    yield {"case": f"{case}, scale asked for: scale at the end", "value": page.run(SCALE), "unit": "1"}
+    _save(page, pictures, f"{world.name}-headset-{eyes[0]}-scaled")
+    page.run("vinesim.viewer.scene.visible = false, vinesim.viewer.shadowAt = Infinity, 0")
+    yield from _measure(page, f"{case}, nothing drawn", None)
+    yield from _errors(page)
+
+
+SCALE = "vinesim.viewer.headset.scale.value"
+"""Share of rows and columns that a headset's page asks for."""
+PIXELS = """vinesim.viewer.renderer.xr.getCamera().cameras
+  .reduce((sum, { viewport }) => sum + viewport.z * viewport.w, 0)"""
+"""Of both eyes, as drawn last."""
+
+
+def _open(page: browser.Page, world: Recorded, address: str) -> None:
+    page.resize(1280, 720)
+    page.open(address, before=browser.emulated_headset() + VIEWPORT_SCALE)
+    _wait(page, "window.vinesim?.viewer !== undefined && vinesim.drawn > 20")
+    if (view := VIEWS[world.name]) is not None:
+        page.look(*map(np.array, view))
+
+
+def _wear(page: browser.Page, world: Recorded, address: str, eyes: tuple[int, int]) -> None:
+    """Enter a headset on a page that has not yet found out how much it can draw on a screen."""
+    _open(page, world, address)
+    page.resize(*eyes)
+    page.run("vinesim.viewer.resize(), 0")
+    page.run("device.position.set(0, 1.6, 0), document.getElementById('enter').click()")
+    _wait(page, "vinesim.viewer.headset.isWorn")
+
+
+def _wait_for_scale(page: browser.Page) -> None:
+    """Until a headset's page has asked for the same number of pixels for a while."""
+    ask, end = f"[{SCALE}, vinesim.frames]", time.monotonic() + PATIENCE
+    scale, since = page.run(ask)
+    while time.monotonic() < end:
+        time.sleep(0.2)
+        now, count = page.run(ask)
+        if now != scale:
+            scale, since = now, count
+        elif count - since >= UNCHANGED:
+            break
+
+
+def _save(page: browser.Page, folder: pathlib.Path | None, name: str) -> None:
+    import cv2
+
+    if folder is not None:
+        picture = page.picture()[..., ::-1]
+        cv2.imwrite(str(folder / f"{name}.jpg"), picture[::2, ::2] if picture.shape[1] > EYES[0] // 2 else picture)
+
+
+def _errors(page: browser.Page) -> Iterator[dict[str, Any]]:
+    for error in page.errors:
+        yield {"case": "error of the page", "value": error, "unit": ""}
 
 
 def _measure(page: browser.Page, case: str, bar: float | None) -> Iterator[dict[str, Any]]:

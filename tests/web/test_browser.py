@@ -625,6 +625,10 @@ def test_what_the_eyes_can_see_is_drawn_and_what_is_behind_them_only_casts_shado
         page.run(f"Object.assign(vinesim.viewer.eyes, {{ yaw: {yaw}, pitch: 0 }}), 0")
         is_drawn_anew(page)
         found = page.run(script)
+        is_drawn_anew(page)
+        page.run("window.listedBefore = vinesim.viewer.world.listedAt, 0")
+        page.resize(640, 240)
+        wait(lambda: page.run("vinesim.viewer.world.listedAt !== listedBefore"), "a wider picture has its own list")
     assert 0 < found["seen"] < share * found["all"]
     assert found["least"] >= found["bound"]
     assert found["lost"] == 0

@@ -8,7 +8,7 @@ from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
 from vinesim.client.page_world import ELSE_LOADED, LOADED, PageWorld
-from vinesim.client.spectator import FOLLOW_YAW, Spectator, standing_view
+from vinesim.client.spectator import Spectator, standing_view
 from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
@@ -290,18 +290,17 @@ def test_contacts_and_owners_are_told_to_pages_that_show_them():
         assert "owners" not in decode(world.state(-1)[1])[0]
 
 
-def test_the_page_of_a_robot_far_away_looks_over_its_shoulder_to_the_vines():
+def test_the_page_of_a_robot_far_away_shows_it_and_the_vines():
     with MemoryHub().bus("visitor") as bus:
         scene = load_scene("demo")
         model = generate(scene)
         start = frames.pose(np.array([-12.0, 3.0, 0.0]), frames.from_yaw(2.5))
         client = Client(scene, model, load_description("vinebot"), bus, name="visitor", pose=start)
         view = decode(PageWorld(client).scene())[1]["start"]
-    ahead = frames.rotate(view[3:], np.array([1.0, 0.0, 0.0]))[:2]
-    ways = model.tree_pose[:, :2] - view[:2]
-    angles = np.arccos(ways @ ahead / np.linalg.norm(ways, axis=1))
-    assert angles.min() < FOLLOW_YAW + 0.1
-    assert np.linalg.norm(view[:2] - start[:2]) < 3.0
+    local = frames.rotate(frames.conjugate(view[3:]), np.vstack([model.tree_pose[:, :3], start[:3]]) - view[:3])
+    angles = np.arctan2(local[:, 1], local[:, 0])
+    assert angles[:-1].min() < 0.0 < angles[:-1].max(), "vines on both sides of the middle"
+    assert abs(angles[-1]) < 0.6, "the robot is in the picture"
 
 
 def test_of_a_large_vineyard_a_page_loads_what_is_nearest(shown):

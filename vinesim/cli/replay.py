@@ -122,7 +122,7 @@ def make_page_replay(
     plan, model = _vineyard(tape, scene, seed)
 
     def make(begin: float, eyes: np.ndarray | None) -> tuple[Spectator, ReplayBus]:
-        return _spectator_in(tape, plan, model, _eyes(tape, pose) if eyes is None else eyes, begin, end)
+        return _spectator_in(tape, plan, model, _eyes(tape, model, pose) if eyes is None else eyes, begin, end)
 
     return PageReplay(make, tape.length if end is None else min(end, tape.length), start, speed)
 
@@ -186,7 +186,7 @@ def _spectator(
 ) -> tuple[Spectator, ReplayBus]:  # fmt: skip
     """A spectator of a recording that stands at a ``pose``, unless given behind the first robot; and its bus."""
     plan, model = _vineyard(tape, scene, seed)
-    return _spectator_in(tape, plan, model, _eyes(tape, pose), start, end)
+    return _spectator_in(tape, plan, model, _eyes(tape, model, pose), start, end)
 
 
 def _vineyard(tape: Recording, scene: str | None, seed: int | None) -> tuple[Scene, Model]:
@@ -212,11 +212,14 @@ def _vineyard(tape: Recording, scene: str | None, seed: int | None) -> tuple[Sce
     return plan, model
 
 
-def _eyes(tape: Recording, pose: tuple[float, float, float] | None) -> np.ndarray:
+def _eyes(tape: Recording, model: Model, pose: tuple[float, float, float] | None) -> np.ndarray:
     """Pose [7] of eyes that stand at a ``pose``, unless given behind the first robot."""
-    from vinesim.client.spectator import follow_view, standing_view
+    from vinesim.client.first_view import first_view
+    from vinesim.client.spectator import standing_view
 
-    return standing_view(*pose) if pose is not None else follow_view(_first_pose(tape))
+    if pose is not None:
+        return standing_view(*pose)
+    return first_view(_first_pose(tape), model, model.forward_kinematics(model.joint_settled)[:, :3])
 
 
 def _spectator_in(

@@ -7,12 +7,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.avatar.gestures import OPEN_HAND
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 from vinesim.client import page_overlays
 from vinesim.client.client import Client
-from vinesim.client.spectator import Spectator, follow_view
+from vinesim.client.first_view import first_view
+from vinesim.client.spectator import Spectator
 from vinesim.kernels.shading import materials
 from vinesim.physics.plants.sway import Sway
 from vinesim.physics.rigid.human_shapes import SIDES
@@ -32,8 +32,6 @@ from vinesim.web.page_server import PageServer
 
 GRASS = 25.0
 """Tufts a square metre: a browser draws fewer than the cameras."""
-NEAR = 3.0
-"""An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
 MAX_PRIMITIVES = 400_000
 """Of plants and ground that a page has at a time: 32 MB."""
 LOADED = {int(materials.STEM): 0.4, int(materials.GRASS): 0.5, int(materials.BERRY): 1.0}
@@ -318,7 +316,7 @@ class PageWorld:
             return client.humans[client.name].pose.head
         name = next(iter(client.robots), client.name)
         root = client.physics.rigid.base_state(name)[0] if client.robots else client.humans[name].pose.root
-        return follow_view(_towards_plants(np.asarray(root, float), client.model))
+        return first_view(np.asarray(root, float), client.model, self._at_rest[:, :3])
 
 
 def _light(height: float) -> dict[str, Any]:
@@ -331,16 +329,6 @@ def _light(height: float) -> dict[str, Any]:
 def _bytes(values: np.ndarray) -> np.ndarray:
     """Values from 0 to 1 in bytes."""
     return np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
-
-
-def _towards_plants(root: np.ndarray, model: Model) -> np.ndarray:
-    """A pose [7], turned to the nearest tree if that is far."""
-    ways = model.tree_pose[:, :2] - root[:2]
-    distances = np.linalg.norm(ways, axis=1)
-    if not len(distances) or distances.min() < NEAR:
-        return root
-    x, y = ways[np.argmin(distances)]
-    return frames.pose(root[:3], frames.from_yaw(np.arctan2(y, x)))
 
 
 def _differ_in_lights_only(before: tuple[RigidVisual, ...], now: tuple[RigidVisual, ...]) -> bool:

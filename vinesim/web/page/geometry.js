@@ -84,14 +84,32 @@ function cube() {
   return { points, faces };
 }
 
-/** By kind, in the order of its numbers (primitives.py); each from fine to coarse. */
+/** How far the flattest face of a mesh is inside the sphere of radius 1 that it stands for. */
+const insideBall = ({ points, faces }) => {
+  const at = (k) => points.slice(3 * k, 3 * k + 3), minus = (p, q) => p.map((x, axis) => x - q[axis]);
+  let least = 1;
+  for (let k = 0; k < faces.length; k += 3) {
+    const [a, b, c] = [0, 1, 2].map((corner) => at(faces[k + corner])), u = minus(b, a), v = minus(c, a);
+    const normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+    least = Math.min(least, Math.abs(normal.reduce((sum, x, axis) => sum + x * a[axis], 0)) / Math.hypot(...normal));
+  }
+  return 1 - least;
+};
+/** The same of a cylinder. */
+const insideTube = (sides) => 1 - Math.cos(Math.PI / sides);
+const BALLS = [sphere(3), sphere(2), sphere(1)], SIDES = [16, 10, 6];
+
+/**
+ * By kind, in the order of its numbers (primitives.py); each from fine to coarse. `inside`: of bodies that are round, how
+ * far each level is inside the true form, as a share of the radius.
+ */
 export const MESHES = [
   { name: "cone", levels: [tube(7, true, false), tube(4, false, false), tube(3, false, false)] },
   { name: "spheroid", levels: [sphere(2), sphere(1), sphere(0), tetrahedron()] },
   { name: "leaf", levels: [blade(2, 4), blade(1, 2), blade(1, 1), blade(0.5, 1)] },
   { name: "box", levels: [cube()] },
-  { name: "ellipsoid", levels: [sphere(3)] },
-  { name: "cylinder", levels: [tube(16, true, true)] },
+  { name: "ellipsoid", levels: BALLS, inside: BALLS.map(insideBall) },
+  { name: "cylinder", levels: SIDES.map((sides) => tube(sides, true, true)), inside: SIDES.map(insideTube) },
   { name: "triangle", levels: [{ points: [0, 0, 0, 1, 0, 0, 2, 0, 0], faces: [0, 1, 2] }] },
 ];
 

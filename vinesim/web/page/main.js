@@ -22,8 +22,9 @@ const SILENCE = 3; // s
 const SHADOW_PERIOD = 250, SHADOW_PICTURES = 4; // what the sun sees is drawn anew after so many ms, and so many pictures
 const LONGEST = 0.1; // s: what moves by keys moves no further in one picture
 const FINGER = 22; // px: a tap so far beside a thing means it
-/** rad: eyes that have turned so far need another list of plants; in a headset, half of what the eyes see, corner to corner. */
-const TURN = 0.35, IN_HEADSET = { field: 1.2, turn: 0.7 };
+/** rad: eyes that have turned so far need another list of plants; in a headset, half of what the eyes see, corner to corner,
+ * and a pixel of the finest ones. */
+const TURN = 0.35, IN_HEADSET = { field: 1.2, turn: 0.7, pixel: 7e-4 };
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
 /** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on: so many
@@ -250,7 +251,7 @@ class Viewer {
     const eye = new THREE.Vector3(...pose.slice(0, 3));
     page.voice.listen(pose);
     if (this.world.isLeft(eye)) this.loadPlants(eye);
-    this.world.list(eye, ahead(pose), this.headset.isWorn ? IN_HEADSET : { field: this.diagonal, turn: TURN });
+    this.world.list(eye, ahead(pose), this.headset.isWorn ? IN_HEADSET : { field: this.diagonal, turn: TURN, pixel: this.pixel });
     this.overlays.draw(actors, this.camera);
     if (this.isPerson) {
       this.person = this.track(pose, seconds);
@@ -357,6 +358,9 @@ class Viewer {
   get diagonal() {
     return Math.atan(Math.tan(this.camera.fov / 2 * Math.PI / 180) * Math.hypot(1, this.camera.aspect));
   }
+
+  /** Angle of a pixel in the middle of the picture [rad]. */
+  get pixel() { return 2 * Math.tan(this.camera.fov / 2 * Math.PI / 180) / this.renderer.domElement.height; }
 
   /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
   look(pose) {

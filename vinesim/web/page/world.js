@@ -3,7 +3,7 @@
 import * as THREE from "./vendor/three.module.js";
 import { Batches } from "./batches.js";
 import { boxAround, farthest, outermost } from "./extent.js";
-import { LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
+import { ELLIPSOID, LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
 import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
 
 const SHAPE_SHIFT = 10, SURFACE_SHIFT = 9, POSE_SHIFT = 9;
@@ -15,6 +15,10 @@ const COARSEST = 1000;
 const NEAR_COARSER = 1.5, MOST_SHORT = 5;
 /** Rigid bodies are drawn by these coarser levels once plants are coarser than asked for by so much. */
 const RIGID_COARSER = [3, 8];
+/** Round parts of rigid bodies are drawn so coarsely that this is wrong at most, in pixels. */
+const ROUNDNESS = 0.5;
+/** The list is made anew when a rigid body comes nearer, or goes, by this factor; not if it stays nearer than so many m. */
+const COMES_NEARER = 1.3, NEAR = 1.5;
 /** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
 const VANISHING = 2600;
 /** Of leaves and grass less: where some must be missing, bunches and posts are missed more. */
@@ -56,6 +60,7 @@ export class World {
     this.outermost = new Map(); // of rigid bodies: points, by carrier, in its frame
     this.bounds = new Map(); // boxes around them
     this.hidden = new Set(); // carriers whose rigid primitives are not drawn
+    this.listedAway = new Map(); // from the eye to carriers of round parts, as last listed [m]
     this.rigidVersion = 0;
     this.eye = new THREE.Vector3();
     this.coarser = 1;
@@ -171,6 +176,7 @@ export class World {
     this.write(arrays, this.plants);
     this.rigidClusters = clusters(arrays);
     this.names = header.names;
+    this.listedAway.clear();
     this.outermost = outermost(arrays);
     this.bounds = new Map([...this.outermost].map(([carrier, points]) => [carrier, boxAround(points)]));
     const own = partsBeforeEyes(this.header);
@@ -207,6 +213,10 @@ export class World {
   applyRigid({ rigid_place, rigid_turn, ...arrays }) {
     for (let k = 0; k < rigid_place.length / 3; ++k) this.pose(this.bodies + 1 + k, rigid_place, rigid_turn, k);
     this.poses.needsUpdate = true;
+    for (const [carrier, before] of this.listedAway) {
+      const now = this.away(carrier);
+      if (Math.max(now, before) > COMES_NEARER * Math.min(now, before)) this.listedAt = null;
+    }
     this.light(arrays);
   }
 
@@ -275,13 +285,16 @@ export class World {
 
   /**
    * Choose what is drawn, and how finely, for the eye [3] in the world that sees what is within an angle `field` of the
-   * direction `ahead`. The list is good until the eyes have turned by `turn`; what they cannot see until then only casts
-   * shadows.
+   * direction `ahead`, in pixels of an angle `pixel`. The list is good until the eyes have turned by `turn` or see more or less at once; what they cannot
+   * see until then only casts shadows.
    */
-  list(eye, ahead, { field, turn }) {
+  list(eye, ahead, { field, turn, pixel }) {
     this.eye.copy(eye);
-    if (this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE && this.listedAhead.angleTo(ahead) < turn) return;
+    const isNear = this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE && this.listedAhead.angleTo(ahead) < turn;
+    if (isNear && this.listedField === field && this.pixel === pixel) return;
     this.listedAt = eye.clone();
+    this.listedField = field;
+    this.pixel = pixel;
     this.listedAhead = ahead.clone();
     for (;;) {
       for (const level of this.draws.flat()) level.clear();
@@ -299,12 +312,25 @@ export class World {
   countTriangles() { return this.draws.flat().reduce((sum, level) => sum + level.triangles, 0); }
 
   chooseRigid() {
-    const { first, size, kind, carrier } = this.rigidClusters, coarser = RIGID_COARSER.filter((most) => this.coarser > most).length;
+    const { first, size, kind, carrier, widest } = this.rigidClusters, coarser = RIGID_COARSER.filter((most) => this.coarser > most).length;
     for (let k = 0; k < first.length; ++k) {
       if (this.hidden.has(carrier[k])) continue;
-      const levels = this.draws[kind[k]];
-      levels[Math.min(coarser, levels.length - 1)].seen.add(this.plants + first[k], size[k]);
+      const levels = this.draws[kind[k]], { inside } = MESHES[kind[k]];
+      let level = Math.min(coarser, levels.length - 1);
+      if (inside) {
+        this.listedAway.set(carrier[k], this.away(carrier[k]));
+        const seen = widest[k] * COMES_NEARER / this.listedAway.get(carrier[k]) / this.pixel;
+        level = Math.max(0, inside.filter((share) => share * seen < ROUNDNESS).length - 1);
+      }
+      levels[level].seen.add(this.plants + first[k], size[k]);
     }
+  }
+
+  /** From the eye to the surface of a rigid body at least [m]. */
+  away(carrier) {
+    const { min, max } = this.bounds.get(carrier), { x, y, z } = this.eye, data = this.poses.image.data, at = 8 * carrier;
+    const away = Math.hypot(data[at] - x, data[at + 1] - y, data[at + 2] - z);
+    return Math.max(away - Math.max(min.length(), max.length()), NEAR);
   }
 
   choosePlants(angle) {
@@ -388,15 +414,18 @@ function dataTexture(format, type, Kind, channels, texels, shift) {
   return texture;
 }
 
-/** Runs of primitives, with the mean thickness of their parts [m]. */
+/** Runs of primitives, with the mean thickness of their parts and the largest radius [m]. */
 function clusters(arrays) {
   const { first, size, kind, bunch, ball, shape } = arrays, count = first.length;
-  const thickness = new Float32Array(count);
+  const thickness = new Float32Array(count), widest = new Float32Array(count);
   for (let k = 0; k < count; ++k) {
     let sum = 0;
-    for (let i = 0; i < size[k]; ++i) sum += Math.abs(shape[16 * (first[k] + i) + 3]);
+    for (let at = 16 * first[k]; at < 16 * (first[k] + size[k]); at += 16) {
+      sum += Math.abs(shape[at + 3]);
+      widest[k] = Math.max(widest[k], shape[at + 3], kind[k] === ELLIPSOID ? Math.max(shape[at + 8], shape[at + 9]) : 0);
+    }
     thickness[k] = kind[k] === TRIANGLE ? 1 : Math.max(sum / size[k], 1e-4) * (kind[k] === LEAF ? 0.6 : kind[k] === SPHEROID ? 0.8 : 1);
   }
   const carrier = Array.from(first, (row) => arrays.carrier[row]);
-  return { first, size, kind, bunch, ball, thickness, carrier };
+  return { first, size, kind, bunch, ball, thickness, widest, carrier };
 }
