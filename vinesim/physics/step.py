@@ -70,8 +70,9 @@ class Physics:
         warn_of_raised_damping(model, p.dt, p.phi)
         self.rigid = RigidWorld(model, parameters=p)
         self.elastic_supports = ElasticSupports(self.plants, p)
-        self.wires = DeflectedWires(model, self.elastic_supports, p.dt)
-        self.rigid.let_wires_give(self.wires)
+        self.wires = DeflectedWires(model, self.elastic_supports, self.state.tree_awake, p.dt)
+        if self.wires.gives.any():
+            self.rigid.let_wires_give(self.wires)
         self.contact_solver = ContactSolver(model, self.plants, self.rigid, self.wires)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
@@ -164,7 +165,7 @@ class Physics:
 
     def _deflect_wires(self) -> None:
         self.contact_solver.report_wires()
-        self.wires.end_step(self.state.tree_awake, self.rigid.mj_data.tree_asleep)
+        self.wires.end_step(self.rigid.mj_data.tree_asleep)
 
     def _detach(self) -> None:
         self.detachments = self.detachment_monitor.update(check_load=self._detachment)

@@ -245,32 +245,23 @@ def in_series(a: wp.float64, b: wp.float64):
     return a * b / (a + b)
 
 
-@wp.kernel
-def find_wire_springs(
-    # model
+@wp.func
+def wire_spring(
+    piece: int,
+    x: wp.float64,
     least_share: wp.float64,
     wires: Wires,
     nodes: SupportNodes,
-    # in
-    pieces: wp.array(dtype=wp.int32),
-    along: wp.array(dtype=wp.float64),
     bodies: SupportedBodies,
     springs: SupportedSprings,
     loads: wp.array(dtype=wp.vec3d),
-    # out
-    stiffness_out: wp.array(dtype=wp.float64),
-    rest_out: wp.array(dtype=wp.vec3d),
-    deflection_out: wp.array(dtype=wp.vec3d),
 ):
-    """One thread finds the spring that a wire is at one point, across itself, while its shoots stay where they are.
+    """The spring that a wire is ``x`` [m] from its start, across itself, while its shoots stay where they are.
 
-    least_share: of the length, the least distance from a post. pieces, along: [thread] which wire, and where [m] from its
-    start. loads: [node] N. stiffness_out: [thread] N/m. rest_out: [thread] m, where the point is without loads, from
-    where it was drawn. deflection_out: [thread] m by which the loads on nodes move it from there.
+    Its stiffness [N/m]; where the point is without loads [m], from where it was drawn; and by how much the ``loads``
+    [node] N move it from there [m], but for those between its own two nodes. ``least_share``: of the length, the least
+    distance from a post or a node.
     """
-    thread = wp.tid()
-    piece = pieces[thread]
-    x = along[thread]
     tension = wires.tension[piece]
     length = wires.length[piece]
     least = least_share * length
@@ -286,7 +277,7 @@ def find_wire_springs(
     behind = wp.float64(0.0)  # stiffness of all up to a node, its tie included
     right_first = end
     for i in range(first, end):
-        if wires.node_along[i] <= x:
+        if wires.node_along[i] < x:
             between = nodes.stiffness[i]
             if i > first:
                 between = in_series(between, behind)
@@ -310,6 +301,7 @@ def find_wire_springs(
         right_rest = (pull + between * right_rest) / behind
         right_deflection = (loads[i] + between * right_deflection) / behind
         right = in_series(tension / wp.max(wires.node_along[i] - x, least), behind)
-    stiffness_out[thread] = left + right
-    rest_out[thread] = (left * left_rest + right * right_rest) / (left + right)
-    deflection_out[thread] = (left * left_deflection + right * right_deflection) / (left + right)
+    whole = left + right
+    rest = (left * left_rest + right * right_rest) / whole
+    deflection = (left * left_deflection + right * right_deflection) / whole
+    return whole, rest, deflection

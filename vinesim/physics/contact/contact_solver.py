@@ -87,7 +87,7 @@ class ContactSolver:
         self._rigid_arrays.begin_step()
         if self._wires is not None and (len(self._deflected) or len(self._wires.deflected)):
             self.detection.move_wires(np.union1d(self._deflected, self._wires.deflected), self._wires)
-            self._deflected = self._wires.deflected
+            self._deflected = self._wires.deflected.copy()
         self.near_trees = self.detection.find_near_trees()
         if len(self.near_trees) and not tree_awake[self.near_trees].all():
             self.plants.wake(self.near_trees)

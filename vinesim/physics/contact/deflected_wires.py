@@ -4,16 +4,26 @@ A wire has no mass here (see :mod:`vinesim.physics.plants.elastic_supports`). So
 of the wire's stiffness across itself, which both solvers treat as implicit, as they do any contact. The wire's geom
 follows what presses on it, so that normals and closest points are those of the deflected wire; the spring is measured
 from where the wire would be without that contact's force.
+
+Several contacts share a wire. Each ends at a spring as soft as the sum of the deflections there by all that press, over
+that by the contact itself (as of a string without ties); what the others in fact do follows from the forces of the last
+step. With springs as soft as that, these forces converge: the sums of the rows of a matrix of compliances, weighed by
+any positive numbers, bound its eigenvalues. The weights are means of forces over some time: what follows the forces
+themselves feeds swings.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
+import warp as wp
 
-from vinesim.physics.plants.elastic_supports import WIRE_DAMPING_TIME, ElasticSupports
+from vinesim.kernels.contact import wire_contacts as kernels
+from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.warp_arrays import SharedArrays, share
+from vinesim.physics.plants.elastic_supports import LEAST_SHARE, WIRE_DAMPING_TIME, ElasticSupports
 from vinesim.scene.model import Model
 
 MAX_DEFLECTION = 0.25
@@ -37,95 +47,112 @@ MOST_ALONG, OUT_OF_REACH = 0.5, 1e3
 SAME_PLACE = 0.05
 """[m] Contacts of the same pair of shapes that are further apart in two steps are different ones. TUNED: less than any
 box is long, more than anything slides in a step."""
-_NONE = np.zeros(0, int)
-
-
-@dataclasses.dataclass(frozen=True)
-class WireSprings:
-    """The springs at which contacts with wires end. [contact] unless said otherwise."""
-
-    piece: np.ndarray
-    """Fixed piece."""
-    along: np.ndarray
-    """[m] from its start."""
-    normal: np.ndarray
-    """[contact, 3] from the wire to what presses on it."""
-    gap: np.ndarray
-    """[m] to the geom of the wire."""
-    stiffness: np.ndarray
-    """[N/m] Of several that press on one wire, what is left for each."""
-    shift: np.ndarray
-    """[m] Gap to where the wire would be without the contact's force, less that to its geom."""
-    geom: np.ndarray
-    """[contact, 3] m, where the geom is there, from where it was drawn."""
-    place: np.ndarray
-    """[contact, 3] m, where the wire is there under the forces of the last step, from where it was drawn."""
-    last_force: np.ndarray
-    """[N] with which it pressed in the last step."""
-    weight: np.ndarray
-    """[N] the mean of that over :data:`MEMORY`."""
-    others: np.ndarray
-    """[m] along the normal, by which the others deflect the wire there; mean over the same time."""
-    key: np.ndarray
-    """Number of the pair of shapes."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Presses:
-    """What presses on wires. [press] unless said otherwise."""
-
-    piece: np.ndarray
-    along: np.ndarray
-    normal: np.ndarray
-    """[press, 3] from the wire."""
-    place: np.ndarray
-    """[press, 3] m, where the wire is there, from where it was drawn."""
-    pressure: np.ndarray
-    """[N] along the normal, as expected in the next step."""
-    weight: np.ndarray
-    """[N] mean of it over :data:`MEMORY`."""
-    others: np.ndarray
-    """[m] See :class:`WireSprings`."""
-    key: np.ndarray
-    owner: np.ndarray
-    """The tree that presses, or -1 less the kinematic tree of the rigid world."""
-
-    def where(self, mask: np.ndarray) -> _Presses:
-        """Some of them."""
-        return _Presses(**{field.name: getattr(self, field.name)[mask] for field in dataclasses.fields(self)})
-
-
-_NO_PRESSES = _Presses(
-    _NONE, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0), _NONE, _NONE
-)
+ROOM, MOST_PRESSES = 32, 512
+"""Contacts with wires in one solve for which there is room at first; and those of both solvers that count."""
+_NOBODY = np.iinfo(np.int32).min
+"""Owner of presses that do not outlive a step."""
 
 
 class DeflectedWires:
-    """The wires of one model."""
+    """The wires of one model, and what presses on them."""
 
-    def __init__(self, model: Model, supports: ElasticSupports, dt: float) -> None:
-        self._supports, self._dt = supports, dt
-        self._recovery, self._forgetting = math.exp(-dt / WIRE_DAMPING_TIME), dt / MEMORY
+    def __init__(self, model: Model, supports: ElasticSupports, tree_awake: np.ndarray, dt: float) -> None:
+        """``tree_awake``: [tree] what sleeps presses on as it did."""
+        self._supports = supports
         self.gives = model.fixed_tension > 0.0
         """[piece] Whether it is a wire under tension."""
         self.start, self.end = model.fixed_start.astype(float), model.fixed_end.astype(float)
-        way = self.end - self.start
-        self._length = np.linalg.norm(way, axis=1)
-        self._axis = way / np.maximum(self._length, 1e-9)[:, None]
-        self.offset = np.zeros((len(way), 2, 3))
+        way, count = self.end - self.start, len(self.start)
+        self.offset = np.zeros((count, 2, 3))
         """[piece, 2, 3] m by which the start and the end of its geom are away from where they were drawn."""
-        self.deflected = _NONE
-        """Pieces [k] whose offset is not 0, sorted."""
-        self._found: list[_Presses] = []
-        self._presses = _NO_PRESSES
+        axis = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
+        self._geoms = SharedArrays.zeros(
+            kernels.WireGeoms, count, start=self.start, axis=axis, offset=self.offset, count=np.zeros(2, np.int32)
+        )
+        self.presses, self._found = (
+            SharedArrays.zeros(kernels.WirePresses, MOST_PRESSES, count=np.zeros(1, np.int32)) for _ in range(2)
+        )
+        self._numbers, self._load = _numbers(dt), share(supports.load, wp.vec3d)
+        self._tree_awake = share(tree_awake, wp.bool)
+        self._is_loaded = share(np.zeros(supports.count, np.bool_), wp.bool)
+        self.forget_rigid(0)
 
-    # ------------------------------------------------------------------ within a step
+    @property
+    def deflected(self) -> np.ndarray:
+        """Pieces [k] whose offset is not 0; a view that the next step changes."""
+        return self._geoms.deflected[: self._geoms.count[0]]
+
+    def bind(self, contacts: SharedArrays) -> tuple[Callable[..., None], Callable[..., None]]:
+        """Functions that find the springs of ``contacts``, and that add what presses of them, for one thread each."""
+        wires, nodes, bodies, springs = self._supports.wire_structs
+        find = bind_launch(
+            kernels.find_wire_springs,
+            [self._numbers, wires, nodes, self._geoms.struct, bodies, springs, self._load, self.presses.struct],
+            [contacts.struct],
+        )
+        return find, bind_launch(kernels.add_presses, [self._numbers, contacts.struct], [self._found.struct])
+
+    def end_step(self, rigid_asleep: np.ndarray) -> None:
+        """Move the geoms after what presses on them, let go those that nothing presses on, and load the supports.
+
+        ``rigid_asleep``: [kinematic tree] not negative while it sleeps.
+        """
+        if not (self._found.count[0] or self.presses.count[0] or self._geoms.count[0]):
+            return
+        self._rigid_asleep[:] = rigid_asleep
+        self._deflect(1)
+        self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
+
+    def forget_rigid(self, trees: int) -> None:
+        """The rigid world was compiled anew: it has so many kinematic ``trees``, with other numbers, as its geoms."""
+        of_rigid = self.presses.owner < 0
+        self.presses.key[of_rigid], self.presses.owner[of_rigid] = 0, _NOBODY
+        self._rigid_asleep = np.full(trees, -1, np.int32)
+        self._deflect = bind_launch(
+            kernels.deflect_wires,
+            [self._numbers, *self._supports.wire_structs[:2], self._tree_awake, share(self._rigid_asleep, wp.int32)],
+            [self._found.struct, self.presses.struct, self._load, self._is_loaded, self._geoms.struct],
+        )
+
+
+class WireContacts:
+    """The contacts of one solver with wires, in its last solve."""
+
+    def __init__(self, wires: DeflectedWires) -> None:
+        self._wires = wires
+        self._make_room(ROOM)
+
+    def _make_room(self, room: int) -> None:
+        self._arrays = SharedArrays.zeros(kernels.WireContacts, room, count=np.zeros(1, np.int32))
+        self._find, self._add = self._wires.bind(self._arrays)
+
+    def __len__(self) -> int:
+        return int(self._arrays.count[0])
+
+    @property
+    def stiffness(self) -> np.ndarray:
+        """[contact] N/m of the springs; of several contacts that press on one wire, what is left for each."""
+        return self._arrays.stiffness[: len(self)]
+
+    @property
+    def shift(self) -> np.ndarray:
+        """[contact] m, gap to where the wire would be without the contact's force, less that to its geom."""
+        return self._arrays.shift[: len(self)]
+
+    @property
+    def key(self) -> np.ndarray:
+        """[contact] number of the pair of shapes."""
+        return self._arrays.key[: len(self)]
+
+    def clear(self) -> None:
+        """There are none."""
+        self._arrays.count[0] = 0
 
     def find_springs(
         self, piece: np.ndarray, point: np.ndarray, normal: np.ndarray, gap: np.ndarray, closing: np.ndarray,
-        key: np.ndarray,
-    ) -> WireSprings:  # fmt: skip
-        """The springs of contacts with wires.
+        key: np.ndarray, owner: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Find the springs of contacts with wires; poses of awake trees must be up to date.
 
         Args:
             piece: [k] which fixed pieces; all must give.
@@ -134,149 +161,34 @@ class DeflectedWires:
             gap: [k] m to the geom of the wire.
             closing: [k] m/s, how fast the gap would get smaller without the contacts.
             key: [k] number of the pair of shapes, the same in the next step.
+            owner: [k] the tree that presses, or -1 less the kinematic tree of the rigid world.
         """
-        length = self._length[piece]
-        along = np.clip(((point - self.start[piece]) * self._axis[piece]).sum(1), 0.0, length)
-        stiffness, rest, deflection = self._supports.wire_springs(piece, along)
-        share = along / np.maximum(length, 1e-9)
-        geom = (1.0 - share)[:, None] * self.offset[piece, 0] + share[:, None] * self.offset[piece, 1]
-        own = self._last_presses(key, along)
-        before = self._presses
-        force, weight, mean = (
-            np.where(own >= 0, np.append(values, 0.0)[own], 0.0)
-            for values in (before.pressure, before.weight, before.others)
-        )
-        is_new = (own < 0) & (gap - self._dt * closing < TOUCHING)
-        for k in np.flatnonzero(own < 0).tolist():  # taken to press as hard as any
-            weight[k] = before.weight[before.piece == piece[k]].max(initial=1e-9)
-        stiffness = stiffness / self._sharers(piece, share, normal, weight, own, is_new)
-        now = (deflection * normal).sum(1) + force / stiffness  # by the others, and by the force shared with them
-        mean = np.where(own >= 0, mean + self._forgetting * (now - mean), now)
-        others = FOLLOWED * now + (1.0 - FOLLOWED) * mean
-        shift = ((geom - rest) * normal).sum(1) - others
-        shift[gap > TOUCHING] = 0.0  # another holds the wire off it
-        # with its axis inside a box, the nearest way out may be along it, where a wire does not push
-        shift[np.abs((normal * self._axis[piece]).sum(1)) > MOST_ALONG] = OUT_OF_REACH
-        return WireSprings(
-            piece, along, normal, gap, stiffness, shift, geom, rest + deflection, force, weight, mean, key
-        )
+        count = len(piece)
+        if count > len(self._arrays.piece):
+            self._make_room(2 * count)
+        a = self._arrays
+        a.piece[:count], a.point[:count], a.normal[:count] = piece, point, normal
+        a.gap[:count], a.closing[:count], a.key[:count], a.owner[:count] = gap, closing, key, owner
+        a.count[0] = count
+        self._find(1)
 
-    def _last_presses(self, key: np.ndarray, along: np.ndarray) -> np.ndarray:
-        """[k] which press of the last step each contact was: of those with its key the nearest; -1 if it is new."""
-        before = self._presses
-        if len(before.key) == 0:
-            return np.full(len(key), -1)
-        same = (key[:, None] == before.key) & (before.pressure > 0.0)
-        distance = np.where(same, np.abs(along[:, None] - before.along), np.inf)
-        return np.where(distance.min(1) < SAME_PLACE, distance.argmin(1), -1)
-
-    def _sharers(
-        self, piece: np.ndarray, share: np.ndarray, normal: np.ndarray, weight: np.ndarray, own: np.ndarray,
-        is_new: np.ndarray,
-    ) -> np.ndarray:  # fmt: skip
-        """By how much less stiff a wire is taken to be for each contact [k] than for it alone: the sum of its
-        deflections there by all that press, over that by the contact itself, as of a string without ties.
-
-        What the others in fact do follows from the forces of the last step. With springs as soft as that, these forces
-        converge: the sums of the rows of a matrix of compliances, weighed by any positive numbers, bound its
-        eigenvalues. The weights are means of forces over some time: what follows the forces themselves feeds swings.
-        """
-        before = self._presses
-        pieces, sides = np.append(before.piece, piece[is_new]), np.concatenate([before.normal, normal[is_new]])
-        there = before.along / np.maximum(self._length[before.piece], 1e-9)
-        x, y = share[:, None], np.append(there, share[is_new])
-        here = np.clip(x, 1e-3, 1.0 - 1e-3)
-        ratio = np.clip(np.where(y > x, (1.0 - y) / (1.0 - here), y / here), 0.0, 1.0)
-        weights = (piece[:, None] == pieces) * np.append(before.weight, weight[is_new])
-        least = LEAST_WEIGHT * np.maximum(weights.max(1, initial=0.0), weight)[:, None] + 1e-9
-        at = np.where(is_new, len(before.piece) + np.cumsum(is_new) - 1, own)
-        weights[at >= 0, at[at >= 0]] = 0.0
-        return 1.0 + (weights / np.maximum(weight[:, None], least) * ratio * np.abs(normal @ sides.T)).sum(1)
-
-    def add_presses(self, springs: WireSprings, force: np.ndarray, velocity: np.ndarray, owner: np.ndarray) -> None:
-        """Note what a solve has found.
+    def add_presses(self, force: np.ndarray, velocity: np.ndarray) -> None:
+        """Note what the solve has found.
 
         Args:
-            springs: of its contacts.
             force: [contact] N with which they press, 0 for those that are near only.
             velocity: [contact] m/s along the normal, of what presses, at the end of the step.
-            owner: [contact] the tree that presses, or -1 less the kinematic tree of the rigid world.
         """
-        moved = (springs.gap + self._dt * velocity)[:, None] * springs.normal
-        place = np.where((force > 0.0)[:, None], springs.geom + moved, springs.place)
-        pressure = np.where(force > 0.0, np.maximum(force + EXTRAPOLATED * (force - springs.last_force), 0.0), 0.0)
-        weight = springs.weight + self._forgetting * (force - springs.weight)
-        weight = np.where(springs.last_force > 0.0, weight, np.maximum(springs.weight, force))
-        weight[force <= 0.0] = 0.0
-        self._found.append(
-            _Presses(
-                springs.piece, springs.along, springs.normal, place, pressure, weight, springs.others, springs.key,
-                owner,
-            )
-        )  # fmt: skip
-
-    def end_step(self, tree_awake: np.ndarray, rigid_asleep: np.ndarray) -> None:
-        """Move the geoms after what presses on them, let go those that nothing presses on, and load the supports.
-
-        Args:
-            tree_awake: [tree] What sleeps presses on as it did.
-            rigid_asleep: [kinematic tree] not negative while it sleeps.
-        """
-        before = self._presses
-        if not self._found and len(before.piece) == 0 and len(self.deflected) == 0:
-            return
-        if len(before.piece):
-            of_tree, count = before.owner >= 0, len(rigid_asleep)
-            sleeps = np.zeros(len(of_tree), bool)
-            sleeps[of_tree] = ~tree_awake[before.owner[of_tree]]
-            number = -1 - before.owner[~of_tree]
-            sleeps[~of_tree] = (number < count) & (rigid_asleep[np.minimum(number, count - 1)] >= 0)
-            self._found.append(before.where(sleeps))
-        self._presses = now = _concatenate(self._found)
-        self._found = []
-        self._supports.set_loads(now.piece, now.along, -now.pressure[:, None] * now.normal)
-        self._place(now)
-
-    def forget_rigid(self) -> None:
-        """The rigid world was compiled anew: its kinematic trees have other numbers."""
-        self._presses = self._presses.where(self._presses.owner >= 0)
-
-    def _place(self, presses: _Presses) -> None:
-        held = np.unique(presses.piece)
-        let_go = np.setdiff1d(self.deflected, held, assume_unique=True)
-        self.offset[let_go] *= self._recovery
-        for piece in held.tolist():
-            of = presses.piece == piece
-            self.offset[piece] = _rod_through(
-                presses.along[of] / self._length[piece], presses.place[of], presses.pressure[of]
-            )
-        moved = np.concatenate([held, let_go]).astype(int)
-        size = np.linalg.norm(self.offset[moved], axis=2, keepdims=True)
-        self.offset[moved] *= np.minimum(1.0, MAX_DEFLECTION / np.maximum(size, 1e-12))
-        at_rest = size.max(axis=(1, 2)) < LEAST_DEFLECTION
-        self.offset[moved[at_rest]] = 0.0
-        self.deflected = np.sort(moved[~at_rest])
+        self._arrays.force[: len(self)], self._arrays.velocity[: len(self)] = force, velocity
+        self._add(1)
 
 
-def _rod_through(share: np.ndarray, place: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Displacements [2, 3] m of the ends of a rod that passes through points displaced to ``place`` [k, 3] m at a
-    ``share`` [k] of its length; if these are too near each other, that of their mean by ``weight`` [k]."""
-    if weight.any():
-        share, place, weight = share[weight > 0.0], place[weight > 0.0], weight[weight > 0.0]
-    else:
-        weight = np.ones(len(share))
-    first, last = int(np.argmin(share)), int(np.argmax(share))
-    spread = share[last] - share[first]
-    if spread < LEAST_SPREAD:
-        return np.broadcast_to((weight[:, None] * place).sum(0) / weight.sum(), (2, 3))
-    slope = (place[last] - place[first]) / spread
-    return place[first] + (np.array([[0.0], [1.0]]) - share[first]) * slope
-
-
-def _concatenate(parts: list[_Presses]) -> _Presses:
-    if not parts:
-        return _NO_PRESSES
-    if len(parts) == 1:
-        return parts[0]
-    names = [field.name for field in dataclasses.fields(_Presses)]
-    return _Presses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+def _numbers(dt: float) -> kernels.WireNumbers:
+    made = kernels.WireNumbers()
+    made.dt, made.followed, made.extrapolated = dt, FOLLOWED, EXTRAPOLATED
+    made.forgetting, made.recovery = dt / MEMORY, math.exp(-dt / WIRE_DAMPING_TIME)
+    made.least_weight, made.least_share = LEAST_WEIGHT, LEAST_SHARE
+    made.least_spread, made.least_deflection = LEAST_SPREAD, LEAST_DEFLECTION
+    made.max_deflection, made.touching, made.same_place = MAX_DEFLECTION, TOUCHING, SAME_PLACE
+    made.most_along, made.out_of_reach = MOST_ALONG, OUT_OF_REACH
+    return made

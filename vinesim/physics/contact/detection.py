@@ -137,7 +137,7 @@ class ContactDetection:
         states.offset[geoms] = wires.offset[pieces].mean(1)
         states.center[geoms] = ends.mean(1)
         # it may spring back within the step
-        states.speed[geoms] = np.linalg.norm(wires.offset[pieces], axis=2).max(1) / self.parameters.dt
+        states.speed[geoms] = np.sqrt((wires.offset[pieces] ** 2).sum(2).max(1)) / self.parameters.dt
         grown = (arrays.geoms.size[geoms, 0] + self.parameters.contact_margin)[:, None]
         states.low[geoms], states.high[geoms] = ends.min(1) - grown, ends.max(1) + grown
         block = (geoms - arrays.movable) // AABB_BLOCK

@@ -11,10 +11,11 @@ import math
 import numpy as np
 import warp as wp
 
+from vinesim import frames
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
-from vinesim.physics.contact.deflected_wires import DeflectedWires, WireSprings
+from vinesim.physics.contact.deflected_wires import DeflectedWires, WireContacts
 from vinesim.physics.contact.detection import ContactDetection
 from vinesim.physics.contact.row_response import RowResponse
 from vinesim.physics.contact.warp_arrays import SharedArrays, share
@@ -41,8 +42,7 @@ class ImpulseSolver:
         wires: DeflectedWires | None = None,
     ) -> None:
         """``wires``: those that give; without, none does."""
-        self._wires = wires
-        self._wire_springs: WireSprings | None = None
+        self._wires = None if wires is None or not wires.gives.any() else WireContacts(wires)
         self._at_wires = np.zeros(0, int)
         self.plants, self.rigid, self.arrays, self.parameters = plants, rigid, arrays, parameters
         self._kernel_parameters = kernel_parameters
@@ -144,7 +144,7 @@ class ImpulseSolver:
     def clear(self) -> None:
         """Forget the last solve, but for its warm start."""
         self.bodies, self.wrenches, self.rigid_force = self.bodies[:0], self.wrenches[:0], None
-        self._wire_springs = None
+        self._at_wires = self._at_wires[:0]
 
     def solve(self, count: int, counters: np.ndarray) -> None:
         """Find the impulses of the first ``count`` contacts, and what they do to either side."""
@@ -162,7 +162,7 @@ class ImpulseSolver:
         rigid_jacobian[:] = 0.0
         rigid_response[:] = 0.0
         if self._wires is not None:
-            self._end_at_wires(n)
+            self._end_at_wires(n, self._wires)
         self._write_contact_rows(n)
 
         self.response.compute(n)
@@ -184,34 +184,31 @@ class ImpulseSolver:
         self._accumulate_wrenches(1)
         self.wrenches = self._wrench[:touched].copy()
 
-    def _end_at_wires(self, count: int) -> None:
+    def _end_at_wires(self, count: int, wires: WireContacts) -> None:
         """Find the springs of the wires that are in contact."""
-        assert self._wires is not None
         contacts, candidates = self.contacts, self._detection.candidates
         piece = self.rigid_arrays.wire_of_geom[np.maximum(contacts.other[:count], -1)]
         at = self._at_wires = np.flatnonzero(piece >= 0)
         contacts.wire_stiffness[:count] = contacts.wire_shift[:count] = 0.0
-        self._wire_springs = None
-        if len(at):
-            row, slot = np.divmod(contacts.source[at], candidates.feature.shape[1])
-            body, point, normal = contacts.body[at], candidates.point[row, slot], candidates.normal[row, slot]
-            free, arm = self.plants.velocity_free[body], point - self.plants.state.body_q[body, :3]
-            closing = -((free[:, :3] + np.cross(free[:, 3:], arm)) * normal).sum(1)
-            springs = self._wire_springs = self._wires.find_springs(
-                piece[at], point, normal, candidates.gap[row, slot], closing,
-                contacts.feature[at].astype(np.int64) * len(self.rigid_arrays.geom_of_wire) + piece[at],
-            )  # fmt: skip
-            contacts.wire_stiffness[at], contacts.wire_shift[at] = springs.stiffness, springs.shift
+        if len(at) == 0:
+            return
+        row, slot = np.divmod(contacts.source[at], candidates.feature.shape[1])
+        body, point, normal = contacts.body[at], candidates.point[row, slot], candidates.normal[row, slot]
+        free, arm = self.plants.velocity_free[body], point - self.plants.state.body_q[body, :3]
+        closing = -((free[:, :3] + frames.cross(free[:, 3:], arm)) * normal).sum(1)
+        key = contacts.feature[at].astype(np.int64) * len(self.rigid_arrays.geom_of_wire) + piece[at]
+        wires.find_springs(
+            piece[at], point, normal, candidates.gap[row, slot], closing, key, self.plants.model.body_tree[body]
+        )
+        contacts.wire_stiffness[at], contacts.wire_shift[at] = wires.stiffness, wires.shift
 
     def report_wires(self) -> None:
         """Tell the wires what pressed on them in the last solve."""
-        if self._wires is None or self._wire_springs is None:
-            return
-        at, contacts, dt = self._at_wires, self.contacts, self.parameters.dt
-        force, bias = self.rows.impulse[3 * at] / dt, self.rows.bias[3 * at]
-        share = contacts.stiffness[at] * dt + contacts.damping[at]
-        owner = self.plants.model.body_tree[contacts.body[at]]
-        self._wires.add_presses(self._wire_springs, force, -(force / share + bias), owner)
+        wires, at, contacts, dt = self._wires, self._at_wires, self.contacts, self.parameters.dt
+        if wires is not None and len(at):
+            force = self.rows.impulse[3 * at] / dt
+            share = contacts.stiffness[at] * dt + contacts.damping[at]
+            wires.add_presses(force, -(force / share + self.rows.bias[3 * at]))
 
     def _set_rigid_force(self, row_count: int) -> None:
         rows = self.rows

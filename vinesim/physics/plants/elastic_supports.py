@@ -7,8 +7,6 @@ trees, their sleep and joint wrenches need not know of supports.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import warp as wp
 
@@ -32,24 +30,6 @@ WIRE_DAMPING_TIME = 0.01
 """[s] Damping of a wire over its stiffness where something presses on it. GUESSED: as ``tie_damping`` of the plants."""
 
 _NO_TREES = _NO_SUPPORTS = np.zeros(0, np.int32)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Loads:
-    """What presses on wires. [load] unless said otherwise."""
-
-    piece: np.ndarray
-    along: np.ndarray
-    """[m] from the start of the piece."""
-    force: np.ndarray
-    """[load, 3] N"""
-    interval: np.ndarray
-    """Number of the stretch between two nodes."""
-    nodes: np.ndarray
-    """[k] nodes on which there is a load."""
-
-
-_NO_LOADS = _Loads(_NO_TREES, np.zeros(0), np.zeros((0, 3)), _NO_TREES, _NO_TREES)
 
 
 class ElasticSupports:
@@ -80,7 +60,8 @@ class ElasticSupports:
         self._is_placed = np.zeros(trees, np.bool_)
         self._awake, self._placed, self._is_listed = _NO_TREES, _NO_TREES, False
         self._loaded = self._unloaded = _NO_SUPPORTS
-        self._load, self._loads = np.zeros((len(self._tree), 3)), _NO_LOADS
+        self.load = np.zeros((len(self._tree), 3))
+        """[node, 3] N on wires, but for ties."""
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
         stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
         self._bind({
@@ -91,26 +72,23 @@ class ElasticSupports:
         } | {name: nodes[name] for name in ("axis", "body", "point", "origin")}, self._wires(wires))  # fmt: skip
 
     def _wires(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The pieces of wire, for :func:`kernels.find_wire_springs`; ``nodes``: those of wires."""
+        """The pieces of wire, for :func:`kernels.wire_spring`; ``nodes``: those of wires."""
         model = self._plants.model
         tension = model.fixed_tension.astype(float)
         way = (model.fixed_end - model.fixed_start).astype(float)
         support = np.full(len(tension), -1, np.int32)
         support[nodes["support"]] = self._support[: len(nodes["support"])]
-        self._node_along = np.zeros(len(self._tree))
-        self._node_along[: len(nodes["support"])] = nodes["compliance"] * tension[nodes["support"]]
-        self._wire_support, self._wire_length = support, np.linalg.norm(way, axis=1)
-        self._node_start = np.searchsorted(nodes["support"], np.arange(len(tension)))
-        self._node_end = np.searchsorted(nodes["support"], np.arange(len(tension)), side="right")
+        along = np.zeros(len(self._tree))
+        along[: len(nodes["support"])] = nodes["compliance"] * tension[nodes["support"]]
         return {
-            "tension": tension, "length": self._wire_length, "support": support, "node_along": self._node_along,
+            "tension": tension, "length": np.linalg.norm(way, axis=1), "support": support, "node_along": along,
         }  # fmt: skip
 
     def _bind(self, nodes: dict[str, np.ndarray], wires: dict[str, np.ndarray]) -> None:
         plants, count = self._plants, len(self._tree)
         ties, rests, state = plants.ties, plants.root_rests, plants.state
         shape = {
-            "load": self._load, "deflection": self.deflection, "reference": np.zeros((count, 3)),
+            "load": self.load, "deflection": self.deflection, "reference": np.zeros((count, 3)),
             "ratio": np.zeros(count), "velocity": np.zeros((count, 3)), "share": np.zeros(count),
         }  # fmt: skip
         bodies = {
@@ -132,82 +110,13 @@ class ElasticSupports:
             [SharedArrays(kernels.SupportState, **shape).struct, spring_struct, share(self._is_moved, wp.bool),
              share(self._moved_count, wp.int32)],
         )  # fmt: skip
-        self._wire_structs = [wp.float64(LEAST_SHARE), SharedArrays(kernels.Wires, **wires).struct, node_struct]
-        self._held_by = [body_struct, spring_struct]
-        self._bind_wire_springs(16)
+        self.wire_structs = SharedArrays(kernels.Wires, **wires).struct, node_struct, body_struct, spring_struct
+        """What :func:`kernels.wire_spring` asks for, but for the loads."""
 
-    def _bind_wire_springs(self, room: int) -> None:
-        """Make room for so many points of wires."""
-        self._piece, self._along = np.zeros(room, np.int32), np.zeros(room)
-        self._spring, self._spring_rest, self._spring_load = np.zeros(room), np.zeros((room, 3)), np.zeros((room, 3))
-        self._find_wire_springs = bind_launch(
-            kernels.find_wire_springs,
-            [*self._wire_structs, share(self._piece, wp.int32), share(self._along, wp.float64), *self._held_by,
-             share(self._load, wp.vec3d)],
-            [share(self._spring, wp.float64), share(self._spring_rest, wp.vec3d),
-             share(self._spring_load, wp.vec3d)],
-        )  # fmt: skip
-
-    def wire_springs(self, pieces: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The springs that wires are across themselves, while their shoots stay where they are.
-
-        Args:
-            pieces: [k] which wires, of all fixed pieces; their tension must not be 0.
-            along: [k] m from their starts.
-
-        Returns:
-            Stiffness [k] N/m; where the points are without loads [k, 3] m, from where they were drawn; and by how much
-            the loads deflect them [k, 3] m. Poses of awake trees must be up to date.
-        """
-        count = len(pieces)
-        if count > len(self._piece):
-            self._bind_wire_springs(2 * count)
-        self._piece[:count], self._along[:count] = pieces, along
-        self._find_wire_springs(count)
-        deflection = self._spring_load[:count].copy()
-        loads = self._loads
-        if len(loads.piece):
-            interval, low, high = self._interval(pieces, along)
-            together = interval[:, None] == loads.interval
-            if together.any():
-                # of a string between two nodes that do not move
-                first = np.clip(np.minimum(along[:, None], loads.along) - low[:, None], 0.0, None)
-                last = np.clip(high[:, None] - np.maximum(along[:, None], loads.along), 0.0, None)
-                tension = self._plants.model.fixed_tension[pieces].astype(float)
-                compliance = first * last / np.maximum(tension * (high - low), 1e-12)[:, None]
-                deflection += (together * compliance) @ loads.force
-        return self._spring[:count].copy(), self._spring_rest[:count].copy(), deflection
-
-    def _interval(self, pieces: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Between which two nodes, or posts, points of wires lie: a number [k], and where [k], [k] m that stretch of
-        wire begins and ends."""
-        node = self._node_start[pieces].copy()
-        for k in range(len(pieces)):
-            first, end = self._node_start[pieces[k]], self._node_end[pieces[k]]
-            node[k] = first + np.searchsorted(self._node_along[first:end], along[k])
-        padded = np.append(self._node_along, 0.0)
-        low = np.where(node > self._node_start[pieces], padded[node - 1], 0.0)
-        high = np.where(node < self._node_end[pieces], padded[node], self._wire_length[pieces])
-        return node + (len(self._tree) + 1) * pieces, low, high
-
-    def set_loads(self, pieces: np.ndarray, along: np.ndarray, force: np.ndarray) -> None:
-        """What presses on wires from now on: ``force`` [k, 3] N on ``pieces`` [k], ``along`` [k] m from their starts.
-
-        A load between two nodes acts on these as it does on the posts of a string: by the shares of the distance.
-        """
-        if len(pieces) == 0 and len(self._loads.piece) == 0:
-            return
-        self._load[self._loads.nodes] = 0.0
-        interval, low, high = self._interval(pieces, along)
-        node, share = interval - (len(self._tree) + 1) * pieces, (along - low) / np.maximum(high - low, 1e-9)
-        before, behind = node > self._node_start[pieces], node < self._node_end[pieces]
-        np.add.at(self._load, node[before] - 1, ((1.0 - share)[:, None] * force)[before])
-        np.add.at(self._load, node[behind], (share[:, None] * force)[behind])
-        self._unloaded = self._loaded
-        supports = self._wire_support[pieces]
-        self._loaded = np.unique(supports[supports >= 0]).astype(np.int32)
-        self._loads = _Loads(pieces, along, force, interval, np.concatenate([node[before] - 1, node[behind]]))
-        self._is_listed = False
+    def set_loaded(self, supports: np.ndarray) -> None:
+        """On which supports [k] there are loads from now on; :attr:`load` is theirs."""
+        if not np.array_equal(supports, self._loaded):
+            self._unloaded, self._loaded, self._is_listed = self._loaded, supports.copy(), False
 
     @property
     def active(self) -> np.ndarray:

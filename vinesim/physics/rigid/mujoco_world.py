@@ -29,7 +29,7 @@ from vinesim.physics.rigid.pair_friction import PairFriction
 from vinesim.physics.rigid.recompile import WorldNames
 from vinesim.physics.rigid.robot_body import RobotBody
 from vinesim.physics.rigid.speculative_contacts import SpeculativeContacts
-from vinesim.physics.rigid.wire_contacts import WireContacts
+from vinesim.physics.rigid.wire_contacts import SoftWires
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import RigidVisual
@@ -94,7 +94,7 @@ class WorldCore:
         self._link_sensors = LinkSensors()
         self._pair_friction = PairFriction(parameters)
         self._speculative_contacts = SpeculativeContacts()
-        self._wire_contacts: WireContacts | None = None
+        self._soft_wires: SoftWires | None = None
         _log_mujoco_warnings()
         self._recompile()
 
@@ -275,8 +275,8 @@ class WorldCore:
         self._link_sensors.find_indices(m, self._robots)
         self._pair_friction.find_materials(m)
         self._speculative_contacts.find_crates(m, self._boxes)
-        if self._wire_contacts is not None:
-            self._wire_contacts.use_world(m)
+        if self._soft_wires is not None:
+            self._soft_wires.use_world(m)
         for human in self._humans.values():
             for hand in human.hands:
                 self._restore_grasp(hand)

@@ -29,7 +29,7 @@ from vinesim.physics.rigid.rigid_world_humans import HumanAccess
 from vinesim.physics.rigid.rigid_world_robots import RobotAccess
 from vinesim.physics.rigid.robot_body import RobotBody, build_error
 from vinesim.physics.rigid.urdf import RobotError
-from vinesim.physics.rigid.wire_contacts import WireContacts
+from vinesim.physics.rigid.wire_contacts import SoftWires
 from vinesim.scene.model import Model
 from vinesim.scene.values import HumanSpec, RobotSpec
 
@@ -169,8 +169,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
 
     def let_wires_give(self, wires: DeflectedWires) -> None:
         """From now on what presses on a wire deflects it; before, wires are rigid."""
-        self._wire_contacts = WireContacts(wires)
-        self._wire_contacts.use_world(self.mj_model)
+        self._soft_wires = SoftWires(wires)
+        self._soft_wires.use_world(self.mj_model)
 
     # ------------------------------------------------------------------ the step, in two halves
 
@@ -183,16 +183,16 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         self._valid_qpos[:] = d.qpos
         self._set_passing(self._passing_bunches, True)
         has_margins = self._speculative_contacts.set_margins(m, d)
-        if self._wire_contacts is not None:
-            self._wire_contacts.place_geoms(m, d)
+        if self._soft_wires is not None:
+            self._soft_wires.place_geoms(m, d)
         # qfrc_applied is still that of the last step: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
         self._end_passing()
         self._pair_friction.apply(m, d)
         if has_margins:
             self._speculative_contacts.limit_closing(m, d)
-        if self._wire_contacts is not None:
-            self._wire_contacts.soften(m, d)
+        if self._soft_wires is not None:
+            self._soft_wires.soften(m, d)
         d.qfrc_applied[:] = 0.0
         # the whole forward pass after the velocity stage: single calls of its parts leave out dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
@@ -245,8 +245,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         if force is not None:
             np.add(force, 0.0, out=d.qfrc_applied)  # see predict_with()
         mujoco.mj_step2(m, d)
-        if self._wire_contacts is not None:
-            self._wire_contacts.report(d, self.dt)
+        if self._soft_wires is not None:
+            self._soft_wires.report(d, self.dt)
         self._link_sensors.measure(m, d)
         if self._is_faulty():
             self._stop_faulty_trees()

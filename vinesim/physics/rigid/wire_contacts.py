@@ -7,11 +7,13 @@ m b. Here m is that of the piece of wire, so that the force is that of the wire'
 
 from __future__ import annotations
 
+import math
+
 import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.deflected_wires import MAX_DEFLECTION, DeflectedWires, WireSprings
+from vinesim.physics.contact.deflected_wires import MAX_DEFLECTION, DeflectedWires, WireContacts
 from vinesim.physics.plants.elastic_supports import WIRE_DAMPING_TIME
 from vinesim.physics.rigid.static_world import FIRST_FIXED_GEOM
 
@@ -23,7 +25,7 @@ _LEAST_IMPEDANCE, _MOST_IMPEDANCE = 1e-4, 0.9999  # MuJoCo's mjMINIMP, mjMAXIMP
 _WIDTH, _MIDPOINT, _POWER = 1.0, 0.5, 2.0  # of an impedance that is the same at all depths
 
 
-class WireContacts:
+class SoftWires:
     """What a MuJoCo world needs so that wires give."""
 
     def __init__(self, wires: DeflectedWires) -> None:
@@ -31,8 +33,8 @@ class WireContacts:
         self._geoms = np.append(np.zeros(FIRST_FIXED_GEOM, bool), wires.gives)
         """[MuJoCo geom, up to the last fixed piece] whether it is a wire that gives."""
         self._numbers = np.flatnonzero(self._geoms)
-        self._springs: WireSprings | None = None
-        self._at = self._row = self._owner = np.zeros(0, int)
+        self._contacts = WireContacts(wires)
+        self._at = self._row = np.zeros(0, int)
         self._gap = self._damping_time = self._mobility = self._impedance = self._rate = np.zeros(0)
         self._measured: dict[int, float] = {}
         self._moved = np.zeros(0, int)
@@ -42,8 +44,8 @@ class WireContacts:
         self._margin = m.geom_margin[: len(self._geoms)].copy()
         self._body_margin, self._level = float(m.body_margin[0]), 0.0
         self._pos, self._quat = (values[: len(self._geoms)].copy() for values in (m.geom_pos, m.geom_quat))
-        self._springs, self._moved, self._measured = None, np.zeros(0, int), {}
-        self._wires.forget_rigid()
+        self._at, self._moved, self._measured = self._at[:0], np.zeros(0, int), {}
+        self._wires.forget_rigid(m.ntree)
         _widen_boxes(m, self._geoms)
 
     def place_geoms(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
@@ -55,7 +57,7 @@ class WireContacts:
             mujoco.mju_mulQuat(m.geom_quat[geom], _turn(way, way + offset[1] - offset[0]), self._quat[geom])
             m.geom_pos[geom] = d.geom_xpos[geom] = self._pos[geom] + 0.5 * (offset[0] + offset[1])
             mujoco.mju_quat2Mat(d.geom_xmat[geom], m.geom_quat[geom])
-        self._moved = wires.deflected
+        self._moved = wires.deflected.copy()
         self._set_margins(m, d)
 
     def _set_margins(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
@@ -65,8 +67,8 @@ class WireContacts:
         reach = m.opt.timestep * max(float(rates.max()), -float(rates.min()))
         level = next((level for level in MARGIN_LEVELS if reach <= level), MARGIN_LEVELS[-1])
         if len(self._wires.deflected):
-            size = np.linalg.norm(self._wires.offset[self._wires.deflected], axis=2).max()
-            level = max(level, float(size))
+            offset = self._wires.offset[self._wires.deflected]
+            level = max(level, math.sqrt((offset * offset).sum(2).max()))
         if level != self._level:
             self._level = level
             m.geom_margin[self._numbers] = np.maximum(self._margin[self._numbers], level)
@@ -74,31 +76,30 @@ class WireContacts:
 
     def soften(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
         """After the constraints are made: contacts with wires end at the wires' springs."""
-        self._springs = None
+        self._at = self._at[:0]
         if d.ncon == 0:
             return
         geom = d.contact.geom
-        is_wire = np.zeros(geom.shape, bool)
-        fixed = geom < len(self._geoms)
-        is_wire[fixed] = self._geoms[geom[fixed]]
+        is_wire = (geom < len(self._geoms)) & self._geoms[np.minimum(geom, len(self._geoms) - 1)]
         at = np.flatnonzero(is_wire.any(1) & (d.contact.efc_address >= 0))
         if len(at) == 0:
             return
         contact, first = d.contact, is_wire[at, 0]
         wire, other = np.where(first, *geom[at].T), np.where(first, *geom[at].T[::-1])
+        body, row = m.geom_bodyid[other], contact.efc_address[at]
         normal = np.where(first, 1.0, -1.0)[:, None] * contact.frame[at, :3]
         gap = contact.dist[at] - self._margin[wire]
         key = -1 - (wire * np.int64(m.ngeom) + other)
-        closing = -d.efc_vel[contact.efc_address[at]]
-        springs = self._wires.find_springs(wire - FIRST_FIXED_GEOM, contact.pos[at], normal, gap, closing, key)
-        self._at, self._row, self._gap = at, contact.efc_address[at], gap + springs.shift
+        self._contacts.find_springs(
+            wire - FIRST_FIXED_GEOM, contact.pos[at], normal, gap, -d.efc_vel[row], key, -1 - m.body_treeid[body]
+        )
+        self._at, self._row, self._gap = at, row, gap + self._contacts.shift
         self._damping_time = np.where(self._gap > 0.0, 0.0, WIRE_DAMPING_TIME)  # nor does it damp before it is touched
-        self._springs, self._owner = springs, -1 - m.body_treeid[m.geom_bodyid[other]]
         self._mobility = np.array([self._measured.get(k, 0.0) for k in key.tolist()])
         is_new = self._mobility == 0.0
-        self._mobility[is_new] = np.maximum(m.body_invweight0[m.geom_bodyid[other[is_new]], 0], 1e-9)
+        self._mobility[is_new] = np.maximum(m.body_invweight0[body[is_new], 0], 1e-9)
         self._write(d)
-        d.efc_margin[self._row] = d.efc_pos[self._row] - self._gap
+        d.efc_margin[row] = d.efc_pos[row] - self._gap
         if is_new.any():
             mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
             self._measure(d, m.opt.timestep)
@@ -106,11 +107,10 @@ class WireContacts:
 
     def _write(self, d: mujoco.MjData) -> None:
         """Write impedance and reference of the contacts."""
-        assert self._springs is not None
         share = self._mobility * WIRE_MASS
         self._impedance = impedance = np.clip(share / (1.0 + share), _LEAST_IMPEDANCE, _MOST_IMPEDANCE)
         mass = impedance / ((1.0 - impedance) * self._mobility)
-        self._rate = self._springs.stiffness / mass
+        self._rate = self._contacts.stiffness / mass
         d.contact.solimp[self._at, 0] = d.contact.solimp[self._at, 1] = impedance
         d.contact.solimp[self._at, 2:] = _WIDTH, _MIDPOINT, _POWER
         d.contact.solref[self._at, 0] = -impedance * self._rate
@@ -119,26 +119,24 @@ class WireContacts:
     def _measure(self, d: mujoco.MjData, dt: float) -> None:
         """Find by which effective masses MuJoCo has scaled the contacts: those of its implicit step, which it does not
         tell. They change little from step to step."""
-        assert self._springs is not None
         implicit = 1.0 + (self._damping_time + dt) * dt * self._rate
         self._mobility = d.efc_R[self._row] * implicit * self._impedance / (1.0 - self._impedance)
-        self._measured = dict(zip(self._springs.key.tolist(), self._mobility.tolist(), strict=True))
+        self._measured = dict(zip(self._contacts.key.tolist(), self._mobility.tolist(), strict=True))
 
     def report(self, d: mujoco.MjData, dt: float) -> None:
         """After the second half of a step: tell the wires what has pressed on them."""
-        if self._springs is None:
-            return
-        self._measure(d, dt)
-        force, stiffness = d.efc_force[self._row], self._springs.stiffness
-        # of the spring and damper: force = -stiffness (gap + dt v) - damping v
-        velocity = -(force + stiffness * self._gap) / (stiffness * (dt + self._damping_time))
-        self._wires.add_presses(self._springs, force, velocity, self._owner)
+        if len(self._at):
+            self._measure(d, dt)
+            force, stiffness = d.efc_force[self._row], self._contacts.stiffness
+            # of the spring and damper: force = -stiffness (gap + dt v) - damping v
+            velocity = -(force + stiffness * self._gap) / (stiffness * (dt + self._damping_time))
+            self._contacts.add_presses(force, velocity)
 
 
 def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """The shortest rotation [4], MuJoCo's order, from the direction of ``before`` [3] to that of ``after`` [3]."""
-    size = np.linalg.norm(before) * np.linalg.norm(after)
-    return frames.to_wxyz(frames.normalize(np.append(np.cross(before, after), size + before @ after)))
+    size = math.sqrt((before @ before) * (after @ after))
+    return frames.to_wxyz(frames.normalize(np.append(frames.cross(before, after), size + before @ after)))
 
 
 def _widen_boxes(m: mujoco.MjModel, is_wire: np.ndarray) -> None:
