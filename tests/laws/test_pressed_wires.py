@@ -199,6 +199,24 @@ def test_two_that_press_on_one_wire_feel_each_other() -> None:
         np.testing.assert_allclose(found, law @ [first, second], rtol=2e-3)
 
 
+def test_wires_bear_the_same_when_an_actor_joins_and_leaves() -> None:
+    """A robot that presses on a wire to which shoots are tied, to the bit: the world is compiled anew around it."""
+    found = []
+    for joins in (False, True):
+        physics = world(row_of_shoots(beyond=BEYOND))
+        press(physics, 1.0, 10.0)
+        heights = []
+        for step in range(150):
+            if joins and step == 60:
+                physics.add_robot(probe((0.0, 40.0, 3.0), "far"))
+            if joins and step == 100:
+                physics.remove_robot("far")
+            physics.step()
+            heights.append([rod(physics), force_on(physics, "probe"), *physics.wires.offset[0].ravel()])
+        found.append(heights)
+    np.testing.assert_array_equal(*found)
+
+
 @pytest.mark.parametrize("below", [0.0, 0.1])
 def test_a_cane_on_a_wire_and_a_robot_under_it(below: float) -> None:
     """A cut cane lies across a wire which a robot lifts with 12 N, ``below`` [m] from it: one solve has the cane, the

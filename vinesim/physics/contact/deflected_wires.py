@@ -49,7 +49,7 @@ SAME_PLACE = 0.05
 box is long, more than anything slides in a step."""
 ROOM, MOST_PRESSES = 32, 512
 """Contacts with wires in one solve for which there is room at first; and those of both solvers that count."""
-_NOBODY = np.iinfo(np.int32).min
+NOBODY = int(np.iinfo(np.int32).min)
 """Owner of presses that do not outlive a step."""
 
 
@@ -75,7 +75,7 @@ class DeflectedWires:
         self._numbers, self._load = _numbers(dt), share(supports.load, wp.vec3d)
         self._tree_awake = share(tree_awake, wp.bool)
         self._is_loaded = share(np.zeros(supports.count, np.bool_), wp.bool)
-        self.forget_rigid(0)
+        self.renumber_rigid(lambda _: (0, NOBODY), 0)
 
     @property
     def deflected(self) -> np.ndarray:
@@ -103,10 +103,12 @@ class DeflectedWires:
         self._deflect(1)
         self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
 
-    def forget_rigid(self, trees: int) -> None:
-        """The rigid world was compiled anew: it has so many kinematic ``trees``, with other numbers, as its geoms."""
-        of_rigid = self.presses.owner < 0
-        self.presses.key[of_rigid], self.presses.owner[of_rigid] = 0, _NOBODY
+    def renumber_rigid(self, numbers: Callable[[int], tuple[int, int]], trees: int) -> None:
+        """The rigid world was compiled anew: it has so many kinematic ``trees``. ``numbers``: of a key of rigid bodies
+        the new key, and the new owner; :data:`NOBODY` if the shape is gone."""
+        presses = self.presses
+        for k in np.flatnonzero(presses.owner[: presses.count[0]] < 0).tolist():
+            presses.key[k], presses.owner[k] = numbers(int(presses.key[k]))
         self._rigid_asleep = np.full(trees, -1, np.int32)
         self._deflect = bind_launch(
             kernels.deflect_wires,

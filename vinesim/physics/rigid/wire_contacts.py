@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.deflected_wires import MAX_DEFLECTION, DeflectedWires, WireContacts
+from vinesim.physics.contact.deflected_wires import MAX_DEFLECTION, NOBODY, DeflectedWires, WireContacts
 from vinesim.physics.plants.elastic_supports import WIRE_DAMPING_TIME
 from vinesim.physics.rigid.static_world import FIRST_FIXED_GEOM
 
@@ -38,15 +38,32 @@ class SoftWires:
         self._gap = self._damping_time = self._mobility = self._impedance = self._rate = np.zeros(0)
         self._measured: dict[int, float] = {}
         self._moved = np.zeros(0, int)
+        self._world: mujoco.MjModel | None = None
 
     def use_world(self, m: mujoco.MjModel) -> None:
         """Take over a world that was compiled anew, in which all wires are straight."""
         self._margin = m.geom_margin[: len(self._geoms)].copy()
         self._body_margin, self._level = float(m.body_margin[0]), 0.0
         self._pos, self._quat = (values[: len(self._geoms)].copy() for values in (m.geom_pos, m.geom_quat))
-        self._at, self._moved, self._measured = self._at[:0], np.zeros(0, int), {}
-        self._wires.forget_rigid(m.ntree)
+        self._at, self._moved = self._at[:0], np.zeros(0, int)
+        before, self._world = self._world, m
+        self._wires.renumber_rigid(lambda key: self._renumber(key, before), m.ntree)
+        measured = [(self._renumber(key, before), value) for key, value in self._measured.items()]
+        self._measured = {key: value for (key, owner), value in measured if owner != NOBODY}
         _widen_boxes(m, self._geoms)
+
+    def _renumber(self, key: int, before: mujoco.MjModel | None) -> tuple[int, int]:
+        """The key that a pair of a wire and a geom of the world ``before`` has in this one, and its owner."""
+        m = self._world
+        if before is None or m is None or key >= 0:
+            return 0, NOBODY
+        wire, other = divmod(-1 - key, before.ngeom)
+        body = before.geom_bodyid[other]
+        now = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, before.body(body).name)
+        if now < 0:
+            return 0, NOBODY
+        geom = m.body_geomadr[now] + other - before.body_geomadr[body]
+        return -1 - int(wire * m.ngeom + geom), -1 - int(m.body_treeid[now])
 
     def place_geoms(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
         """Before ``mj_step1``: put the geoms of wires where they are. MuJoCo computes static poses only once."""
