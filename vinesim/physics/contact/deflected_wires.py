@@ -146,10 +146,6 @@ class WireContacts:
         """[contact] number of the pair of shapes."""
         return self._arrays.key[: len(self)]
 
-    def clear(self) -> None:
-        """There are none."""
-        self._arrays.count[0] = 0
-
     def find_springs(
         self, piece: np.ndarray, point: np.ndarray, normal: np.ndarray, gap: np.ndarray, closing: np.ndarray,
         key: np.ndarray, owner: np.ndarray,

@@ -6,6 +6,10 @@ const KEYS = { KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1],
 const REST = 0.15;
 /** Numbers of buttons of a gamepad with the standard mapping. */
 const LEFT_TRIGGER = 6, RIGHT_TRIGGER = 7;
+/** Angles beside the line straight behind what is followed, the best ones first [rad]; height of what is looked at [m]. */
+const SIDES = [0.6, -0.6, 0.4, -0.4, 0.2, -0.2], AIM = 1.1;
+/** One of them is kept until it has moved so far [m] or turned by twice the angle with this sine. */
+const FAR = 1, HALF_TURN = 0.25, NOTHING = { at: [NaN, NaN], turned: 0, side: SIDES[0] };
 const TURN = 1.8, NOD = 1.4; // rad/s of a stick that is pushed all the way
 
 export class FlyingEyes {
@@ -15,6 +19,7 @@ export class FlyingEyes {
     this.yaw = Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
     this.pitch = 0;
     this.speed = 1.5; // m/s
+    this.followed = NOTHING;
     this.held = new Set();
     this.fingers = new Map();
     addEventListener("keydown", (event) => { if (event.code in KEYS) this.held.add(event.code); });
@@ -75,12 +80,22 @@ export class FlyingEyes {
     return true;
   }
 
-  /** Look at a point from a distance, over the shoulder. */
-  follow(point, heading, distance = 3.2) {
-    const side = heading + 0.6;
-    const goal = [point[0] - distance * Math.cos(side), point[1] - distance * Math.sin(side), 1.6];
+  /**
+   * Look at a point from a distance, over the shoulder: from that side where the least is between, by `between(eye,
+   * point)`. It is chosen anew when the point has moved far, or turned.
+   */
+  follow(point, heading, between, distance = 3.2) {
+    const behind = (side) =>
+      [point[0] - distance * Math.cos(heading + side), point[1] - distance * Math.sin(heading + side), 1.6];
+    const { at, turned } = this.followed;
+    const way = Math.hypot(point[0] - at[0], point[1] - at[1]), turn = Math.abs(Math.sin((heading - turned) / 2));
+    if (!(way < FAR) || turn > HALF_TURN) {
+      const target = [point[0], point[1], AIM], counts = SIDES.map((angle) => between(behind(angle), target));
+      this.followed = { at: [...point], turned: heading, side: SIDES[counts.indexOf(Math.min(...counts))] };
+    }
+    const goal = behind(this.followed.side);
     for (let axis = 0; axis < 3; ++axis) this.place[axis] += 0.06 * (goal[axis] - this.place[axis]);
-    const ahead = [point[0] - this.place[0], point[1] - this.place[1], 1.1 - this.place[2]];
+    const ahead = [point[0] - this.place[0], point[1] - this.place[1], AIM - this.place[2]];
     this.yaw = Math.atan2(ahead[1], ahead[0]);
     this.pitch = Math.atan2(ahead[2], Math.hypot(ahead[0], ahead[1]));
   }

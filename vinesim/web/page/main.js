@@ -241,7 +241,8 @@ class Viewer {
     element("follow").setAttribute("aria-pressed", String(this.followed >= 0));
     if (this.followed >= 0 && this.followed < actors.length) {
       const { carrier } = actors[this.followed];
-      this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier));
+      this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier),
+        (eye, point) => this.world.countBetween(eye, point));
     }
     if (this.headset.isWorn) {
       this.headset.update(frame, seconds, passed);

@@ -17,6 +17,9 @@ const NEAR_COARSER = 1.5, MOST_SHORT = 5;
 const RIGID_COARSER = [3, 8];
 /** Round parts of rigid bodies are drawn so coarsely that this is wrong at most, in pixels. */
 const ROUNDNESS = 0.5;
+/** A cluster hides what is behind this share of its ball; at the end of a line of sight, where an actor works, plants
+ * must be. */
+const HALF_FULL = 0.5, MOST_BETWEEN = 0.8;
 /** The list is made anew when a rigid body comes nearer, or goes, by this factor; not if it stays nearer than so many m. */
 const COMES_NEARER = 1.3, NEAR = 1.5;
 /** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
@@ -324,6 +327,20 @@ export class World {
       }
       levels[level].seen.add(this.plants + first[k], size[k]);
     }
+  }
+
+  /** How many clusters of plants are on the line from an eye [3] to a point [3] in the world, or around the eye. */
+  countBetween(eye, point) {
+    const { first, ball } = this.plantClusters, way = point.map((value, axis) => value - eye[axis]);
+    const square = way[0] ** 2 + way[1] ** 2 + way[2] ** 2;
+    let count = 0;
+    for (let k = 0; k < first.length; ++k) {
+      const x = ball[4 * k] - eye[0], y = ball[4 * k + 1] - eye[1], z = ball[4 * k + 2] - eye[2];
+      const along = Math.min(Math.max((x * way[0] + y * way[1] + z * way[2]) / square, 0), MOST_BETWEEN);
+      const away = Math.hypot(x - along * way[0], y - along * way[1], z - along * way[2]);
+      count += away < HALF_FULL * ball[4 * k + 3];
+    }
+    return count;
   }
 
   /** From the eye to the surface of a rigid body at least [m]. */
