@@ -148,6 +148,24 @@ def test_a_cut_cane_lies_on_wires_that_give(drop: float, tension: float) -> None
     assert -physics.wires.offset[:, 0, 2] == pytest.approx(given, abs=0.02 * given + half / 1.5e4)
 
 
+def test_a_cane_that_sleeps_on_wires_holds_them_down_until_it_is_put_elsewhere() -> None:
+    """Asleep, the wires stay where it pressed them to; when its owner tells that it rests in another pose, they are
+    straight again."""
+    places = [(0.2, 0.99), (0.8, 0.99)]
+    physics = Physics(assemble([cane((0.0, 0.0, 1.0))], fixed_tension=[TENSION] * 2, **wires(places)))
+    physics.cut(0)
+    while len(physics.plants.awake):
+        physics.step()
+    run(physics, 20)
+    held = physics.wires.offset.copy()
+    assert held[:, :, 2].max() < -1e-4
+    run(physics, 20)
+    np.testing.assert_array_equal(physics.wires.offset, held)
+    physics.apply_remote_rest([0], [physics.model.joint_settled])
+    run(physics, 100)
+    assert np.all(physics.wires.offset == 0.0)
+
+
 def test_what_presses_on_a_wire_moves_the_shoots_tied_to_it() -> None:
     """10 N between two of four shoots: all tips within 1 % of the dense solve of joints, ties and wire."""
     at, force = 1.0, 10.0

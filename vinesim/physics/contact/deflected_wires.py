@@ -103,6 +103,10 @@ class DeflectedWires:
         self._deflect(1)
         self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
 
+    def let_go(self, trees: np.ndarray) -> None:
+        """Trees [k] that slept were put somewhere else: they press on nothing until they wake."""
+        self.presses.owner[np.isin(self.presses.owner, trees)] = NOBODY
+
     def renumber_rigid(self, numbers: Callable[[int], tuple[int, int]], trees: int) -> None:
         """The rigid world was compiled anew: it has so many kinematic ``trees``. ``numbers``: of a key of rigid bodies
         the new key, and the new owner; :data:`NOBODY` if the shape is gone."""
