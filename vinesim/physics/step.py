@@ -71,9 +71,10 @@ class Physics:
         self.rigid = RigidWorld(model, parameters=p)
         self.elastic_supports = ElasticSupports(self.plants, p)
         self.wires = DeflectedWires(model, self.elastic_supports, self.state.tree_awake, p.dt)
-        if self.wires.gives.any():
-            self.rigid.let_wires_give(self.wires)
-        self.contact_solver = ContactSolver(model, self.plants, self.rigid, self.wires)
+        wires = self.wires if self.wires.gives.any() else None
+        if wires is not None:
+            self.rigid.let_wires_give(wires)
+        self.contact_solver = ContactSolver(model, self.plants, self.rigid, wires)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
         self.support_tracker = SupportTracker(self.rigid)

@@ -57,7 +57,7 @@ class WireContacts:
     count: wp.array(dtype=wp.int32)  # [1]
     piece: wp.array(dtype=wp.int32)
     key: wp.array(dtype=wp.int64)  # number of the pair of shapes
-    owner: wp.array(dtype=wp.int32)  # the tree that presses, or -1 less the kinematic tree of the rigid world
+    tree: wp.array(dtype=wp.int32)  # the tree that presses, or -1 less the kinematic tree of the rigid world
     point: wp.array(dtype=wp.vec3d)  # [m]
     normal: wp.array(dtype=wp.vec3d)  # from the wire to the other side
     gap: wp.array(dtype=wp.float64)  # [m] to the wire's geom
@@ -82,7 +82,7 @@ class WirePresses:
     count: wp.array(dtype=wp.int32)  # [1]
     piece: wp.array(dtype=wp.int32)
     key: wp.array(dtype=wp.int64)
-    owner: wp.array(dtype=wp.int32)
+    tree: wp.array(dtype=wp.int32)
     along: wp.array(dtype=wp.float64)  # [m]
     normal: wp.array(dtype=wp.vec3d)
     place: wp.array(dtype=wp.vec3d)  # [m] where the wire is, from where it was drawn
@@ -273,7 +273,7 @@ def add_presses(
                     weight = contacts.weight[i] + numbers.forgetting * (force - contacts.weight[i])
             found_out.piece[k] = contacts.piece[i]
             found_out.key[k] = contacts.key[i]
-            found_out.owner[k] = contacts.owner[i]
+            found_out.tree[k] = contacts.tree[i]
             found_out.along[k] = contacts.along[i]
             found_out.normal[k] = contacts.normal[i]
             found_out.place[k] = place
@@ -287,7 +287,7 @@ def copy_press(j: int, k: int, presses: WirePresses, presses_out: WirePresses):
     """Copy press ``j`` to place ``k`` of another list."""
     presses_out.piece[k] = presses.piece[j]
     presses_out.key[k] = presses.key[j]
-    presses_out.owner[k] = presses.owner[j]
+    presses_out.tree[k] = presses.tree[j]
     presses_out.along[k] = presses.along[j]
     presses_out.normal[k] = presses.normal[j]
     presses_out.place[k] = presses.place[j]
@@ -372,12 +372,12 @@ def deflect_wires(
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     for j in range(presses_out.count[0]):
-        owner = presses_out.owner[j]
+        tree = presses_out.tree[j]
         sleeps = bool(False)
-        if owner >= 0:
-            sleeps = not tree_awake[owner]
-        elif -1 - owner < rigid_asleep.shape[0]:
-            sleeps = rigid_asleep[-1 - owner] >= 0
+        if tree >= 0:
+            sleeps = not tree_awake[tree]
+        elif -1 - tree < rigid_asleep.shape[0]:
+            sleeps = rigid_asleep[-1 - tree] >= 0
         if sleeps and found_out.count[0] < found_out.piece.shape[0]:
             copy_press(j, found_out.count[0], presses_out, found_out)
             found_out.count[0] = found_out.count[0] + 1

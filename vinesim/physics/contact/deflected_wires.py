@@ -49,8 +49,8 @@ SAME_PLACE = 0.05
 box is long, more than anything slides in a step."""
 ROOM, MOST_PRESSES = 32, 512
 """Contacts with wires in one solve for which there is room at first; and those of both solvers that count."""
-NOBODY = int(np.iinfo(np.int32).min)
-"""Owner of presses that do not outlive a step."""
+NO_TREE = int(np.iinfo(np.int32).min)
+"""Tree of presses that do not outlive a step: whose shape is gone, or that was put elsewhere."""
 
 
 class DeflectedWires:
@@ -75,7 +75,7 @@ class DeflectedWires:
         self._numbers, self._load = _numbers(dt), share(supports.load, wp.vec3d)
         self._tree_awake = share(tree_awake, wp.bool)
         self._is_loaded = share(np.zeros(supports.count, np.bool_), wp.bool)
-        self.renumber_rigid(lambda _: (0, NOBODY), 0)
+        self.renumber_rigid(lambda _: (0, NO_TREE), 0)
 
     @property
     def deflected(self) -> np.ndarray:
@@ -105,14 +105,14 @@ class DeflectedWires:
 
     def let_go(self, trees: np.ndarray) -> None:
         """Trees [k] that slept were put somewhere else: they press on nothing until they wake."""
-        self.presses.owner[np.isin(self.presses.owner, trees)] = NOBODY
+        self.presses.tree[np.isin(self.presses.tree, trees)] = NO_TREE
 
     def renumber_rigid(self, numbers: Callable[[int], tuple[int, int]], trees: int) -> None:
         """The rigid world was compiled anew: it has so many kinematic ``trees``. ``numbers``: of a key of rigid bodies
-        the new key, and the new owner; :data:`NOBODY` if the shape is gone."""
+        the new key, and the new tree; :data:`NO_TREE` if the shape is gone."""
         presses = self.presses
-        for k in np.flatnonzero(presses.owner[: presses.count[0]] < 0).tolist():
-            presses.key[k], presses.owner[k] = numbers(int(presses.key[k]))
+        for k in np.flatnonzero(presses.tree[: presses.count[0]] < 0).tolist():
+            presses.key[k], presses.tree[k] = numbers(int(presses.key[k]))
         self._rigid_asleep = np.full(trees, -1, np.int32)
         self._deflect = bind_launch(
             kernels.deflect_wires,
@@ -152,7 +152,7 @@ class WireContacts:
 
     def find_springs(
         self, piece: np.ndarray, point: np.ndarray, normal: np.ndarray, gap: np.ndarray, closing: np.ndarray,
-        key: np.ndarray, owner: np.ndarray,
+        key: np.ndarray, tree: np.ndarray,
     ) -> None:  # fmt: skip
         """Find the springs of contacts with wires; poses of awake trees must be up to date.
 
@@ -163,14 +163,14 @@ class WireContacts:
             gap: [k] m to the geom of the wire.
             closing: [k] m/s, how fast the gap would get smaller without the contacts.
             key: [k] number of the pair of shapes, the same in the next step.
-            owner: [k] the tree that presses, or -1 less the kinematic tree of the rigid world.
+            tree: [k] the tree that presses, or -1 less the kinematic tree of the rigid world.
         """
         count = len(piece)
         if count > len(self._arrays.piece):
             self._make_room(2 * count)
         a = self._arrays
         a.piece[:count], a.point[:count], a.normal[:count] = piece, point, normal
-        a.gap[:count], a.closing[:count], a.key[:count], a.owner[:count] = gap, closing, key, owner
+        a.gap[:count], a.closing[:count], a.key[:count], a.tree[:count] = gap, closing, key, tree
         a.count[0] = count
         self._find(1)
 

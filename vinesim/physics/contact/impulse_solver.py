@@ -42,7 +42,7 @@ class ImpulseSolver:
         wires: DeflectedWires | None = None,
     ) -> None:
         """``wires``: those that give; without, none does."""
-        self._wires = None if wires is None or not wires.gives.any() else WireContacts(wires)
+        self._wires = None if wires is None else WireContacts(wires)
         self._at_wires = np.zeros(0, int)
         self.plants, self.rigid, self.arrays, self.parameters = plants, rigid, arrays, parameters
         self._kernel_parameters = kernel_parameters

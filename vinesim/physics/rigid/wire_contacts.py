@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from vinesim import frames
-from vinesim.physics.contact.deflected_wires import MAX_DEFLECTION, NOBODY, DeflectedWires, WireContacts
+from vinesim.physics.contact.deflected_wires import MAX_DEFLECTION, NO_TREE, DeflectedWires, WireContacts
 from vinesim.physics.plants.elastic_supports import WIRE_DAMPING_TIME
 from vinesim.physics.rigid.static_world import FIRST_FIXED_GEOM
 
@@ -49,19 +49,19 @@ class SoftWires:
         before, self._world = self._world, m
         self._wires.renumber_rigid(lambda key: self._renumber(key, before), m.ntree)
         measured = [(self._renumber(key, before), value) for key, value in self._measured.items()]
-        self._measured = {key: value for (key, owner), value in measured if owner != NOBODY}
+        self._measured = {key: value for (key, tree), value in measured if tree != NO_TREE}
         _widen_boxes(m, self._geoms)
 
     def _renumber(self, key: int, before: mujoco.MjModel | None) -> tuple[int, int]:
-        """The key that a pair of a wire and a geom of the world ``before`` has in this one, and its owner."""
+        """The key that a pair of a wire and a geom of the world ``before`` has in this one, and its tree."""
         m = self._world
         if before is None or m is None or key >= 0:
-            return 0, NOBODY
+            return 0, NO_TREE
         wire, other = divmod(-1 - key, before.ngeom)
         body = before.geom_bodyid[other]
         now = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, before.body(body).name)
         if now < 0:
-            return 0, NOBODY
+            return 0, NO_TREE
         geom = m.body_geomadr[now] + other - before.body_geomadr[body]
         return -1 - int(wire * m.ngeom + geom), -1 - int(m.body_treeid[now])
 
