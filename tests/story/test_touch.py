@@ -1,5 +1,7 @@
 """A touch from contact to the copy on another client, in one process over the bus in memory."""
 
+import concurrent.futures
+
 import numpy as np
 import pytest
 
@@ -21,7 +23,7 @@ COMPARED_TICK = 600
 class World:
     """Two clients on one bus, ticked in turn by one clock."""
 
-    def __init__(self, visitor_back=0.0):
+    def __init__(self, visitor_back=0.0, executor=None):
         self.now, self.compared = 100.0, None
         self.scene = load_scene("demo")
         self.model = generate(self.scene)
@@ -32,10 +34,9 @@ class World:
         self.body = int(self.model.bunch_body[self.bunch])
         self.tree = int(self.model.body_tree[self.body])
         places = {"picker": start, "visitor": spawn_pose(self.scene, 1, visitor_back)}
+        common = {"clock": lambda: self.now, "executor": executor}
         self.clients = {
-            name: Client(
-                self.scene, self.model, vinebot, self.hub.bus(name), name=name, pose=pose, clock=lambda: self.now
-            )
+            name: Client(self.scene, self.model, vinebot, self.hub.bus(name), name=name, pose=pose, **common)
             for name, pose in places.items()
         }
         self.picker, self.visitor = self.clients.values()
@@ -138,6 +139,21 @@ def test_no_environment_byte_is_sent_without_a_peer_nearby():
     assert world.picker.replicator.counters.environment.bytes_out == 0
     assert world.visitor.replicator.counters.environment.bytes_in == 0
     assert world.picker.replicator.counters.actor.bytes_out > 0
+
+
+class BusyExecutor(concurrent.futures.Executor):
+    """Of a machine so full that nothing is ever compiled."""
+
+    def submit(self, *_):
+        return concurrent.futures.Future()
+
+
+def test_a_peer_is_near_before_its_copy_is_compiled():
+    world = World(executor=BusyExecutor())
+    world.until(lambda: world.picker.replicator.counters.environment.bytes_out > 0)
+    assert not world.picker.remote_actors
+    assert world.picker.interest_audit.ticks_touching == 0
+    assert world.picker.interest_audit.bytes == 0
 
 
 def test_two_runs_are_bitwise_equal(world):

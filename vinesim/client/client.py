@@ -477,18 +477,13 @@ class InterestAudit:
         self._seen = 0
 
     def update(self, client: Client, touching: bool) -> None:
-        """Count one tick, by the positions of the remote actors' copies."""
-        sent = sum(replicator.counters.environment.bytes_out for replicator in client.replicators.values())
-        if not client.remote_actors:
-            self.bytes += sent - self._seen
-            self.ticks_touching += touching
-            self._seen = sent
-            return
-        rigid = client.physics.rigid
-        here = np.array([rigid.actor_position(name)[:2] for name in client.replicators])
-        there = np.array([rigid.actor_position(name)[:2] for name in client.remote_actors])
-        distance = float(np.linalg.norm(here[:, None] - there, axis=-1).min())
-        if distance > client.replicator.interest_radius + self.MARGIN:
+        """Count one tick, by where the remote actors say that they are: copies appear later, spectators have none."""
+        replicators = client.replicators.values()
+        sent = sum(replicator.counters.environment.bytes_out for replicator in replicators)
+        there = [position[:2] for replicator in replicators for position in replicator.peer_positions()]
+        here = [client.physics.rigid.actor_position(name)[:2] for name in client.replicators]
+        away = np.linalg.norm(np.reshape(here, (-1, 1, 2)) - np.reshape(there, (1, -1, 2)), axis=-1)
+        if away.min(initial=np.inf) > client.replicator.interest_radius + self.MARGIN:
             self.bytes += sent - self._seen
             self.ticks_touching += touching
         self._seen = sent

@@ -116,6 +116,10 @@ class Replicator:
         """The hello of each peer that is in this world now."""
         return {name: peer.hello for name, peer in self._state.peers.known.items()}
 
+    def peer_positions(self) -> list[np.ndarray]:
+        """Positions [3] m of the peers whose pose is known, spectators as well: who may receive states of objects."""
+        return list(self._state.peers.positions().values())
+
     @property
     def offset(self) -> float:
         """Network time minus the client's own time [s]."""
