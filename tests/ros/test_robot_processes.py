@@ -144,11 +144,12 @@ def test_pictures_and_clouds_come_and_killed_processes_come_back_and_diagnostics
     robot.run_until(lambda: all(len(messages) >= 2 for messages in received))
     diagnostics = robot.subscribe(DiagnosticArray, "/diagnostics")
 
-    def level_of_sensors() -> bytes | None:
-        found = [s.level for array in diagnostics for s in array.status if s.name.endswith(": sensors")]
+    def sensors() -> tuple[bytes, str] | None:
+        """Level and message of the newest status of the sensors."""
+        found = [(s.level, s.message) for array in diagnostics for s in array.status if s.name.endswith(": sensors")]
         return found[-1] if found else None
 
-    robot.run_until(lambda: pictures and joints and level_of_sensors() == DiagnosticStatus.OK)
+    robot.run_until(lambda: pictures and joints and sensors() == (DiagnosticStatus.OK, "well"))
     values = {"/robot": ("environment_rate", 4.0), "/robot_sensors": (f"{CAMERA}.jpeg_quality", 40)}
     for node, (name, value) in values.items():
         set_parameter(robot, node, name, value)
@@ -158,10 +159,15 @@ def test_pictures_and_clouds_come_and_killed_processes_come_back_and_diagnostics
     robot.run_until(commands.get_subscription_count)
     commands.publish(Float64MultiArray(data=[1.0, 2.0]))  # it has more joints
     robot.run_until(lambda: robot.status.current()["faults"].get("commands_refused") == 1)
-    os.kill(robot.processes.sensors.worker.current().process.pid, signal.SIGKILL)
-    robot.run_until(lambda: level_of_sensors() == DiagnosticStatus.ERROR)
+    worker = robot.processes.sensors.worker
+    robot.run_until(lambda: worker.standby_pid is not None)
+    standby = worker.standby_pid
+    os.kill(standby, signal.SIGSTOP)  # it takes over only later
+    os.kill(worker.current().process.pid, signal.SIGKILL)
+    robot.run_until(lambda: sensors()[0] == DiagnosticStatus.ERROR)
     assert not robot.status.current()["sensors_ready"]
-    robot.run_until(lambda: level_of_sensors() == DiagnosticStatus.OK)
+    os.kill(standby, signal.SIGCONT)
+    robot.run_until(lambda: sensors() == (DiagnosticStatus.WARN, "sensor process restarted"))
     seen = len(pictures)
     robot.run_until(lambda: len(pictures) > seen)
     assert robot.status.current()["sensor_restarts"] == 1

@@ -56,20 +56,31 @@ RECENT_TIME = 60.0
 """A fault is recent for this long after its last occurrence [s]."""
 
 
+class RecentCounts:
+    """Which of several counts rose lately."""
+
+    def __init__(self) -> None:
+        self.counts: dict[str, int] = {}
+        """The newest."""
+        self._risen: dict[str, float] = {}
+        """Time at which each was last seen to have risen [s]."""
+
+    def update(self, counts: Mapping[str, int], time: float) -> list[str]:
+        """Take the ``counts`` at ``time`` [s]; the names of those that rose within the last :data:`RECENT_TIME`."""
+        self._risen |= {name: time for name, count in counts.items() if count > self.counts.get(name, 0)}
+        self.counts = dict(counts)
+        return [name for name, risen in self._risen.items() if time - risen < RECENT_TIME]
+
+
 class FaultLog:
     """Logs the first fault of each kind, later ones are only counted; knows which kinds occurred lately."""
 
     def __init__(self) -> None:
-        self._counts: dict[str, int] = {}
-        self._risen: dict[str, float] = {}
-        """Time at which each count was last seen to have risen [s]."""
+        self._recent = RecentCounts()
 
     def update(self, counts: Mapping[str, int], time: float) -> list[str]:
         """Log what is new in ``counts`` at ``time`` [s]; the kinds that are recent. Call it outside the step."""
         for name, count in counts.items():
-            if name not in self._counts:
+            if name not in self._recent.counts:
                 log.warning("%d %s (further ones are only counted: %s)", count, DESCRIPTIONS[name], name)
-            if count > self._counts.get(name, 0):
-                self._risen[name] = time
-        self._counts = dict(counts)
-        return [name for name, risen in self._risen.items() if time - risen < RECENT_TIME]
+        return self._recent.update(counts, time)

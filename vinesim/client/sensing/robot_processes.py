@@ -6,9 +6,11 @@ import collections
 import contextlib
 import logging
 import pathlib
+from collections.abc import Sequence
 from typing import Any, Self
 
 from vinesim.client.client import Client
+from vinesim.client.faults import RecentCounts
 from vinesim.client.sensing.ros_process import RosProcess
 from vinesim.client.sensing.sensor_process import SensorProcess
 from vinesim.robot.description.description import RobotDescription
@@ -57,6 +59,7 @@ class RobotProcesses:
                 )  # fmt: skip
                 self.ros = stack.enter_context(process)
             self._stack = stack.pop_all()
+        self._restarts = RecentCounts()
 
     def attach(self, client: Client, robot: Robot | None = None) -> None:
         """Connect the processes with a robot of the client, its first unless given; waits until they are ready."""
@@ -110,15 +113,11 @@ class RobotProcesses:
         if self.ros is None:
             return
         report, awaited = self.report() | {"sound_lost": self.ros.sound_lost}, self.sensors.awaited()
+        restarts = {"sensor process": report["sensor_restarts"], "ROS node": report["ros_restarts"]}
+        restarted = self._restarts.update(restarts, status["time"])
         self.ros.publish_diagnostics(
             status["world_time"],
-            [
-                loop_status(status),
-                network_status(status),
-                ComponentStatus(
-                    "sensors", "error" if awaited else "ok", f"not ready: {awaited[0]}" if awaited else "well", report
-                ),
-            ],
+            [loop_status(status), network_status(status), sensors_status(awaited, restarted, report)],
         )
 
     def close_ros(self) -> None:
@@ -154,3 +153,12 @@ def network_status(status: dict[str, Any]) -> ComponentStatus:
     trouble = status["network"]
     values = {key: status[key] for key in _NETWORK_VALUES}
     return ComponentStatus("network", "warning" if trouble else "ok", trouble or "well", values)
+
+
+def sensors_status(awaited: Sequence[str], restarted: Sequence[str], report: dict[str, Any]) -> ComponentStatus:
+    """A robot's sensors for /diagnostics, with all that was counted: an error while any is ``awaited``; a warning after
+    a process was started again, for that can take less than the time between two messages."""
+    if awaited:
+        return ComponentStatus("sensors", "error", f"not ready: {awaited[0]}", report)
+    trouble = [f"{process} restarted" for process in restarted]
+    return ComponentStatus("sensors", "warning" if trouble else "ok", ", ".join(trouble) or "well", report)
