@@ -29,7 +29,8 @@ class SideRows:
 
 @wp.struct
 class ResponseScratch:
-    """Velocities of all bodies of the tree [side * stride + body of the tree]."""
+    """Velocities of all bodies of the tree [row * stride + body of the tree]; one row serves all sides in turn on a CPU,
+    where it stays in the cache, and each side has its own on a GPU."""
 
     a: wp.array(dtype=wp.mat33)
     alpha: wp.array(dtype=wp.mat33)
@@ -93,6 +94,7 @@ def respond_to_sides(
     # model
     model: ArticulationModel,
     stride: int,
+    scratch_rows: int,
     place: wp.array(dtype=wp.int32),
     # in
     touched: wp.array(dtype=wp.int32),
@@ -109,7 +111,8 @@ def respond_to_sides(
 
     touched: [slot] bodies in contact, sorted; those after the side's own follow by symmetry. place: [body] where kernels
     find it. tree_start: [slot] first slot of the same tree. body_slot, other_slot: [contact] of its sides, -1 for none.
-    jacobian: [row, 12] of both sides. stride: bodies of the largest tree.
+    jacobian: [row, 12] of both sides. stride: bodies of the largest tree; scratch_rows: rows of
+    ``scratch_out``.
     """
     side = wp.tid()
     c = side / 2
@@ -120,7 +123,7 @@ def respond_to_sides(
         return
     body = place[touched[slot]]
     first = model.tree_first[model.body_tree[body]]
-    shift = side * stride
+    shift = side % scratch_rows * stride
     force = row_columns(c, 6 * (side % 2), jacobian)
     moment = row_columns(c, 6 * (side % 2) + 3, jacobian)
     sides_out.force[side] = force

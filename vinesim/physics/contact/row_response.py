@@ -31,13 +31,15 @@ class RowResponse:
             data = buffers.pinned(zeros(matrix, (2 * contacts, *shape)))
             setattr(self.sides, name, share(data, matrix))
             setattr(there, name, buffers.reach(data, matrix, name))
+        scratch_rows = 1 if buffers.device.is_cpu else 2 * contacts
         for name in row_response.ResponseScratch.vars:
-            setattr(scratch, name, wp.empty(2 * contacts * size, dtype=matrix, device=buffers.device))
+            setattr(scratch, name, wp.empty(scratch_rows * size, dtype=matrix, device=buffers.device))
         lists = (self.body, self.tree_start, self.body_slot, self.other_slot)
         self._respond = plants.launches.record(
             row_response.respond_to_sides,
             plants.launches.fill(ArticulationModel),
             size,
+            scratch_rows,
             wp.array(buffers.slots, dtype=wp.int32, device=buffers.device),
             *(buffers.reach(data, wp.int32, "list of responses") for data in lists),
             buffers.reach(self.jacobian, wp.float64, "jacobian"),
