@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import gc
-import itertools
 import threading
 from collections.abc import Callable
 
@@ -14,6 +13,7 @@ from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.device_buffers import DeviceBuffers, DeviceUnavailable
 from vinesim.physics.plants.fault_guard import FaultGuard
+from vinesim.physics.plants.kernel_launches import TREES_PER_CHUNK
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
@@ -607,8 +607,8 @@ def filled_with_nan(make: Callable[..., wp.array]) -> Callable[..., wp.array]:
 def test_threads_and_device_buffers_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("empty", "empty_like"):  # whatever reads memory before it is written shall show
         monkeypatch.setattr(wp, name, filled_with_nan(getattr(wp, name)))
-    monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_GROUPS_PER_THREAD", 0)
-    monkeypatch.setattr("vinesim.physics.plants.step_runner.MIN_INTEGRATED_TREES_PER_THREAD", 0)
+    for work in TREES_PER_CHUNK:
+        monkeypatch.setitem(TREES_PER_CHUNK, work, 1)  # even of so few trees each thread takes some
     single_threaded, response = run_with_events()
     copies = [{"buffers": DeviceBuffers("cpu", interleave=lanes)} for lanes in (1, 3)]
     for options in ({"threads": 2}, {"threads": 3}, *copies):
@@ -635,18 +635,6 @@ def test_advance_equals_repeated_predict_and_integrate() -> None:
             step(plants, 30)
         runs.append((plants.tick, plants.state.joint_q.tobytes(), plants.velocity_free.tobytes()))
     assert runs[0] == runs[1]
-
-
-def test_partitions_have_similar_numbers_of_bodies() -> None:
-    model = trees_of_different_size(np.random.default_rng(3), 40)
-    plants = ArticulationSolver(model, State.at_rest(model), threads=3)
-    plants.wake(np.arange(1, 40))
-    plants.predict()
-    runner = plants._runner
-    places, trees = runner._starts[runner._group_ends], runner._list
-    assert (places[0], places[-1]) == (0, 39)
-    partition_sizes = [int(model.tree_size[trees[a:b]].sum()) for a, b in itertools.pairwise(places)]
-    assert max(partition_sizes) - min(partition_sizes) <= 8 * model.tree_size.max()
 
 
 def test_threads_end_with_their_solver() -> None:

@@ -6,7 +6,6 @@ The scene: canes of 16 bodies (1 m, 8 mm, 5 GPa, 800 kg/m^3), each with a bunch 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from threading import Thread
 
 import mujoco
 import numpy as np
@@ -41,9 +40,9 @@ def cane_scene(count: int) -> Model:
     return assemble([plain_cane(0.5 * i) for i in range(count)])
 
 
-def warmed_up_solver(model: Model, awake: int) -> ArticulationSolver:
+def warmed_up_solver(model: Model, awake: int, threads: int = 1) -> ArticulationSolver:
     """A solver with its first trees awake and every kernel loaded."""
-    plants = ArticulationSolver(model, State.at_rest(model))
+    plants = ArticulationSolver(model, State.at_rest(model), threads=threads)
     plants.wake(np.arange(awake))
     run_steps(plants, 5)
     return plants
@@ -60,25 +59,19 @@ def plant_measurements() -> Iterator[Measurement]:
     """64 canes awake, without contacts: on one thread, by its processor time, and on two, by the time that passes."""
     steps = 40
     model = cane_scene(CANE_COUNT)
-    whole = warmed_up_solver(model, CANE_COUNT)
-    halves = [warmed_up_solver(cane_scene(CANE_COUNT // 2), CANE_COUNT // 2) for _ in range(2)]
+    alone, shared = (warmed_up_solver(model, CANE_COUNT, threads) for threads in (1, 2))
     mujoco_model = compile_plants(model)
     data = mujoco.MjData(mujoco_model)
     for _ in range(5):
         mujoco.mj_step(mujoco_model, data)
 
-    def together() -> None:
-        threads = [Thread(target=run_steps, args=(half, steps)) for half in halves]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-
     def mujoco_steps() -> None:
         for _ in range(steps):
             mujoco.mj_step(mujoco_model, data)
 
-    times = 1e3 / steps * interleaved_times(lambda: run_steps(whole, steps), together, mujoco_steps)
+    times = (
+        1e3 / steps * interleaved_times(lambda: run_steps(alone, steps), lambda: run_steps(shared, steps), mujoco_steps)
+    )
     name = f"MuJoCo {mujoco.mj_versionString()} discrete"
     for i, threads in enumerate(("one thread, processor time", "two threads")):
         ours, reference = times[1 - i, [i, -1]].tolist()

@@ -6,9 +6,11 @@ interpreter lock away, so Python threads can run a kernel side by side on parts 
 """
 
 import ctypes
+import dataclasses
 import os
 import threading
 from collections.abc import Callable, Sequence
+from typing import Protocol, cast
 
 import warp as wp
 
@@ -16,6 +18,26 @@ MAX_THREADS = 4
 """A picture or a scan is not shared by more threads of a CPU than this: the gain is used up."""
 THREADS_PER_BLOCK = 32
 """CUDA threads a block. One thread is one tree and runs long: small blocks spread few trees over all multiprocessors."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PackedLaunch:
+    """A launch as native code makes it."""
+
+    head: tuple[int, int, int]
+    """Address of the kernel, address of the list, bytes of an entry."""
+    parts: tuple[tuple[int, int, int, int, int], ...]
+    """For each partition the addresses of its bounds, of their shape and their size, of its arguments, and of the
+    address of the list in these."""
+
+
+class BoundLaunch(Protocol):
+    """A kernel on its arrays: ``launch(threads, first, partition)``, see :func:`bind_launch`."""
+
+    packed: PackedLaunch | None
+    """None without a list, on CUDA, and where Warp is another."""
+
+    def __call__(self, threads: int, first: int = 0, partition: int = 0) -> None: ...
 
 
 def bind_launch(
@@ -27,7 +49,7 @@ def bind_launch(
     index_list: str = "",
     partitions: int = 1,
     block: int = THREADS_PER_BLOCK,
-) -> Callable[..., None]:
+) -> BoundLaunch:
     """A function that launches ``kernel`` with ``threads`` [first argument] threads on these arrays and structs.
 
     The arrays must stay where they are; the function keeps Warp's handles of them. With ``index_list``, the name of
@@ -43,15 +65,23 @@ def bind_launch(
     if not wp.get_device(device).is_cpu:
         return _recorded(commands, inputs, at)
     try:
-        calls = []
+        calls, parts = [], []
         for command in commands:
             bounds, values = command.params[0], command.params[1:]
             fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, values, strict=True)]
             packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
             listed = getattr(packed, index_list) if index_list else None
             calls.append((bounds, bounds.shape, listed, ctypes.byref(bounds), ctypes.byref(packed)))
+            if listed is not None:
+                at_bounds, fields_of = ctypes.addressof(bounds), type(bounds)
+                at_list = ctypes.addressof(listed) + type(listed).data.offset
+                parts.append((
+                    at_bounds, at_bounds + fields_of.shape.offset, at_bounds + fields_of.size.offset,
+                    ctypes.addressof(packed), at_list,
+                ))  # fmt: skip
         forward = commands[0].hooks.forward
         start, step = (listed.data, inputs[at].strides[0]) if index_list else (0, 0)
+        address = ctypes.cast(forward, ctypes.c_void_p).value or 0
     except (AttributeError, TypeError, ValueError):  # another Warp: its own way, at its own speed
         return _recorded(commands, inputs, at)
 
@@ -63,11 +93,24 @@ def bind_launch(
             shape[0] = bounds.size = threads
             forward(at_bounds, at_packed)
 
-    launch.keeps = (commands, inputs, outputs)  # type: ignore[attr-defined]
-    return launch
+    launch.keeps = (commands, inputs, outputs, calls)  # type: ignore[attr-defined]
+    launch.packed = PackedLaunch((address, start, step), tuple(parts)) if index_list else None  # type: ignore[attr-defined]
+    return cast(BoundLaunch, launch)
 
 
-def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> Callable[..., None]:
+def join_partitions(launches: Sequence[BoundLaunch]) -> BoundLaunch:
+    """One launch whose partition i is the only one of ``launches[i]``: of a kernel with memory for each thread."""
+
+    def launch(threads: int, first: int = 0, partition: int = 0) -> None:
+        launches[partition](threads, first)
+
+    packed = [one.packed for one in launches]
+    parts = tuple(one.parts[0] for one in packed if one is not None)
+    launch.packed = PackedLaunch(packed[0].head, parts) if packed[0] is not None else None  # type: ignore[attr-defined]
+    return cast(BoundLaunch, launch)
+
+
+def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> BoundLaunch:
     """Warp's own replay: what CUDA uses, and what can be captured into a graph."""
     starts = [0] * len(commands)
 
@@ -79,7 +122,8 @@ def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> Callable[...,
             commands[partition].set_dim(threads)
             commands[partition].launch()
 
-    return launch
+    launch.packed = None  # type: ignore[attr-defined]
+    return cast(BoundLaunch, launch)
 
 
 def usable_cores() -> int:

@@ -122,6 +122,7 @@ class Physics:
 
     def step(self) -> None:
         """Advance by ``dt``. Commands received before the call act in this step."""
+        self.plants.launch_pool.wake()  # while MuJoCo works
         for _, stage in self.stages:
             stage()
         self.tick += 1

@@ -65,6 +65,7 @@ def respond_rigidly(
     # model
     geoms: Geoms,
     # in
+    items: wp.array(dtype=wp.int32),
     rigid: RigidBodies,
     factors: RigidFactors,
     contacts: Contacts,
@@ -72,7 +73,7 @@ def respond_rigidly(
     rows_out: Rows,
 ):
     """One thread per row j: M^-1 j of one kinematic tree of MuJoCo. The response was zeroed before."""
-    row = wp.tid()
+    row = items[wp.tid()]
     other = contacts.other[row // 3]
     if other >= 0 and geoms.dof[other] >= 0:
         solve_rigid_row(row, geoms.dof[other], rigid, factors, rows_out.rigid_jacobian, rows_out.rigid_response)
@@ -110,6 +111,7 @@ def sides_entries(value: wp.mat33, side: int, source: int, contacts: Contacts, t
 @wp.kernel
 def assemble_delassus(
     # in
+    items: wp.array(dtype=wp.int32),
     contacts: Contacts,
     touched: TouchedBodies,
     islands: Islands,
@@ -118,7 +120,7 @@ def assemble_delassus(
     rows_out: Rows,
 ):
     """One thread per contact: the plants' entries of J M^-1 J^T of its three rows with all rows of its block."""
-    c = wp.tid()
+    c = items[wp.tid()]
     block = contacts.block[c]
     first = islands.block_start[block]
     last = islands.block_start[block + 1]

@@ -58,6 +58,7 @@ def store_warm_start(
     parameters: Parameters,
     geoms: Geoms,
     # in
+    items: wp.array(dtype=wp.int32),
     rigid: RigidBodies,
     islands: Islands,
     rows: Rows,
@@ -66,7 +67,7 @@ def store_warm_start(
     warm_start_out: WarmStart,
 ):
     """One thread per contact: its impulse as a force on the plant, and what the next step starts from."""
-    c = wp.tid()
+    c = items[wp.tid()]
     u = 3 * c + 1
     v = 3 * c + 2
     slip_u = velocity_along(rows.velocity_free[u], u, geoms, rigid, contacts_out, islands, rows)

@@ -196,6 +196,7 @@ def write_contact_rows(
     capsules: Capsules,
     geoms: Geoms,
     # in
+    items: wp.array(dtype=wp.int32),
     bodies: PlantBodies,
     rigid: RigidBodies,
     candidates: Candidates,
@@ -205,7 +206,7 @@ def write_contact_rows(
     rows_out: Rows,
 ):
     """One thread per contact: its three rows. The rigid Jacobian was zeroed before."""
-    c = wp.tid()
+    c = items[wp.tid()]
     slots = candidates.feature.shape[1]
     write_rows(
         c, contacts_out.source[c] // slots, contacts_out.source[c] % slots, parameters, pairs, capsules, geoms, bodies,

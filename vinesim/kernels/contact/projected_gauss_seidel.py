@@ -145,6 +145,7 @@ def solve_islands(
     tolerance: wp.float64,
     geoms: Geoms,
     # in
+    items: wp.array(dtype=wp.int32),
     rigid: RigidBodies,
     contacts: Contacts,
     # out
@@ -154,6 +155,6 @@ def solve_islands(
 ):
     """One thread per island: see :func:`solve_island`."""
     solve_island(
-        wp.tid(), max_sweeps, max_newton_steps, max_newton_contacts, tolerance, geoms, rigid, contacts, islands_out,
-        scratch_out, rows_out,
+        items[wp.tid()], max_sweeps, max_newton_steps, max_newton_contacts, tolerance, geoms, rigid, contacts,
+        islands_out, scratch_out, rows_out,
     )  # fmt: skip

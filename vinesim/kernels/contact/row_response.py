@@ -97,6 +97,7 @@ def respond_to_sides(
     scratch_rows: int,
     place: wp.array(dtype=wp.int32),
     # in
+    items: wp.array(dtype=wp.int32),
     touched: wp.array(dtype=wp.int32),
     tree_start: wp.array(dtype=wp.int32),
     body_slot: wp.array(dtype=wp.int32),
@@ -114,7 +115,7 @@ def respond_to_sides(
     jacobian: [row, 12] of both sides. stride: bodies of the largest tree; scratch_rows: rows of
     ``scratch_out``.
     """
-    side = wp.tid()
+    side = items[wp.tid()]
     c = side / 2
     slot = body_slot[c]
     if side % 2 == 1:

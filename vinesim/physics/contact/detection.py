@@ -8,9 +8,6 @@ each listing of the rigid world: a bound launch costs a fifth of a plain one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import numpy as np
 import warp as wp
 
@@ -22,7 +19,7 @@ from vinesim.kernels.contact import (
     structs,
     sweep_order,
 )
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
 from vinesim.physics.contact.deflected_wires import DeflectedWires
@@ -31,14 +28,12 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
 AABB_BLOCK = int(structs.AABB_BLOCK)
-MIN_TREES_PER_THREAD = 16
-"""With fewer awake trees for each thread, handing them over costs more than it saves. TUNED."""
+TREES_PER_CHUNK = {"boxes": 8, "rigid": 2, "plants": 4}
+"""Trees that a thread takes at a time: work of 3 to 8 us. DERIVED from the times of one tree of 17 bodies."""
 MAX_PASSING_BUNCHES = 4
 """Picked bunches that can pass through one tree at once; a further one touches it at once."""
 MIN_TREE_ROOM = 64
 """Rows of the candidates that are allocated at least; more when more trees are awake."""
-
-Launch = Callable[..., None]
 
 
 class ContactDetection:
@@ -54,7 +49,7 @@ class ContactDetection:
         self.plants, self.arrays, self.parameters = plants, arrays, parameters
         self._kernel_parameters = kernel_parameters
         trees = len(arrays.trees.is_fine)
-        self._order, self._partition = np.zeros(trees, np.int32), (0, 0)
+        self._order = np.arange(trees, dtype=np.int32)
         self._sorted_rows = np.zeros((2, trees), np.int32)
         self._is_near, self._is_reached = np.zeros(trees, np.bool_), np.zeros(trees, np.bool_)
         self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
@@ -101,7 +96,7 @@ class ContactDetection:
     def update_tree_bounds(self, trees: np.ndarray) -> None:
         """Bring the boxes of some trees [k], and of their blocks, up to the poses of their bodies."""
         self.arrays.trees.awake[: len(trees)] = trees
-        self._launch_over_trees(len(trees), self._tree_aabbs)
+        self._tree_aabbs(len(trees))
         self.compare_anew()
         self._update_blocks(np.unique(trees // AABB_BLOCK))
 
@@ -169,7 +164,7 @@ class ContactDetection:
         """Take the awake trees [k] and bring their boxes up to their predicted motion."""
         self.arrays.trees.awake[: len(awake)] = awake
         self.counters[structs.AWAKE_TREES] = len(awake)
-        self._launch_over_trees(len(awake), self._tree_aabbs)
+        self._tree_aabbs(len(awake))
         if awake is not self._listed:
             self._listed, self._awake_blocks = awake, np.unique(awake // AABB_BLOCK)
         self._update_blocks(self._awake_blocks)  # or a tree that was dragged out of its block would have no actor near
@@ -177,7 +172,7 @@ class ContactDetection:
     def find_reached_trees(self) -> np.ndarray:
         """Sleeping trees [k] with which one of the listed awake ones is in contact, or will be before the step ends."""
         self._is_reached[:] = False
-        self._launch_over_trees(int(self.counters[structs.AWAKE_TREES]), self._find_reached_trees)
+        self._find_reached_trees(int(self.counters[structs.AWAKE_TREES]))
         return self._is_reached.nonzero()[0]
 
     def find_candidates(self, plant_plant_contacts: bool) -> None:
@@ -185,10 +180,10 @@ class ContactDetection:
         trees = int(self.counters[structs.AWAKE_TREES])
         if trees > self._room:
             self._allocate_candidates(2 * trees)
-        self._launch_over_trees(trees, self._find_rigid_contacts)
+        self._find_rigid_contacts(trees)
         if plant_plant_contacts:
             self._sort_awake_trees(1)
-            self._launch_over_trees(trees, self._find_plant_contacts)
+            self._find_plant_contacts(trees)
 
     def deepest(self, trees: int, count: int) -> np.ndarray:
         """The ``count`` candidates with the smallest gap, as numbers row * slots + slot in ascending order."""
@@ -196,21 +191,6 @@ class ContactDetection:
         return np.sort(found[np.argsort(self.candidates.gap.ravel()[found], kind="stable")[:count]])
 
     # ------------------------------------------------------------------ launches
-
-    def _launch_over_trees(self, count: int, *launches: Launch) -> None:
-        """Launch over so many trees of the list, for each one launch after the other; threads take turns in it."""
-        pool = self.plants.thread_pool
-        threads = 1 if pool is None or count < MIN_TREES_PER_THREAD * pool.size else pool.size
-        if self._partition != (count, threads):
-            self._partition = (count, threads)
-            self._order[:count] = np.concatenate([np.arange(i, count, threads) for i in range(threads)])
-        if pool is None or threads == 1:
-            for launch in launches:
-                launch(count)
-            return
-        share = [len(range(i, count, threads)) for i in range(threads)]
-        first = [sum(share[:i]) for i in range(threads)]
-        pool.run([partial(_launch_all, launches, share[i], first[i], i) for i in range(threads)])
 
     def _bind_launches(self) -> None:
         """Bind every kernel to its arrays."""
@@ -221,17 +201,22 @@ class ContactDetection:
         tree_boxes, wood_boxes = self.tree_boxes.struct, self._wood_boxes.struct
         actor_boxes, block_boxes = self._actor_boxes.struct, self._block_boxes.struct
         order, candidates = share(self._order, wp.int32), self.candidates.struct
-        by_tree = {"index_list": "order", "partitions": self.plants.threads}
+
+        def bind_shared(kernel: wp.Kernel, given: list, results: list, chunk: str) -> BoundLaunch:
+            """The same of a kernel over trees, which the threads of the plants share."""
+            pool = self.plants.launch_pool
+            launch = bind_launch(kernel, given, results, index_list="order", partitions=pool.size)
+            return pool.share([launch], TREES_PER_CHUNK[chunk])
 
         self._geom_aabbs = bind_launch(broadphase.geom_aabbs, [parameters, geoms, rigid.bodies.struct], [geom_states])
         self._actor_aabbs = bind_launch(
             broadphase.actor_aabbs, [actors, geoms, rigid.bodies.struct, geom_states], [actor_boxes]
         )
-        self._tree_aabbs = bind_launch(
+        self._tree_aabbs = bind_shared(
             broadphase.tree_aabbs,
             [parameters, capsules, order, trees, bodies],
             [capsule_states, wood_boxes, tree_boxes],
-            **by_tree,
+            "boxes",
         )
         self._block_aabbs = bind_launch(
             broadphase.block_aabbs, [share(self._blocks, wp.int32), tree_boxes], [block_boxes]
@@ -241,33 +226,27 @@ class ContactDetection:
             [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
             [share(self._is_near, wp.bool)],
         )
-        self._find_reached_trees = bind_launch(
+        self._find_reached_trees = bind_shared(
             sleeping_trees.find_reached_trees,
             [parameters, capsules, order, trees, block_boxes, tree_boxes, bodies, capsule_states],
             [self._clearances.struct, share(self._is_reached, wp.bool)],
-            **by_tree,
+            "boxes",
         )
-        self._find_rigid_contacts = bind_launch(
+        self._find_rigid_contacts = bind_shared(
             narrowphase_rigid.find_rigid_contacts,
             [parameters, self.parameters.max_static_geoms_per_tree, capsules, geoms, order, trees, tree_boxes, bodies,
              capsule_states, rigid.bodies.struct, rigid.hulls.struct, geom_states, self._static_blocks.struct],
             [self._passing_bunches.struct, candidates],
-            **by_tree,
+            "rigid",
         )  # fmt: skip
         sorted_rows, scratch = (share(rows, wp.int32) for rows in self._sorted_rows)
         self._sort_awake_trees = bind_launch(
             sweep_order.sort_awake_trees, [trees, tree_boxes], [share(self.counters, wp.int32), sorted_rows, scratch]
         )
-        self._find_plant_contacts = bind_launch(
+        self._find_plant_contacts = bind_shared(
             narrowphase_plants.find_plant_contacts,
             [parameters, capsules, order, sorted_rows, share(self.counters, wp.int32), trees,
              tree_boxes, wood_boxes, bodies, capsule_states],
             [candidates],
-            **by_tree,
+            "plants",
         )  # fmt: skip
-
-
-def _launch_all(launches: tuple[Launch, ...], count: int, first: int, partition: int) -> None:
-    """One thread's share of several launches."""
-    for launch in launches:
-        launch(count, first, partition)

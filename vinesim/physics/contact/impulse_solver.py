@@ -13,7 +13,7 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
 from vinesim.physics.contact.deflected_wires import DeflectedWires, WireContacts
 from vinesim.physics.contact.detection import ContactDetection
@@ -23,6 +23,9 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
 
+ITEMS_PER_CHUNK = {"write_contact_rows": 16, "respond_rigidly": 48, "assemble_delassus": 16, "solve_islands": 1,
+                   "store_warm_start": 48}  # fmt: skip
+"""Contacts, rows or islands that a thread takes at a time: work of 5 us and more."""
 MATRIX_CONTACTS = 16
 """Room for the matrices of the blocks is made for blocks of so many contacts, and more when they are larger."""
 REMOVED_GEOM = np.iinfo(np.int32).max
@@ -59,6 +62,7 @@ class ImpulseSolver:
             for name in ("start", "first_block", "block_start", "matrix_start", "contact", "label", "block_label",
                          "first_dof", "sweeps")
         }  # fmt: skip
+        self._items = np.arange(3 * n, dtype=np.int32)
         self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
         self._row_arrays = {
             "plant_jacobian": response.jacobian,
@@ -264,32 +268,39 @@ class ImpulseSolver:
         groups, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
         counters, touched = share(detection.counters, wp.int32), self.touched.struct
         self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
+        items = share(self._items, wp.int32)
+
+        def bind_shared(kernel: wp.Kernel, model: list, given: list, results: list) -> BoundLaunch:
+            """The same of a kernel over items, which the threads of the plants share."""
+            pool = self.plants.launch_pool
+            launch = bind_launch(kernel, [*model, items, *given], results, index_list="items", partitions=pool.size)
+            return pool.share([launch], ITEMS_PER_CHUNK[kernel.key])
+
         self._build_islands = bind_launch(
             islands.build_islands,
             [capsules, geoms, bodies, rigid_bodies, candidates],
             [counters, touched, contacts, groups],
         )
-        self._write_contact_rows = bind_launch(
+        self._write_contact_rows = bind_shared(
             jacobians.write_contact_rows,
-            [parameters, self._pairs.struct, capsules, geoms, bodies, rigid_bodies, candidates, warm_start],
+            [parameters, self._pairs.struct, capsules, geoms],
+            [bodies, rigid_bodies, candidates, warm_start],
             [contacts, rows],
         )
-        self._respond_rigidly = bind_launch(
-            delassus.respond_rigidly, [geoms, rigid_bodies, rigid.factors.struct, contacts], [rows]
+        self._respond_rigidly = bind_shared(
+            delassus.respond_rigidly, [geoms], [rigid_bodies, rigid.factors.struct, contacts], [rows]
         )
-        self._assemble_delassus = bind_launch(
-            delassus.assemble_delassus, [contacts, touched, groups, self.response.sides], [rows]
+        self._assemble_delassus = bind_shared(
+            delassus.assemble_delassus, [], [contacts, touched, groups, self.response.sides], [rows]
         )
-        self._solve_islands = bind_launch(
+        self._solve_islands = bind_shared(
             projected_gauss_seidel.solve_islands,
-            [p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms,
-             rigid_bodies, contacts],
+            [p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
+            [rigid_bodies, contacts],
             [groups, self.scratch.struct, rows],
-        )  # fmt: skip
-        self._store_warm_start = bind_launch(
-            forces.store_warm_start,
-            [parameters, geoms, rigid_bodies, groups, rows],
-            [contacts, warm_start],
+        )
+        self._store_warm_start = bind_shared(
+            forces.store_warm_start, [parameters, geoms], [rigid_bodies, groups, rows], [contacts, warm_start]
         )
         self._accumulate_wrenches = bind_launch(
             forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]

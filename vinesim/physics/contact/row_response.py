@@ -7,8 +7,12 @@ import warp as wp
 
 from vinesim.kernels.articulation.structs import ArticulationModel, Factors
 from vinesim.kernels.contact import row_response
+from vinesim.kernels.launch import BoundLaunch, join_partitions
 from vinesim.physics.contact.warp_arrays import share, zeros
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+
+SIDES_PER_CHUNK = 16
+"""Sides of contacts that a thread takes at a time: work of 5 us."""
 
 
 class RowResponse:
@@ -25,28 +29,32 @@ class RowResponse:
         self.body_slot, self.other_slot = (buffers.pinned(np.zeros(contacts, np.int32)) for _ in range(2))
         self.sides = row_response.SideRows()
         """See :class:`vinesim.kernels.contact.row_response.SideRows`; for kernels on the CPU."""
-        there, scratch = row_response.SideRows(), row_response.ResponseScratch()
+        there = row_response.SideRows()
         size, matrix = buffers.max_tree_size, wp.mat33
         for name, shape in {"force": (), "moment": (), "linear": (size,), "angular": (size,)}.items():
             data = buffers.pinned(zeros(matrix, (2 * contacts, *shape)))
             setattr(self.sides, name, share(data, matrix))
             setattr(there, name, buffers.reach(data, matrix, name))
-        scratch_rows = 1 if buffers.device.is_cpu else 2 * contacts
-        for name in row_response.ResponseScratch.vars:
-            setattr(scratch, name, wp.empty(scratch_rows * size, dtype=matrix, device=buffers.device))
         lists = (self.body, self.tree_start, self.body_slot, self.other_slot)
-        self._respond = plants.launches.record(
-            row_response.respond_to_sides,
-            plants.launches.fill(ArticulationModel),
-            size,
-            scratch_rows,
-            wp.array(buffers.slots, dtype=wp.int32, device=buffers.device),
+        arrays = (
+            wp.array(np.arange(2 * contacts), dtype=wp.int32, device=buffers.device),
             *(buffers.reach(data, wp.int32, "list of responses") for data in lists),
             buffers.reach(self.jacobian, wp.float64, "jacobian"),
             plants.launches.fill(Factors),
-            scratch,
-            there,
         )
+        slots, pool = wp.array(buffers.slots, dtype=wp.int32, device=buffers.device), plants.launch_pool
+
+        def bind(scratch_rows: int) -> BoundLaunch:
+            scratch = row_response.ResponseScratch()
+            for name in row_response.ResponseScratch.vars:
+                setattr(scratch, name, wp.empty(scratch_rows * size, dtype=matrix, device=buffers.device))
+            return plants.launches.record(
+                row_response.respond_to_sides, plants.launches.fill(ArticulationModel), size, scratch_rows, slots,
+                *arrays, scratch, there, index_list="items",
+            )  # fmt: skip
+
+        launches = [bind(1 if buffers.device.is_cpu else 2 * contacts) for _ in range(pool.size)]
+        self._respond = pool.share([join_partitions(launches)], SIDES_PER_CHUNK)
 
     def compute(self, contacts: int) -> None:
         """Fill :attr:`sides` of the first ``contacts``; all touch trees of the last prediction, and belong to it."""

@@ -25,7 +25,7 @@ import warp as wp
 from vinesim import frames
 from vinesim.errors import checked_index
 from vinesim.kernels.articulation.first_mode import MAX_SUBSTEPS, substeps_for
-from vinesim.kernels.launch import ThreadPool
+from vinesim.kernels.shared_launch import LaunchPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
 from vinesim.physics.plants.contact_loads import ContactLoads
@@ -102,19 +102,19 @@ class ArticulationSolver:
         self._allocate(phi)
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
-        self.thread_pool = ThreadPool(threads) if threads > 1 else None
-        if self.thread_pool is not None:
-            weakref.finalize(self, self.thread_pool.close)
+        self.launch_pool = LaunchPool(threads)
+        """Threads that share launches over trees."""
+        weakref.finalize(self, self.launch_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
         self.onset_steps = numbers["contact_steps"] - 1  # with phi = 1 after contact began
-        self.launches = KernelLaunches(self, numbers, threads, MAX_SUBSTEPS if substeps else 1)
+        self.launches = KernelLaunches(self, numbers, self.launch_pool, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
         self._runner = StepRunner(
-            buffers, self.launches, tree_size=model.tree_size, tree_substeps=self.tree_substeps, tree_steps=self._steps,
+            buffers, self.launches, tree_substeps=self.tree_substeps, tree_steps=self._steps,
             tree_rate=self.tree_rate, tree_budget=self.tree_budget, stepping=self._stepping, groups=self._groups,
             floating=self._floating, topologies=Topologies(model, state.body_cut, self.tree_moving),
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
-            | model.is_on_arm(), thread_pool=self.thread_pool,
+            | model.is_on_arm(),
         )  # fmt: skip
         self._loads = ContactLoads(
             body_tree=model.body_tree, place_in_tree=self._place_in_tree, is_stepped=self._runner.is_stepped,

@@ -28,15 +28,17 @@ from vinesim.kernels.articulation.kinematics import forward_kinematics
 from vinesim.kernels.articulation.lane_records import LANES, RECORD
 from vinesim.kernels.articulation.lean_prediction import predict_lean
 from vinesim.kernels.articulation.prediction import predict
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.launch import BoundLaunch as Launch
+from vinesim.kernels.launch import bind_launch, join_partitions
+from vinesim.kernels.shared_launch import LaunchPool
 from vinesim.physics.parameters import PhysicsParameters
 
 if TYPE_CHECKING:
     from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
-Launch = Callable[..., None]
-
-
+TREES_PER_CHUNK = {"predict": 2, "integrate": 16, "wrenches": 4}
+"""Trees that a thread takes at a time: work of 3 to 8 us, beside which taking them is nothing. DERIVED from the times
+of one tree of 17 bodies."""
 STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
 """Rows that are carried to the device before every prediction."""
 DEVICE_RESULTS = (
@@ -87,7 +89,7 @@ class Step:
     predict_groups: Launch
     """Over groups of trees; on a GPU each tree is a group."""
     predict: Launch
-    integrate: Launch
+    integrate: Callable[..., None]
     correct_floating_momentum: Launch
 
 
@@ -102,10 +104,11 @@ class KernelLaunches:
     """
 
     def __init__(
-        self, solver: ArticulationSolver, parameters: dict[str, float], threads: int, max_substeps: int
+        self, solver: ArticulationSolver, parameters: dict[str, float], pool: LaunchPool, max_substeps: int
     ) -> None:
-        """``parameters``: numbers of :class:`vinesim.kernels.articulation.structs.SolverParameters` but gravity."""
-        self.buffers, self._threads, self._max_substeps = solver.buffers, threads, max_substeps
+        """``parameters``: numbers of :class:`vinesim.kernels.articulation.structs.SolverParameters` but gravity;
+        ``pool``: threads that share the launches over trees."""
+        self.buffers, self._pool, self._max_substeps = solver.buffers, pool, max_substeps
         self._body_tree = solver.model.body_tree
         self.changed = False
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
@@ -199,6 +202,11 @@ class KernelLaunches:
         given = [self._arrays[value] if isinstance(value, str) else value for value in arguments]
         return bind_launch(kernel, given, [], device=str(self.buffers.device), **options)
 
+    def record_shared(self, kernel: Any, *arguments: object, chunk: int) -> Launch:
+        """The same of a kernel whose list is ``trees``, shared in chunks of so many."""
+        launch = self.record(kernel, *arguments, index_list="trees", partitions=self._pool.size)
+        return self._pool.share([launch], chunk)
+
     # ------------------------------------------------------------------ transfers of the listed trees' rows
 
     def _record_transfers(self) -> None:
@@ -226,17 +234,17 @@ class KernelLaunches:
         self._model, self._forces = fill(s.ArticulationModel), fill(s.AppliedForces)
         joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
         scratch, prediction = fill(s.Scratch), fill(s.Prediction)
-        self.predict = self._record_predict(parameters, "stepping", self._threads)
-        self.predict_subset = self._record_predict(parameters, "subset", 1)
+        self.predict = self._record_predict(parameters, "stepping")
+        self.predict_subset = self._record_predict(parameters, "subset")
         self.predict_groups = (
             None if self.buffers.has_copies else self._record_groups(parameters, joints, scratch, prediction)
         )
         """Predicts groups of trees, on a CPU."""
         self.integrate = self._record_integrate(parameters)
         self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
-        self.apply_wrenches = record(
+        self.apply_wrenches = self.record_shared(
             apply_wrenches, parameters.dt, self._model, "subset", "body_wrench", self._factors, fill(s.WrenchScratch),
-            scratch, prediction,
+            scratch, prediction, chunk=TREES_PER_CHUNK["wrenches"],
         )  # fmt: skip
         self.correct_floating_momentum = self._record_momentum(parameters)
         self.choose_budget = record(choose_budget, parameters, self._model, "stepping", scratch, "tree_budget")
@@ -245,22 +253,22 @@ class KernelLaunches:
             scratch, fill(s.WrenchScratch), "tree_substeps",
         )  # fmt: skip
 
-    def _record_predict(self, parameters: Any, trees: str, partitions: int) -> Launch:
+    def _record_predict(self, parameters: Any, trees: str) -> Launch:
         fill, s = self.fill, structs
         kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
-        return self.record(
+        return self.record_shared(
             kernel[0], parameters, fill(s.ArticulationModel), *kernel[1], trees, "tree_phi", "tree_euler_steps",
             "tree_steps", fill(s.AppliedForces), fill(s.JointState), "phi_used", fill(s.BodyState), fill(s.Factors),
-            fill(s.Scratch), fill(s.Prediction), index_list="trees", partitions=partitions,
+            fill(s.Scratch), fill(s.Prediction), chunk=TREES_PER_CHUNK["predict"],
         )  # fmt: skip
 
-    def _record_integrate(self, parameters: Any) -> Launch:
+    def _record_integrate(self, parameters: Any) -> Callable[..., None]:
         """An integration, with the energy budgets around it."""
         fill, record, s = self.fill, self.record, structs
         model, forces, joints, prediction = (
             fill(struct) for struct in (s.ArticulationModel, s.AppliedForces, s.JointState, s.Prediction)
         )
-        partitioned = {"index_list": "trees", "partitions": self._threads}
+        partitioned = {"index_list": "trees", "partitions": self._pool.size}
         apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
         begin = record(
             begin_budget, parameters, model, "stepping", "tree_budget", "tree_phi", forces, joints,
@@ -275,7 +283,8 @@ class KernelLaunches:
             forces, self.budget, "tree_euler_steps", joints, apart, fill(s.Factors), fill(s.Scratch),
             fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"), **partitioned,
         )  # fmt: skip
-        return self._keeping_budgets(begin, move, keep)
+        chunk = TREES_PER_CHUNK["integrate"]
+        return self._keeping_budgets(self._pool.share([move], chunk), self._pool.share([begin, move, keep], chunk))
 
     def _record_momentum(self, parameters: Any) -> Launch:
         fill, s = self.fill, structs
@@ -291,7 +300,7 @@ class KernelLaunches:
         names = dict.fromkeys(TREE_INPUTS + TREE_RESULTS)
         copies = {name: wp.empty_like(shared[name], device=device) for name in names}
         self.resident_arrays = self._arrays = shared | copies
-        predict = self._record_predict(parameters, "stepping", 1)
+        predict = self._record_predict(parameters, "stepping")
         self.resident = Step(predict, predict, self._record_integrate(parameters), self._record_momentum(parameters))
         self._arrays = shared
 
@@ -324,16 +333,11 @@ class KernelLaunches:
             limit, watch = (row[self._budgeted].max() for row in self._budget_rows)
             self._keeps_budgets = self._watches_closely or bool(watch > 0 or limit >= NO_LIMIT)
 
-    def _keeping_budgets(self, begin: Launch, move: Launch, keep: Launch) -> Launch:
+    def _keeping_budgets(self, move: Launch, move_with_budgets: Launch) -> Callable[..., None]:
         """An integration, with what keeps the energy budgets around it in steps that do."""
 
         def launch(*which: int) -> None:
-            if not self._keeps_budgets:
-                move(*which)
-                return
-            begin(*which)
-            move(*which)
-            keep(*which)
+            (move_with_budgets if self._keeps_budgets else move)(*which)
 
         return launch
 
@@ -346,13 +350,9 @@ class KernelLaunches:
                 "tree_steps", self._forces, joints, wp.zeros(size, dtype=float, device=self.buffers.device),
                 "phi_used", self._bodies, self._factors, scratch, prediction, index_list="groups",
             )
-            for _ in range(self._threads)
+            for _ in range(self._pool.size)
         ]  # fmt: skip
-
-        def launch(groups: int, first: int = 0, partition: int = 0) -> None:
-            launches[partition](groups, first)
-
-        return launch
+        return self._pool.share([join_partitions(launches)], 1)
 
     def _record_impact(self, parameters: Any) -> None:
         """An impact within no time: factors of inertia and springs alone, and wrenches that are impulses."""

@@ -1,4 +1,4 @@
-"""Launches over the awake trees: dealt out to threads on a CPU, captured into a graph on a GPU.
+"""Launches over the awake trees: in groups of one topology on a CPU, captured into a graph on a GPU.
 
 A tree whose first mode is too fast for the step takes substeps instead, of which all others see the sum:
 :mod:`vinesim.kernels.articulation.first_mode` says how many. While contacts act on it, it takes the whole step that
@@ -7,27 +7,15 @@ they were solved for; and so does always a tree that is tied to wires, which mov
 
 from __future__ import annotations
 
-import functools
-import itertools
 from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
 from vinesim.kernels.articulation.energy_budget import NO_BUDGET
-from vinesim.kernels.articulation.lane_records import LANES
-from vinesim.kernels.launch import ThreadPool
 from vinesim.physics.plants.device_buffers import DeviceBuffers
 from vinesim.physics.plants.kernel_launches import KernelLaunches, Step
 from vinesim.physics.plants.topology import Topologies, group_starts
-
-MIN_GROUPS_PER_THREAD = 4
-"""[group] For fewer a thread, a prediction is not handed to other threads. DERIVED: that costs 10 us (measured), as
-much as predicting two and a half trees of 17 bodies; all is lost while no other core is free."""
-
-MIN_INTEGRATED_TREES_PER_THREAD = 100
-"""[tree] The same for an integration. DERIVED: in 10 us 26 trees of 17 bodies are integrated; four times as many, for
-the gain is a few us only."""
 
 Levels = tuple[int, ...]
 """How many of a list take a first, a second, a third substep."""
@@ -42,8 +30,7 @@ class StepRunner:
 
     Args:
         buffers: of the solver.
-        launches: of the solver; bound with as many partitions as there are threads.
-        tree_size: [tree] bodies, by which trees are dealt out.
+        launches: of the solver.
         tree_substeps: [tree] into how many substeps each tree's step is to be divided.
         tree_steps: [tree] into how many it is divided now, which the kernels read.
         tree_budget: [tree] how each tree's energy is watched.
@@ -53,7 +40,6 @@ class StepRunner:
         groups: [tree, 2] int32, groups that the kernels read: first place in the list, number of trees.
         floating: [tree] int32, the floating roots that the kernels read.
         topologies: of the trees.
-        thread_pool: threads that share the work; none for one thread.
     """
 
     def __init__(
@@ -61,7 +47,6 @@ class StepRunner:
         buffers: DeviceBuffers,
         launches: KernelLaunches,
         *,
-        tree_size: np.ndarray,
         tree_substeps: np.ndarray,
         tree_steps: np.ndarray,
         tree_budget: np.ndarray,
@@ -71,15 +56,13 @@ class StepRunner:
         groups: np.ndarray,
         floating: np.ndarray,
         topologies: Topologies,
-        thread_pool: ThreadPool | None,
     ) -> None:
-        self._buffers, self._launches, self._tree_size, self._list = buffers, launches, tree_size, stepping
+        self._buffers, self._launches, self._list = buffers, launches, stepping
         self._substeps, self._steps_of, self._rate, self._floating = tree_substeps, tree_steps, tree_rate, floating
         self._is_whole, self._budget_kind = whole, tree_budget
-        self._pool, self._threads = thread_pool, 1 if thread_pool is None else thread_pool.size
         self.stepped = np.zeros(0, np.int32)
         """The trees of this step [k], sorted."""
-        self.is_stepped = np.zeros(len(tree_size), np.bool_)
+        self.is_stepped = np.zeros(len(tree_rate), np.bool_)
         """Which these are [tree]."""
         self.fast = np.zeros(0, np.int32)
         """Those of them whose step is to be divided [k], sorted."""
@@ -93,20 +76,6 @@ class StepRunner:
         """Place in the list at which each group begins, and the end of the list."""
         self._whole_groups = 0
         """Groups of the trees of whole steps: the first ones."""
-        self._group_ends, self._whole_group_ends, self._whole_ends = ([0] * (self._threads + 1) for _ in range(3))
-        """Thread i works on groups ``_group_ends[i]`` to ``_group_ends[i + 1]``; the same of the groups of whole steps,
-        and of their trees."""
-
-        def part(launch: Callable[..., None], ends: list[int], i: int) -> Callable[[], None]:
-            return lambda: launch(ends[i + 1] - ends[i], ends[i], i)
-
-        self._parts = {
-            launch: [part(launch, ends, i) for i in range(self._threads)]
-            for launch, ends in (
-                (launches.shared.predict_groups, self._group_ends),
-                (launches.integrate, self._whole_ends),
-            )
-        }
 
     # ------------------------------------------------------------------ which trees, in which order
 
@@ -131,7 +100,7 @@ class StepRunner:
         self._order()
 
     def _order(self) -> None:
-        """List the trees by what ``_steps_of`` says of each, and deal them out to the threads by their bodies."""
+        """List the trees by what ``_steps_of`` says of each."""
         trees, on_cpu = self.stepped, self._buffers.device.is_cpu
         topologies = self._topologies.of(trees)
         if on_cpu:
@@ -145,12 +114,6 @@ class StepRunner:
         counts = np.diff(self._starts)
         self._groups[: len(counts), 0], self._groups[: len(counts), 1] = self._starts[:-1], counts
         self._whole_groups = int(np.searchsorted(self._starts, self._whole))
-        work = self._tree_size[trees[self._starts[:-1]]] * (LANES + counts)
-        for ends, groups in ((self._group_ends, len(counts)), (self._whole_group_ends, self._whole_groups)):
-            done = np.cumsum(work[:groups])
-            shares = np.arange(self._threads + 1) * (int(done[-1]) if groups else 0) // self._threads
-            ends[:] = np.searchsorted(done, shares, side="right").tolist()
-        self._whole_ends[:] = self._starts[self._whole_group_ends].tolist()
 
     def _divide(self, touched: np.ndarray) -> None:
         """Divide the coming step of all fast trees but those ``touched`` [k]."""
@@ -179,7 +142,7 @@ class StepRunner:
         """Predict the listed trees over the whole step."""
         if len(self.fast):
             self._steps_of[self.fast] = 1
-        self._launch(self._launches.shared.predict_groups, len(self._starts) - 1, MIN_GROUPS_PER_THREAD)
+        self._launches.shared.predict_groups(len(self._starts) - 1)
 
     def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
         """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
@@ -189,21 +152,15 @@ class StepRunner:
         self._divide(touched)
         self._list_roots(roots, root_trees)
         self._launches.look_for_budgets()
-        self._launch(self._launches.integrate, self._whole, MIN_INTEGRATED_TREES_PER_THREAD)
+        self._launches.integrate(self._whole)
         self._launches.correct_floating_momentum(self._roots)
-        self._take_substeps(self._launches.shared, self._levels, self._whole, 0, self._root_levels)
+        self._take_substeps(self._launches.shared)
 
-    def _launch(self, launch: Callable[..., None], count: int, least: int) -> None:
-        """Launch over the first trees or groups of the list, on all threads if there are ``least`` for each."""
-        if self._pool is None or count < least * self._threads:
-            launch(count)
-        else:
-            self._pool.run(self._parts[launch])
-
-    def _take_substeps(self, step: Step, levels: Levels, first: int, partition: int, roots: Levels = ()) -> None:
-        for level, count in enumerate(levels):
-            step.predict(count, first, partition)
-            step.integrate(count, first, partition)
+    def _take_substeps(self, step: Step) -> None:
+        roots, first = self._root_levels, self._whole
+        for level, count in enumerate(self._levels):
+            step.predict(count, first)
+            step.integrate(count, first)
             if level < len(roots):
                 step.correct_floating_momentum(roots[level], self._roots)
 
@@ -228,19 +185,10 @@ class StepRunner:
                 self._graph, self._graph_of = capture.graph, what
             for _ in range(steps):
                 wp.capture_launch(self._graph)  # pyright: ignore[reportArgumentType]  (captured above)
-        elif self._pool is None or count < self._threads or len(roots) or between is not None:
-            self._steps(steps, between)
         else:
-            shares = enumerate(self._shares_of_substeps())
-            self._pool.run([functools.partial(self._steps_of_part, steps, i, levels, at) for i, (at, levels) in shares])
+            self._steps(steps, between)
         self._launches.download_trees()
         self._buffers.synchronize()
-
-    def _shares_of_substeps(self) -> list[tuple[int, Levels]]:
-        """For each thread where its fast trees begin in the list, and how many take each substep."""
-        fast = self._list[self._whole : len(self.stepped)]
-        ends = np.arange(self._threads + 1) * len(fast) // self._threads
-        return [(self._whole + int(a), _levels(self._steps_of[fast[a:b]])) for a, b in itertools.pairwise(ends)]
 
     def _steps(self, steps: int, between: Callable[[], None] | None) -> None:
         step = self._launches.resident
@@ -250,15 +198,7 @@ class StepRunner:
                 between()
             step.integrate(self._whole)
             step.correct_floating_momentum(self._roots)
-            self._take_substeps(step, self._levels, self._whole, 0, self._root_levels)
-
-    def _steps_of_part(self, steps: int, partition: int, levels: Levels, fast: int) -> None:
-        groups, ends = self._whole_group_ends[partition : partition + 2], self._whole_ends[partition : partition + 2]
-        step = self._launches.resident
-        for _ in range(steps):
-            step.predict_groups(groups[1] - groups[0], groups[0], partition)
-            step.integrate(ends[1] - ends[0], ends[0], partition)
-            self._take_substeps(step, levels, fast, partition)
+            self._take_substeps(step)
 
 
 def _levels(steps: np.ndarray) -> Levels:

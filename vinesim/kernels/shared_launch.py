@@ -1,0 +1,237 @@
+"""Launches that several threads of a CPU share, chunk by chunk, without Python between them.
+
+To wake a thread takes 30 to 60 us, as long as half of the trees of a step take. So a thread that has nothing to do polls
+memory for the next launch, for :data:`POLL_TIME`, before it sleeps, and the thread that launches begins at once: whoever is
+free takes the next chunk, and one that wakes late finds less to do. Results do not depend on who took which, since
+every chunk is work of its own. The threads never hold the interpreter's lock.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import threading
+import time
+from collections.abc import Sequence
+from typing import cast
+
+import warp as wp
+
+from vinesim.kernels.launch import BoundLaunch, bind_launch
+
+POLL_TIME = 300_000
+"""[ns] More than passes between the launches of a step, much less than a step."""
+
+_IDLE, _ASSIGNED, _WORKING, _ASLEEP, _ENDED = range(5)
+"""States of a thread. It sleeps in a read from a pipe, into which one byte is written when it leaves that state."""
+_NEXT_CHUNK, _JOB, _FIRST_THREAD, _LINE = 0, 8, 16, 8
+"""Places in the memory of a pool: the next chunk to be taken, the address of the job, the states of the threads, each in
+a cache line of its own with the end of the pipe to write to."""
+_C_FUNCTIONS = ("read", "clock_gettime", "write", "sched_yield")
+"""Functions of the C library that native code calls, by their addresses."""
+
+_COMMON = """
+    typedef void (*Kernel)(void*, void*);
+    typedef long (*ReadOrWrite)(long, void*, size_t);
+    typedef long (*GetTime)(long, long*);
+    typedef void (*Yield)();
+    long long* const pool = (long long*)(size_t)address;
+    const auto state_of = [&](int i) { return pool + 16 + 8 * i; };
+    const auto is_set = [&](int i, long long from, long long to) {
+        return __atomic_compare_exchange_n(state_of(i), &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_ACQUIRE);
+    };
+    const auto pause = [] {
+#if defined(__x86_64__)
+        __builtin_ia32_pause();
+#elif defined(__aarch64__)
+        asm volatile("yield");
+#endif
+    };
+    // job: chunks, entries of a chunk, entries, first entry, launches, numbers of a launch; of each launch: kernel, address
+    // of the list, bytes of an entry; for each thread addresses of bounds, their shape and size, arguments, list in them
+    const auto run_chunk = [&](const long long* job, int thread) {
+        const long long chunk = __atomic_fetch_add(pool, 1, __ATOMIC_RELAXED);
+        if (chunk >= job[0]) return false;
+        const long long first = chunk * job[1], left = job[2] - first, count = left < job[1] ? left : job[1];
+        for (long long i = 0; i < job[4]; ++i) {
+            const long long* const launch = job + 6 + i * job[5];
+            const long long* const mine = launch + 3 + 5 * thread;
+            *(unsigned*)mine[1] = (unsigned)count;
+            *(size_t*)mine[2] = (size_t)count;
+            *(long long*)mine[4] = launch[1] + (job[3] + first) * launch[2];
+            ((Kernel)launch[0])((void*)mine[0], (void*)mine[3]);
+        }
+        return true;
+    };
+"""
+
+
+@wp.func_native(
+    """
+#if !defined(__CUDA_ARCH__)
+"""
+    + _COMMON
+    + """
+    const long long* const work = (const long long*)(size_t)job;
+    __atomic_store_n(pool, 0, __ATOMIC_RELAXED);
+    __atomic_store_n(pool + 8, (long long)job, __ATOMIC_RELEASE);
+    const long long wanted = threads < work[0] ? threads : work[0];
+    for (int i = 1; i < wanted; ++i) {
+        if (!is_set(i, 0, 1) && is_set(i, 3, 1)) ((ReadOrWrite)(size_t)write)((long)state_of(i)[1], pool, 1);
+    }
+    while (run_chunk(work, 0)) {}
+    for (int i = 1; i < threads; ++i) {
+        is_set(i, 1, 0);  // one that has not begun, perhaps for want of a core, is not waited for
+        for (int polls = 0; __atomic_load_n(state_of(i), __ATOMIC_ACQUIRE) == 2; ++polls) {
+            pause();
+            if (polls > 1000 && yield_) ((Yield)(size_t)yield_)();
+        }
+    }
+#endif
+"""
+)
+def lead(address: wp.uint64, job: wp.uint64, threads: int, write: wp.uint64, yield_: wp.uint64):
+    """Work on a job with the other threads until all of it is done."""
+    ...
+
+
+@wp.func_native(
+    """
+#if !defined(__CUDA_ARCH__)
+"""
+    + _COMMON
+    + """
+    const auto now = [&] {
+        long time[2];
+        ((GetTime)(size_t)get_time)(clock, time);
+        return 1000000000LL * time[0] + time[1];
+    };
+    long long since = now();
+    for (int polls = 1;; ++polls) {
+        const long long state = __atomic_load_n(state_of(thread), __ATOMIC_RELAXED);
+        if (state == 4) break;
+        if (state == 1 && is_set(thread, 1, 2)) {
+            const long long* const work = (const long long*)__atomic_load_n(pool + 8, __ATOMIC_ACQUIRE);
+            while (run_chunk(work, thread)) {}
+            __atomic_store_n(state_of(thread), 0, __ATOMIC_RELEASE);
+            since = now();
+        } else if (polls % 64 == 0 && now() - since > poll_time && is_set(thread, 0, 3)) {
+            char byte;
+            while (((ReadOrWrite)(size_t)read)(pipe, &byte, 1) < 0) {}  // interrupted by a signal
+            since = now();
+        }
+        pause();
+    }
+#endif
+"""
+)
+def follow(
+    address: wp.uint64, thread: int, poll_time: int, pipe: int, clock: int, read: wp.uint64, get_time: wp.uint64
+):
+    """Work on every job, and sleep when there has been none for ``poll_time`` [ns]."""
+    ...
+
+
+@wp.kernel(enable_backward=False)
+def lead_threads(address: wp.uint64, job: wp.uint64, threads: int, write: wp.uint64, yield_address: wp.uint64):
+    """The thread that launches."""
+    lead(address, job, threads, write, yield_address)
+
+
+@wp.kernel(enable_backward=False)
+def follow_thread(
+    address: wp.uint64, thread: int, poll_time: int, pipe: int, clock: int, read: wp.uint64, get_time: wp.uint64
+):  # fmt: skip
+    """The others."""
+    follow(address, thread, poll_time, pipe, clock, read, get_time)
+
+
+class LaunchPool:
+    """Threads that share launches with the caller; see the module."""
+
+    def __init__(self, size: int) -> None:
+        """``size``: how many work at once, the caller of a launch included."""
+        try:
+            library = ctypes.CDLL(None)
+            calls = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0 for name in _C_FUNCTIONS]
+        except (OSError, AttributeError, TypeError):  # not POSIX: the caller works alone
+            size, calls = 1, []
+        self.size = size
+        self._calls = [wp.uint64(call) for call in calls]
+        self._memory = (ctypes.c_int64 * (_FIRST_THREAD + _LINE * (size + 1)))()
+        base = -ctypes.addressof(self._memory) % 64 // 8
+        self._address = wp.uint64(ctypes.addressof(self._memory) + 8 * base)
+        self._states = [base + _FIRST_THREAD + _LINE * i for i in range(size)]
+        self._pipes: list[int] = []
+        for i in range(1, size):
+            reading, writing = os.pipe()
+            self._pipes.append(writing)
+            self._memory[self._states[i] + 1] = writing
+            given = [self._address, i, POLL_TIME, reading, time.CLOCK_MONOTONIC, *self._calls[:2]]
+            run = bind_launch(follow_thread, given, [])
+            arguments = (run, reading, self._memory)
+            threading.Thread(target=_follow, args=arguments, name=f"launch pool {i}", daemon=True).start()
+
+    def share(self, launches: Sequence[BoundLaunch], chunk: int) -> BoundLaunch:
+        """A launch that the threads share in chunks of so many entries of its list.
+
+        All ``launches`` have the same list and are bound with :attr:`size` partitions; a chunk goes through one after
+        the other. Fewer than two chunks are launched here, and so are launches that native code cannot make.
+        """
+
+        if self.size == 1 and len(launches) == 1:
+            return launches[0]
+
+        def launch_here(threads: int, first: int = 0, partition: int = 0) -> None:
+            for launch in launches:
+                launch(threads, first)
+
+        packed = [launch.packed for launch in launches]
+        launch_here.packed = None  # type: ignore[attr-defined]
+        if self.size == 1 or not all(packed):
+            return cast(BoundLaunch, launch_here)
+        numbers = [[*one.head, *(number for part in one.parts for number in part)] for one in packed if one]
+        head = [0, chunk, 0, 0, len(numbers), len(numbers[0])]
+        job = (ctypes.c_int64 * (len(head) + sum(map(len, numbers))))(*head, *(n for each in numbers for n in each))
+        at_job = wp.uint64(ctypes.addressof(job))
+        run = bind_launch(lead_threads, [self._address, at_job, self.size, *self._calls[2:]], [])
+
+        def launch(threads: int, first: int = 0, partition: int = 0) -> None:
+            if threads < 2 * chunk:
+                launch_here(threads, first)
+            else:
+                job[0], job[2], job[3] = -(-threads // chunk), threads, first
+                run(1)
+
+        launch.packed = None  # type: ignore[attr-defined]
+        return cast(BoundLaunch, launch)
+
+    def wake(self) -> None:
+        """Wake the threads that sleep, for a launch that comes soon."""
+        for i in range(1, self.size):
+            if self._memory[self._states[i]] == _ASLEEP:  # which only this thread changes
+                self._memory[self._states[i]] = _IDLE
+                os.write(self._pipes[i - 1], b" ")
+
+    @property
+    def sleeping(self) -> int:
+        """Threads that sleep now."""
+        return sum(self._memory[state] == _ASLEEP for state in self._states[1 : self.size])
+
+    def close(self) -> None:
+        """End the threads."""
+        for i in range(1, self.size):
+            self._memory[self._states[i]] = _ENDED
+            os.close(self._pipes[i - 1])  # which ends a read, too
+        self.size, self._pipes = 1, []
+
+    def __del__(self) -> None:
+        with contextlib.suppress(AttributeError):  # of one that could not be made
+            self.close()
+
+
+def _follow(run: BoundLaunch, pipe: int, memory: object) -> None:
+    """The life of a thread; ``memory`` is kept as long as it lives."""
+    run(1)
+    os.close(pipe)
