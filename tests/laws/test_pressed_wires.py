@@ -26,7 +26,9 @@ from vinesim.physics.plants.elastic_supports import WIRE_DAMPING_TIME
 from vinesim.physics.rigid.wire_contacts import WIRE_MASS
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
+from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
+from vinesim.sensors.scene.primitives import Primitives
 
 G = 9.81
 BEYOND = 0.3
@@ -310,3 +312,45 @@ def energy_of(physics: Physics) -> float:
     mujoco.mj_forward(m, copy)
     m.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     return float(copy.energy.sum())
+
+
+def wire_in_pictures(physics: Physics, primitives: Primitives, piece: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends [k, 3] m of the cones that cameras and lidars see of a wire."""
+    primitives.update(physics.snapshot())
+    cones = np.flatnonzero(primitives.label == label(Organ.WIRE, int(physics.model.fixed_index[piece])))
+    return tuple(getattr(primitives.shapes, end).numpy()[cones, :3].astype(float) for end in "ab")
+
+
+def test_cameras_and_lidars_see_a_pressed_wire_where_the_string_law_says() -> None:
+    """To 2e-5 m at the ends of its segments, which hang together; let go, it is seen where it was drawn."""
+    at, force = 0.5, 20.0
+    physics = world(row_of_shoots((), beyond=BEYOND))
+    primitives = Primitives(physics.model, grass=0.0)
+    drawn = wire_in_pictures(physics, primitives)
+    press(physics, at, force)
+    run(physics, 300)
+    pressed = wire_in_pictures(physics, primitives)
+    for before, after in zip(drawn, pressed, strict=True):
+        x = before[:, 0]
+        expected = force * np.minimum(x, at) * (LENGTH - np.maximum(x, at)) / (TENSION * LENGTH)
+        np.testing.assert_allclose(after - before, expected[:, None] * [0.0, 0.0, 1.0], atol=2e-5)
+    np.testing.assert_allclose(pressed[0][1:], pressed[1][:-1], atol=5e-5)  # it is a little longer than drawn
+    physics.rigid.set_gains("probe", np.array([5000.0, 0.0]), np.array([300.0, 2.0]), np.array([0.0, -20.0]))
+    run(physics, 100)
+    for before, after in zip(drawn, wire_in_pictures(physics, primitives), strict=True):
+        np.testing.assert_array_equal(after, before)
+
+
+def test_a_wire_is_seen_to_pass_its_ties_where_the_shoots_hold_it() -> None:
+    """At each tie it is seen within 0.1 mm of where the tie's anchor has gone, which moves with the wire."""
+    places = (0.5, 1.0, 1.5)
+    physics = world(row_of_shoots(places, beyond=BEYOND))
+    primitives = Primitives(physics.model, grass=0.0)
+    press(physics, 0.75, 30.0)
+    run(physics, 200)
+    start, end = wire_in_pictures(physics, primitives)
+    line, ties = np.concatenate([start, end[-1:]]), physics.plants.ties
+    seen = np.stack([np.interp(places, line[:, 0], line[:, k]) for k in range(3)], axis=1)
+    moved = ties.anchor[ties.on_wire].astype(float) - physics.model.tie_anchor[ties.on_wire]
+    assert moved[:, 2].max() > 0.01
+    np.testing.assert_allclose(seen - [[x, SHOOT + BEYOND, 1.0] for x in places], moved, atol=1e-4)

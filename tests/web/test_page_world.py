@@ -15,7 +15,9 @@ from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
+from vinesim.scene.state import State
 from vinesim.scene.values import INTENTIONS, LightPattern
+from vinesim.scene.wire_segments import wire_segments
 from vinesim.web.array_message import decode
 from vinesim.web.page_input import PageInput, TrackedHand, TrackedPerson
 
@@ -75,9 +77,11 @@ def test_the_scene_holds_what_cameras_see(shown):
     client, world = shown
     header, arrays = decode(world.scene())
     model = client.model
-    assert header["bodies"] == len(model.body_mass)
+    wires = wire_segments(model)
+    assert header["bodies"] == len(model.body_mass) + len(wires)
     np.testing.assert_allclose(arrays["start"], client.pose, atol=1e-6)
-    np.testing.assert_allclose(arrays["poses"], client.physics.snapshot().body_q, atol=1e-6)
+    rest = np.concatenate([client.physics.snapshot().body_q, wires.rest_q])
+    np.testing.assert_allclose(arrays["poses"], rest, atol=1e-6)
     kinds = np.repeat(arrays["kind"], arrays["size"])
     assert len(kinds) == len(arrays["material"]) == len(arrays["shape"]) == len(arrays["carrier"])
     assert (kinds == 1).sum() == model.bunch_berries.sum()
@@ -104,6 +108,38 @@ def test_a_state_holds_the_trees_that_have_moved_since_the_last_one(shown):
     pose = client.physics.state.body_q[arrays["body"]]
     np.testing.assert_allclose(arrays["place"].reshape(-1, 3), pose[:, :3], atol=1e-6)
     np.testing.assert_allclose(arrays["turn"].reshape(-1, 4) / 32767.0, pose[:, 3:], atol=2e-5)
+
+
+def test_a_state_holds_the_segments_of_wires_that_have_moved(shown):
+    """A shoot that swings takes its wire along; at rest again, the wire is told once more and then no longer."""
+    client, world = shown
+    world.scene()
+    client.tick()
+    model, bodies = client.model, len(client.model.body_mass)
+    tree = int(model.body_tree[model.tie_body[model.tie_wire >= 0]][0])
+    swing(client, tree)
+    seen, before = -1, set()
+    while not before:
+        client.tick()
+        seen, message = world.state(-1)
+        arrays, wires = decode(message)[1], client.physics.snapshot().wires
+        before = set(wires.segment.tolist())
+    told = arrays["body"] - np.uint32(bodies)
+    rows = np.flatnonzero(np.isin(told, wires.segment))
+    np.testing.assert_array_equal(told[rows], wires.segment)
+    np.testing.assert_allclose(arrays["place"].reshape(-1, 3)[rows], wires.q[:, :3], atol=1e-6)
+    client.physics.apply_remote_rest([tree], [State.at_rest(model).joint_q[model.bodies_of(tree)]])
+    for other in client.physics.plants.awake.copy():
+        client.physics.apply_remote_rest([int(other)], [State.at_rest(model).joint_q[model.bodies_of(int(other))]])
+    client.tick()
+    seen, message = world.state(seen)
+    arrays = decode(message)[1]
+    rows = np.flatnonzero(np.isin(arrays["body"], bodies + np.array(sorted(before))))
+    rest = wire_segments(model).rest_q[arrays["body"][rows] - bodies]
+    assert len(rows)
+    np.testing.assert_allclose(arrays["place"].reshape(-1, 3)[rows], rest[:, :3], atol=2e-4)
+    client.tick()
+    assert not set((decode(world.state(seen)[1])[1]["body"].astype(int) - bodies).tolist()) & before
 
 
 def test_a_page_that_skips_states_still_gets_every_tree(shown):
@@ -134,7 +170,8 @@ def test_a_picked_bunch_becomes_a_rigid_body_of_the_page(shown):
     assert len(rigid["names"]) * 4 == len(arrays["rigid_turn"].ravel())
     row = next(i for i, name in enumerate(rigid["names"]) if "bunch" in name or Organ.BUNCH.name.lower() in name)
     carriers = shapes["carrier"]
-    assert (carriers == len(client.model.body_mass) + 1 + row).sum() >= client.model.bunch_berries[4]
+    bodies = decode(world.scene())[0]["bodies"]
+    assert (carriers == bodies + 1 + row).sum() >= client.model.bunch_berries[4]
 
 
 def test_the_eyes_of_a_spectator_follow_the_page(shown):

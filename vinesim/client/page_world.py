@@ -19,7 +19,8 @@ from vinesim.physics.rigid.human_shapes import SIDES
 from vinesim.scene.appearance import load_shears
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, Snapshot
+from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
+from vinesim.scene.wire_segments import WireSegments, wire_segments
 from vinesim.sensors.camera.exposure import usual_exposure
 from vinesim.sensors.camera.sunlight import OutdoorLight
 from vinesim.sensors.scene import textures
@@ -81,6 +82,12 @@ class PageWorld:
         self._at_rest = client.physics.snapshot().body_q.copy()
         self._moved_at = np.full(len(client.model.tree_first), -1)
         """[tree] tick"""
+        self._wires = wire_segments(client.model)
+        """For pages their segments are bodies, numbered behind those of plants."""
+        self._wire_q, self._wire_moved_at = self._wires.rest_q.astype(np.float32), np.full(len(self._wires), -1)
+        """[segment, 7] m, 1 as last seen, and [segment] the tick."""
+        self._wires_away = self._wires.piece[:0].astype(int)
+        """[k] Segments that were away from where they were drawn."""
         self._sway: Sway | None = None
         self._primitives: Primitives | None = None
         """None until a page asks."""
@@ -118,6 +125,7 @@ class PageWorld:
             self._ticks_before += self._client.physics.tick + 1
             self._client, self._snapshot = client, None
             self._moved_at[self._moved_at >= 0] = self._tick
+            self._wire_moved_at[self._wire_moved_at >= 0] = self._tick
         client.after_reset.append(self._follow_reset)
         self._visuals = None
         if self._sway is not None:
@@ -153,6 +161,7 @@ class PageWorld:
         snapshot = physics.snapshot()
         swayed = self._sway.apply(snapshot, np.flatnonzero(self._moved_at == self._tick))
         self._moved_at[swayed.moved_trees] = self._tick
+        self._follow_wires(snapshot.wires)
         if self._person is not None:
             hands = [physics.hand(self._client.name, side) for side in SIDES]
             self._hands = {
@@ -166,9 +175,17 @@ class PageWorld:
             self._snapshot = self._tick, swayed
         server.notify()
 
+    def _follow_wires(self, wires: SegmentPoses) -> None:
+        """Note which segments have moved."""
+        which = np.union1d(self._wires_away, wires.segment).astype(int)
+        now = _wire_poses(self._wires, which, wires)
+        moved = which[(now != self._wire_q[which]).any(1)]
+        self._wire_q[which], self._wire_moved_at[moved], self._wires_away = now, self._tick, wires.segment
+
     def _follow_reset(self) -> None:
         """All trees are at rest again: pages are told of those that had moved."""
         self._moved_at[self._moved_at >= 0] = self._tick + 1
+        self._wire_moved_at[self._wire_moved_at >= 0] = self._tick + 1
         if self._sway is not None:
             self._sway = Sway(self._client.model)
 
@@ -188,7 +205,7 @@ class PageWorld:
             {
                 "scene": scene.name, "seed": scene.seed, "sun": list(sun), "light": _light(sun[2]),
                 "rows": list(row_layout(model)), "room": min(primitives.plant_count, self._most), "reach": reach,
-                "bodies": len(model.body_mass), "dt": self._client.physics.dt,
+                "bodies": len(model.body_mass) + len(self._wires), "dt": self._client.physics.dt,
                 "interest": self._client.replicator.interest_radius,
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
@@ -201,7 +218,8 @@ class PageWorld:
             },
             plants
             | {
-                "tree_first": model.tree_first.astype(np.uint32), "poses": self._at_rest.astype(np.float32),
+                "tree_first": model.tree_first.astype(np.uint32),
+                "poses": np.concatenate([self._at_rest, self._wires.rest_q]).astype(np.float32),
                 "outline": outline, "hull": hull, "noise": _bytes(textures.noise_texture()), "leaf": _bytes(leaf),
                 "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(start, np.float32),
             } | ({} if self._person is None else _within_reach(model)),
@@ -234,7 +252,10 @@ class PageWorld:
         if snapshot.visuals is not self._visuals:
             self._follow_visuals(self._primitives, snapshot)
         body = self._bodies(np.flatnonzero(self._moved_at > since))
-        pose, rigid = snapshot.body_q[body], np.asarray(snapshot.visual_q).reshape(-1, 7)
+        wire = np.flatnonzero(self._wire_moved_at > since)
+        pose = np.concatenate([snapshot.body_q[body], _wire_poses(self._wires, wire, snapshot.wires)])
+        body = np.concatenate([body, len(self._client.model.body_mass) + wire])
+        rigid = np.asarray(snapshot.visual_q).reshape(-1, 7)
         haptics, self._haptics = self._haptics, {}
         shown: dict[str, Any] = {"owners": page_overlays.owners(self._client)} if self._overlay_pages else {}
         if self._replay is not None:
@@ -368,6 +389,14 @@ def _within_reach(model: Model) -> dict[str, np.ndarray]:
         "bunch_radius": model.bunch_radius.astype(np.float32), "bunch_stalk": stalk.astype(np.uint32),
         "stalk_length": model.body_length[stalk].astype(np.float32),
     }  # fmt: skip
+
+
+def _wire_poses(segments: WireSegments, which: np.ndarray, away: SegmentPoses) -> np.ndarray:
+    """Poses [k, 7] m, 1 of some segments [k], ascending."""
+    q = segments.rest_q[which].astype(np.float32)
+    _, here, there = np.intersect1d(which, away.segment, assume_unique=True, return_indices=True)
+    q[here] = away.q[there]
+    return q
 
 
 def _turns(pose: np.ndarray) -> np.ndarray:

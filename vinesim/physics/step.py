@@ -13,6 +13,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.physics.contact.contact_solver import ContactSolver
 from vinesim.physics.contact.deflected_wires import DeflectedWires
+from vinesim.physics.contact.wire_shapes import WireShapes
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.detachment import Blade, DetachmentMonitor
@@ -71,6 +72,7 @@ class Physics:
         self.rigid = RigidWorld(model, parameters=p)
         self.elastic_supports = ElasticSupports(self.plants, p)
         self.wires = DeflectedWires(model, self.elastic_supports, self.state.tree_awake, p.dt)
+        self.wire_shapes = WireShapes(model, self.elastic_supports, self.wires)
         wires = self.wires if self.wires.gives.any() else None
         if wires is not None:
             self.rigid.let_wires_give(wires)
@@ -239,6 +241,7 @@ class Physics:
             visual_q=self.visual_q(),
             moved_trees=np.union1d(self.plants.awake, self.remotely_posed),
             wind=self.wind_on_plants.state,
+            wires=self.wire_shapes.poses(),
         )
 
     def visuals(self) -> tuple[RigidVisual, ...]:

@@ -146,6 +146,9 @@ class SensorProcess:
             shared["body_q"][bodies] = physics.state.body_q[bodies]
             shared["tree_number"][trees] = shared["number"][0] = self._snapshot_count
             shared["bunch_attached"][:] = physics.state.bunch_attached
+            wires = physics.wire_shapes.poses()
+            shared["wire_count"][0] = moved = len(wires.segment)
+            shared["wire_segment"][:moved], shared["wire_q"][:moved] = wires.segment, wires.q
             shared["wind_strength"][0] = 0.0 if (wind := physics.wind_on_plants.state) is None else wind.strength
             if wind is not None:
                 shared["wind_time"][0] = wind.time

@@ -28,8 +28,9 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot, WindState
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, SegmentPoses, Snapshot, WindState
 from vinesim.scene.wind import Wind
+from vinesim.scene.wire_segments import wire_segments
 
 if TYPE_CHECKING:
     from vinesim.ros.sensor_node import SensorNode
@@ -92,12 +93,14 @@ class SensorChannel:
     def __init__(self, config: SensorConfig, context: BaseContext) -> None:
         model, sensors = config.model, len(config.sensor_frames)
         bodies, trees, bunches = len(model.body_mass), len(model.tree_first), len(model.bunch_body)
+        wires = len(wire_segments(model))
         self.snapshot = SharedSnapshot(
             {
                 "time": ((1,), "f8"), "frame_score": ((1,), "f8"),
                 "tick": ((1,), "i8"), "number": ((1,), "i8"),  # counts snapshots from 1
                 "visuals_version": ((1,), "i8"), "visual_count": ((1,), "i8"),
                 "body_q": ((bodies, 7), "f4"), "bunch_attached": ((bunches,), "?"),
+                "wire_count": ((1,), "i8"), "wire_segment": ((wires,), "i8"), "wire_q": ((wires, 7), "f4"),
                 "tree_number": ((trees,), "i8"),  # the snapshot in which each tree moved last
                 "wind_time": ((1,), "f8"), "wind_strength": ((1,), "f8"),  # 0: calm
                 "tree_air": ((trees, 3), "f4"), "tree_drawn": ((trees,), "f4"),
@@ -302,6 +305,8 @@ class SensorWorker:
             bodies = np.flatnonzero(has_moved[self.config.model.body_tree])
             self._state.body_q[bodies] = shared["body_q"][bodies]
             self._last_number = int(shared["number"][0])
+            wires = int(shared["wire_count"][0])
+            wire_poses = SegmentPoses(shared["wire_segment"][:wires].copy(), shared["wire_q"][:wires].copy())
             wind = None
             if self.config.wind is not None and shared["wind_strength"][0] > 0.0:
                 wind = WindState(
@@ -322,7 +327,7 @@ class SensorWorker:
         state, names = self._state, tuple(self.config.sensor_frames)
         snapshot = Snapshot(
             time, tick, state.body_q, state.bunch_attached, self._visuals.visuals, visual_q,
-            np.flatnonzero(has_moved), wind,
+            np.flatnonzero(has_moved), wind, wire_poses,
         )  # fmt: skip
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 

@@ -78,6 +78,11 @@ class DeflectedWires:
         self.renumber_rigid(lambda _: (0, NO_TREE), 0)
 
     @property
+    def geoms(self) -> kernels.WireGeoms:
+        """The wires as shapes."""
+        return self._geoms.struct
+
+    @property
     def deflected(self) -> np.ndarray:
         """Pieces [k] whose offset is not 0; a view that the next step changes."""
         return self._geoms.deflected[: self._geoms.count[0]]

@@ -53,6 +53,10 @@ class ElasticSupports:
         first, each from start to end."""
         self.count = len(first)
         """Supports in all."""
+        piece = nodes["support"][first]
+        self._piece = np.where(piece < len(model.fixed_start), piece, -1)
+        """[support] The piece of wire that it is, -1 for an arm."""
+        self._was_active = np.zeros(len(first), np.bool_)
         self._active, self._is_moved = np.zeros(len(first), np.int32), np.zeros(trees, np.bool_)
         self._active_count, self._moved_count = 0, np.zeros(1, np.int32)
         self.is_coupled = np.zeros(trees, np.bool_)
@@ -123,6 +127,13 @@ class ElasticSupports:
         """The supports [k] that the last :meth:`update` computed."""
         return self._active[: self._active_count]
 
+    def moved_pieces(self) -> np.ndarray:
+        """Pieces of wire [k] that were computed since the last call, or will be next: no other has moved."""
+        pieces = self._piece[self._was_active]
+        self._was_active[:] = False
+        self._was_active[self.active] = True
+        return pieces[pieces >= 0]
+
     def place(self, trees: np.ndarray) -> None:
         """Let the next :meth:`update` see that sleeping trees [k] were put somewhere else."""
         self._placed = np.union1d(self._placed, trees).astype(np.int32)
@@ -157,6 +168,7 @@ class ElasticSupports:
         supports = np.unique(np.concatenate([support, self._loaded, self._unloaded]))
         self._active_count = len(supports)
         self._active[: len(supports)] = supports
+        self._was_active[supports] = True
         of_awake = count[: len(self._awake)].sum()
         pairs = np.unique(np.stack([support, np.repeat(trees, count)])[:, :of_awake], axis=1)
         shared = np.bincount(pairs[0], minlength=len(self._active)) > 1

@@ -34,7 +34,7 @@ from vinesim.scene.values.sensors import (
 )
 from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, HandGestures, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
-from vinesim.scene.values.world import Contact, Detachment, Snapshot, WindState
+from vinesim.scene.values.world import Contact, Detachment, SegmentPoses, Snapshot, WindState
 
 __all__ = [
     "FORWARD_KINDS",
@@ -78,6 +78,7 @@ __all__ = [
     "RobotSample",
     "RobotSpec",
     "RobotUpdate",
+    "SegmentPoses",
     "Shape",
     "Snapshot",
     "TreeUpdate",

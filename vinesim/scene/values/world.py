@@ -26,6 +26,16 @@ class WindState:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class SegmentPoses:
+    """Where segments of wires are that are away from where they were drawn, see :mod:`vinesim.scene.wire_segments`."""
+
+    segment: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
+    """[k] Their numbers, ascending."""
+    q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 7), np.float32))
+    """[k, 7] m, 1"""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class Snapshot:
     """The whole world at one instant, as sensors need it: taken by the physics thread, read by any other."""
 
@@ -45,6 +55,8 @@ class Snapshot:
     wind: WindState | None = None
     """None: the air is calm. Else ``body_q`` lacks the sway of trees on which wind is not simulated; see
     :mod:`vinesim.physics.plants.sway`."""
+    wires: SegmentPoses = dataclasses.field(default_factory=SegmentPoses)
+    """All other segments of wires are where they were drawn."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

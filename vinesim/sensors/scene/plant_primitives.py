@@ -18,7 +18,7 @@ STEM_TINT = (0.19, 0.22, 0.075)
 """Linear RGB reflectance of brown canes, and of green stems, peduncles and rachises: GUESSED by eye."""
 
 
-def cane_batch(model: Model, still: int) -> Batch:
+def cane_batch(model: Model) -> Batch:
     """One round cone for each piece of cane and peduncle."""
     bodies = np.flatnonzero((model.body_organ != int(Organ.BUNCH)) & (model.body_length > 0.0))
     rng = np.random.default_rng(5)

@@ -21,7 +21,8 @@ from vinesim.scene import berries
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import RigidVisual, Shape, Snapshot
+from vinesim.scene.values import RigidVisual, SegmentPoses, Shape, Snapshot
+from vinesim.scene.wire_segments import wire_segments
 from vinesim.sensors.raster import renderer_selection
 from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
 from vinesim.sensors.scene import textures
@@ -31,7 +32,13 @@ from vinesim.sensors.scene.plant_primitives import cane_batch, leaf_batches
 from vinesim.sensors.scene.primitive_batches import Batch, placeholder_batch
 from vinesim.sensors.scene.primitive_clusters import ClusterLayout, join_rigid, lay_out
 from vinesim.sensors.scene.rigid_primitives import rigid_batches
-from vinesim.sensors.scene.static_primitives import grass_batch, litter_batch, row_layout, trellis_batch
+from vinesim.sensors.scene.static_primitives import (
+    grass_batch,
+    litter_batch,
+    row_layout,
+    trellis_batches,
+    wire_batch,
+)
 
 _SKY_OF_RIGID = 0.7
 """Share of the sky that robots, people and boxes see: GUESSED, nothing is baked for them."""
@@ -73,9 +80,11 @@ class Primitives:
         self.rasterizer = renderer_selection.create_rasterizer(renderer, device)
         """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`
         does so itself."""
-        bodies = len(model.body_mass)
-        self._static_carrier = bodies
-        """Carrier of the static scene; those of rigid bodies follow it."""
+        self._bodies, self._wires = len(model.body_mass), wire_segments(model)
+        self._static_carrier = self._bodies + len(self._wires)
+        """Carrier of the static scene; before it are those of plants' bodies and of segments of wires, behind it those
+        of rigid bodies."""
+        self._moved_wires = SegmentPoses()
         self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
@@ -130,7 +139,8 @@ class Primitives:
         return {name: self._columns[column].numpy()[rows] for name, column in names.items()}
 
     def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
-        """Poses [..., 7] m, 1 of the carriers of some primitives [...]: a plant's body, a rigid body, or the world."""
+        """Poses [..., 7] m, 1 of the carriers of some primitives [...]: a body of a plant, a segment of wire, a rigid
+        body, or the world."""
         return self._poses[self._carrier.numpy()[primitive]].astype(float)
 
     # -- building
@@ -163,17 +173,17 @@ class Primitives:
 
     def _plant_batches(self, grass: float, low: np.ndarray, high: np.ndarray) -> list[Batch]:
         """Plants, trellis, grass and fallen leaves on the ground from ``low`` to ``high`` [2] m."""
-        model, bodies = self.model, self._static_carrier
-        batches = [cane_batch(model, bodies), *leaf_batches(model)]
+        model, static = self.model, self._static_carrier
+        batches = [cane_batch(model), *leaf_batches(model)]
         every = np.arange(len(model.bunch_body))
         pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
         batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], self._ripeness)
-        around = [trellis_batch(model, bodies)]
+        around = [*trellis_batches(model, static), wire_batch(model, self._wires, self._bodies, len(model.tree_first))]
         if grass > 0.0:
             age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
-            around += [grass_batch(row_layout(model), low, high, grass, bodies), litter_batch(low, high, age, bodies)]
+            around += [grass_batch(row_layout(model), low, high, grass, static), litter_batch(low, high, age, static)]
         batches += [b for b in around if b is not None]
-        return [b for b in batches if len(b)] or [placeholder_batch(bodies)]
+        return [b for b in batches if len(b)] or [placeholder_batch(static)]
 
     def _open(self, baked: disk_cache.Arrays) -> None:
         """Take over what :meth:`_bake` made; poses are not yet applied."""
@@ -192,9 +202,9 @@ class Primitives:
         self._plant_lamps = np.flatnonzero(plants.material == int(materials.LAMP))
         nothing = np.zeros(0, np.float32)  # the columns hold these: hundreds of megabytes in a large vineyard
         self._plants = dataclasses.replace(plants, **dict.fromkeys(_ONLY_IN_COLUMNS, nothing))
-        trees = len(self.model.tree_first)
+        owners = len(self.model.tree_first) + len(self.model.fixed_start)  # trees, then pieces of wire
         self._by_owner = np.argsort(self._plants.owner, kind="stable")
-        self._owner_start = np.searchsorted(self._plants.owner[self._by_owner], np.arange(trees + 1))
+        self._owner_start = np.searchsorted(self._plants.owner[self._by_owner], np.arange(owners + 1))
         self._poses = np.zeros((0, 7), np.float32)
         self._build(())
 
@@ -234,7 +244,10 @@ class Primitives:
         self._bind()
         poses = np.zeros((self._static_carrier + 1 + len(visuals), 7), np.float32)
         poses[:, 6] = 1.0
-        poses[: self._static_carrier] = self._poses[: self._static_carrier] if len(self._poses) else self._body_q
+        if len(self._poses):
+            poses[: self._static_carrier] = self._poses[: self._static_carrier]
+        else:
+            poses[: self._bodies], poses[self._bodies : self._static_carrier] = self._body_q, self._wires.rest_q
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
         self._poses = self._pose_array.numpy() if self._pose_array.device.is_cpu else poses
         """[carrier, 7]; on a CPU the kernels read this very memory."""
@@ -324,28 +337,33 @@ class Primitives:
             self._body_q = body_q
             self._build(snapshot.visuals)
             # a world that is new, or was set back, need not say what moved
-            differs = (np.asarray(body_q, np.float32) != self._poses[: self._static_carrier]).any(1)
+            differs = (np.asarray(body_q, np.float32) != self._poses[: self._bodies]).any(1)
             trees = np.union1d(trees, self.model.body_tree[differs])
         attached = np.asarray(snapshot.bunch_attached, bool)
         changed = np.flatnonzero(attached != self._attached)
         if len(changed):
             self._attached = attached.copy()
             self.clusters.shown.assign(_clusters_shown(self.cluster_bunch, attached))
-        dirty = self._tree_clusters(trees)
+        wires, before = snapshot.wires, self._moved_wires.segment
+        of_wires = self._wires.piece[np.union1d(before, wires.segment).astype(int)]
+        dirty = self._clusters_of(np.concatenate([trees, len(self.model.tree_first) + np.unique(of_wires)]))
         if len(changed):
             dirty = np.union1d(dirty, np.flatnonzero(np.isin(self.cluster_bunch, changed)))
         first_visual = self._static_carrier + 1
         if new_visuals or not np.array_equal(self._poses[first_visual:], visual_q):
             dirty = np.concatenate([dirty, self.rigid_clusters])
         if len(dirty):
-            self._poses[: self._static_carrier] = body_q
+            self._poses[: self._bodies] = body_q
+            self._poses[self._bodies + before] = self._wires.rest_q[before]
+            self._poses[self._bodies + wires.segment] = wires.q
+            self._moved_wires = wires
             self._poses[first_visual:] = visual_q
             self._pose(dirty)
         return dirty
 
-    def _tree_clusters(self, trees: np.ndarray) -> np.ndarray:
-        """Clusters that the given trees [k] move."""
-        start, size = self._owner_start[trees], self._owner_start[trees + 1] - self._owner_start[trees]
+    def _clusters_of(self, owners: np.ndarray) -> np.ndarray:
+        """Clusters that the given trees, and pieces of wire, which are numbered behind all trees, [k] move."""
+        start, size = self._owner_start[owners], self._owner_start[owners + 1] - self._owner_start[owners]
         inner = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
         return self._by_owner[np.repeat(start, size) + inner]
 

@@ -1,4 +1,4 @@
-"""What stands static_carrier as primitives: posts, wires, trunks and arms; grass and herbs."""
+"""Posts, wires, trunks and arms as primitives; grass and herbs. Of these only wires under tension move."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from vinesim.kernels.shading import materials
 from vinesim.scene import leaves
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
+from vinesim.scene.wire_segments import WireSegments, cut
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 from vinesim.sensors.scene import textures
 from vinesim.sensors.scene.primitive_batches import Batch, make_batch, stack_columns
 
 _CELL_SIZE = 2.5
-"""Side of the squares in which things that stand static_carrier are clustered [m]."""
+"""Side of the squares in which things that never move are clustered [m]."""
 _MAX_SEGMENT = 0.5
-"""Longest piece of a post or wire [m]."""
+"""Longest piece of what never moves [m]."""
 _TRELLIS = {
     Organ.POLE: (int(materials.POST), (0.36, 0.33, 0.29)),
     Organ.WIRE: (int(materials.WIRE), (0.33, 0.34, 0.35)),
@@ -31,40 +32,49 @@ def _ground_cells(position: np.ndarray, first: int) -> np.ndarray:
     return (first + cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
 
 
-def trellis_batch(model: Model, static_carrier: int) -> Batch | None:
-    if not len(model.fixed_organ):
+def trellis_batches(model: Model, static_carrier: int) -> list[Batch]:
+    """All that stands, but for :func:`wire_batch`."""
+    still = np.flatnonzero(model.fixed_tension <= 0.0)
+    if not len(still):
+        return []
+    # long ones in pieces: a box around a whole one holds half of the vineyard
+    length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)[still]
+    whole, begin, stop = cut(length, _MAX_SEGMENT)
+    values = _cones(model, still[whole], begin, stop)
+    middle = 0.5 * (values["a"] + values["b"])
+    return [make_batch(CONE, carrier=static_carrier, group=_ground_cells(middle, 0), **values)]
+
+
+def wire_batch(model: Model, segments: WireSegments, first_carrier: int, first_group: int) -> Batch | None:
+    """The segments of wires that give, each on a carrier of its own, in a group for each piece of wire."""
+    if not len(segments):
         return None
-    # long wires in pieces: a box around a whole one holds half of the vineyard
-    length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)
-    pieces = np.maximum(np.ceil(length / _MAX_SEGMENT), 1).astype(int)
-    whole = np.repeat(np.arange(len(pieces)), pieces)
-    share = np.arange(len(whole)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    ends = [(share + k)[:, None] / pieces[whole][:, None] for k in (0, 1)]
-    start, end = (model.fixed_start[whole] * (1.0 - s) + model.fixed_end[whole] * s for s in ends)
-    thick, thin = (model.fixed_radius[whole, :1] * (1.0 - s) + model.fixed_radius[whole, 1:] * s for s in ends)
-    organ, index = model.fixed_organ[whole], model.fixed_index[whole]
+    values = _cones(model, segments.piece, segments.start, segments.end)
+    for end in "ab":
+        values[end][:, :3] -= segments.rest_q[:, :3]
+    carrier = first_carrier + np.arange(len(segments))
+    return make_batch(CONE, carrier=carrier, group=first_group + segments.piece, **values)
+
+
+def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray) -> dict[str, np.ndarray]:
+    """Values of the parts of fixed pieces [part] between two shares of their length [part], as drawn."""
+    way = model.fixed_end - model.fixed_start
+    length = np.linalg.norm(way, axis=1)[piece]
+    start, end = (model.fixed_start[piece] + share[:, None] * way[piece] for share in (begin, stop))
+    radius = model.fixed_radius[piece]
+    thick, thin = (radius[:, 0] * (1.0 - share) + radius[:, 1] * share for share in (begin, stop))
+    organ, index = model.fixed_organ[piece], model.fixed_index[piece]
     table = {o: _TRELLIS[Organ(int(o))] for o in np.unique(organ)}
     material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
     rng = np.random.default_rng(3)
-    seed = rng.uniform(size=int(index.max()) + 1)[index] * 7.0
+    seed = rng.uniform(size=int(model.fixed_index.max()) + 1)[index] * 7.0
     # bark runs through from piece to piece: distances count from the foot of a post, along a wire
-    along = np.where(
-        np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1),
-        start[:, 2],
-        length[whole] * ends[0][:, 0],
-    )
-    return make_batch(
-        CONE,
-        stack_columns(start, thick),
-        b=stack_columns(end, thin),
-        c=stack_columns(along, seed, 0.0, 0.0),
-        material=material,
-        tint=tint,
-        organ=organ,
-        label=organ * label(Organ(1), 0) + index,
-        carrier=static_carrier,
-        group=_ground_cells((start + end) * 0.5, 0),
-    )
+    upright = np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1)
+    return {
+        "a": stack_columns(start, thick), "b": stack_columns(end, thin),
+        "c": stack_columns(np.where(upright, start[:, 2], length * begin), seed, 0.0, 0.0),
+        "material": material, "tint": tint, "organ": organ, "label": organ * label(Organ(1), 0) + index,
+    }  # fmt: skip
 
 
 def row_layout(model: Model) -> tuple[float, float]:

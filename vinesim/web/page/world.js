@@ -44,7 +44,7 @@ export class World {
   constructor(header) {
     const { arrays } = header;
     this.header = header;
-    this.bodies = header.bodies;
+    this.bodies = header.bodies; // of plants, then segments of wires
     this.plants = header.room; // primitives of plants and ground, at most
     this.group = new THREE.Group();
     this.group.rotation.x = -Math.PI / 2; // the world's z is up, the browser's y
