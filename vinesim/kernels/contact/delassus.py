@@ -24,40 +24,45 @@ from vinesim.kernels.contact.structs import (
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.func
-def factor_entry(is_implicit: bool, e: int, factors: RigidFactors):
-    """Entry of L of M^, or of M if nothing is implicit."""
-    value = factors.plain[e]
-    if is_implicit:
-        value = factors.implicit[e]
-    return value
-
-
-@wp.func
-def solve_rigid_row(
-    row: int, last_dof: int, rigid: RigidBodies, factors: RigidFactors, jacobian: wp.array2d(dtype=wp.float64),
-    response_out: wp.array2d(dtype=wp.float64),
+@wp.func_native("""
+    const auto pitch = [](const auto& array) { return array.strides[0] / (int)sizeof(double); };
+    const double* const from = jacobian.data + row * pitch(jacobian);
+    double* const to = response.data + row * pitch(response);
+    const int shift = pitch(response);
+    for (int i = first; i < end; ++i) {
+        for (int axis = 0; axis < 3; ++axis) to[axis * shift + i] = from[axis * pitch(jacobian) + i];
+    }
+    for (int i = end - 1; i >= first; --i) {
+        const double x = to[i], y = to[shift + i], z = to[2 * shift + i];
+        if (x == 0.0 && y == 0.0 && z == 0.0) continue;
+        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) {
+            double* const at = to + column.data[e];
+            at[0] -= entry.data[e] * x;
+            at[shift] -= entry.data[e] * y;
+            at[2 * shift] -= entry.data[e] * z;
+        }
+    }
+    for (int i = first; i < end; ++i) {
+        double x = to[i] * inverse.data[i], y = to[shift + i] * inverse.data[i], z = to[2 * shift + i] * inverse.data[i];
+        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) {
+            const double* const at = to + column.data[e];
+            x -= entry.data[e] * at[0];
+            y -= entry.data[e] * at[shift];
+            z -= entry.data[e] * at[2 * shift];
+        }
+        to[i] = x;
+        to[shift + i] = y;
+        to[2 * shift + i] = z;
+    }
+""")
+def solve_three_rows(
+    row: int, first: int, end: int, start: wp.array(dtype=wp.int32), size: wp.array(dtype=wp.int32),
+    column: wp.array(dtype=wp.int32), entry: wp.array(dtype=wp.float64), inverse: wp.array(dtype=wp.float64),
+    jacobian: wp.array2d(dtype=wp.float64), response: wp.array2d(dtype=wp.float64),
 ):  # fmt: skip
-    """Solve L^T D L x = j for one row j of the Jacobian, within one kinematic tree of MuJoCo."""
-    tree = rigid.dof_tree[last_dof]
-    first = factors.tree_dof[tree]
-    end = first + factors.tree_dof_count[tree]
-    for i in range(first, end):
-        response_out[row, i] = jacobian[row, i]
-    is_implicit = factors.implicit_inverse[last_dof] != wp.float64(0.0)
-    for k in range(end - first):
-        i = end - 1 - k
-        for e in range(factors.row_start[i], factors.row_start[i] + factors.row_count[i] - 1):
-            j = factors.column[e]
-            response_out[row, j] = response_out[row, j] - factor_entry(is_implicit, e, factors) * response_out[row, i]
-    for i in range(first, end):
-        pivot = factors.plain_inverse[i]
-        if is_implicit:
-            pivot = factors.implicit_inverse[i]
-        value = response_out[row, i] * pivot
-        for e in range(factors.row_start[i], factors.row_start[i] + factors.row_count[i] - 1):
-            value = value - factor_entry(is_implicit, e, factors) * response_out[row, factors.column[e]]
-        response_out[row, i] = value
+    """Solve L^T D L x = j for the three rows j of the Jacobian from ``row`` on, within the degrees of freedom from
+    ``first`` to ``end`` of one kinematic tree; ``entry`` of L, ``inverse`` of D."""
+    ...
 
 
 @wp.kernel
@@ -72,11 +77,24 @@ def respond_rigidly(
     # out
     rows_out: Rows,
 ):
-    """One thread per row j: M^-1 j of one kinematic tree of MuJoCo. The response was zeroed before."""
-    row = items[wp.tid()]
-    other = contacts.other[row // 3]
+    """One thread per contact: M^-1 j of its three rows j, of one kinematic tree of MuJoCo."""
+    c = items[wp.tid()]
+    other = contacts.other[c]
     if other >= 0 and geoms.dof[other] >= 0:
-        solve_rigid_row(row, geoms.dof[other], rigid, factors, rows_out.rigid_jacobian, rows_out.rigid_response)
+        last_dof = geoms.dof[other]
+        tree = rigid.dof_tree[last_dof]
+        first = factors.tree_dof[tree]
+        end = first + factors.tree_dof_count[tree]
+        if factors.implicit_inverse[last_dof] != wp.float64(0.0):
+            solve_three_rows(
+                3 * c, first, end, factors.row_start, factors.row_count, factors.column, factors.implicit,
+                factors.implicit_inverse, rows_out.rigid_jacobian, rows_out.rigid_response,
+            )  # fmt: skip
+        else:
+            solve_three_rows(
+                3 * c, first, end, factors.row_start, factors.row_count, factors.column, factors.plain,
+                factors.plain_inverse, rows_out.rigid_jacobian, rows_out.rigid_response,
+            )  # fmt: skip
 
 
 @wp.func

@@ -21,6 +21,8 @@ MESH = wp.constant(7)
 
 MIN_COPLANAR_COSINE = wp.constant(wp.float64(0.999))
 """[1] Least cosine between the normals at both ends of the part of a segment that lies along one face. TUNED."""
+MIN_SLANT = wp.constant(wp.float64(1.0e-6))
+"""[1] A segment whose square of the sine to a cylinder's axis is smaller runs along its side."""
 SLOPE_BISECTIONS = wp.constant(30)
 """Halvings of the segment in the search for its closest point: to 1e-9 of its length."""
 ELLIPSOID_NEWTON_STEPS = wp.constant(12)
@@ -195,6 +197,15 @@ def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
     flat = wp.float64(1.0e-9) * wp.length(along)
     if flat == zero:
         return zero
+    if (
+        kind == CYLINDER
+    ):  # where its axis is closest, if the side is closest there: no other point is nearer to the side
+        t = closest_to_axis(a, along)
+        p = a + t * along
+        across = along[0] * along[0] + along[1] * along[1]
+        is_outside = p[0] * p[0] + p[1] * p[1] > size[0] * size[0]
+        if is_outside and wp.abs(p[2]) <= size[1] and across > MIN_SLANT * wp.length_sq(along):
+            return t
     if distance_slope(kind, size, a, along) > flat:
         return zero
     if distance_slope(kind, size, b, along) < -flat:

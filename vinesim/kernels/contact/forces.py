@@ -43,13 +43,15 @@ def store_contact(
     force_v = impulse[2] / parameters.dt + contacts_out.damping[c] * slip_v
     anchor = -force_u / contacts_out.stiffness[c] * t1
     anchor = anchor - force_v / contacts_out.stiffness[c] * t2
+    friction = impulse[1] * t1 + impulse[2] * t2
+    if impulse[0] <= wp.float64(0.0):  # an open one starts from nothing, but is listed: it is looked for, too
+        anchor = wp.vec3d()
+        friction = wp.vec3d()
     warm_start_out.feature[c] = contacts_out.feature[c]
     warm_start_out.other[c] = contacts_out.other[c]
-    warm_start_out.normal_impulse[c] = impulse[0]
-    warm_start_out.friction_impulse[c] = impulse[1] * t1 + impulse[2] * t2
+    warm_start_out.normal_impulse[c] = wp.max(impulse[0], wp.float64(0.0))
+    warm_start_out.friction_impulse[c] = friction
     warm_start_out.anchor[c] = anchor
-    if impulse[0] <= wp.float64(0.0):
-        warm_start_out.feature[c] = -1
 
 
 @wp.kernel

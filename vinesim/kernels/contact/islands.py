@@ -80,11 +80,13 @@ def rigid_island(other: int, geoms: Geoms, rigid: RigidBodies):
 @wp.func
 def insert_sorted(body: int, count: int, bodies_out: wp.array(dtype=wp.int32)):
     """Insert a body (none if negative) into a sorted list of ``count``, each once; returns their number."""
+    length = count
+    if body < 0:
+        return length
     at = int(count)
     while at > 0 and bodies_out[at - 1] >= body:
         at = at - 1
-    length = count
-    if body >= 0 and (at == count or bodies_out[at] != body):
+    if at == count or bodies_out[at] != body:
         for k in range(count - at):
             bodies_out[count - k] = bodies_out[count - k - 1]
         bodies_out[at] = body

@@ -17,6 +17,7 @@ from vinesim.kernels.contact.structs import (
     Parameters,
     PlantBodies,
     RigidBodies,
+    RigidFactors,
     Rows,
     WarmStart,
 )
@@ -111,12 +112,14 @@ def write_bias(
     t1 = wp.vec3d(axes[1, 0], axes[1, 1], axes[1, 2])
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
     count = warm_start.count[0]
+    middle = wp.min(c, count - 1)
     looked = int(0)
-    while looked < count:  # a contact that lasts is near the same place in the list
-        k = (c + looked) % count
+    while looked < 2 * count:  # a contact that lasts is near the same place in the list, before or behind it
+        step = (looked + 1) // 2
+        k = middle + wp.where(looked % 2 == 1, step, -step)
         looked = looked + 1
-        if warm_start.feature[k] == feature and warm_start.other[k] == other:
-            looked = count
+        if k >= 0 and k < count and warm_start.feature[k] == feature and warm_start.other[k] == other:
+            looked = 2 * count
             rows_out.impulse[3 * c] = warm_start.normal_impulse[k]
             rows_out.impulse[3 * c + 1] = wp.dot(t1, warm_start.friction_impulse[k])
             rows_out.impulse[3 * c + 2] = wp.dot(t2, warm_start.friction_impulse[k])
@@ -188,6 +191,20 @@ def write_rows(
     write_bias(c, parameters, end_gap, contacts_out, warm_start, rows_out)
 
 
+@wp.func_native("""
+    for (int r = row; r < row + 3; ++r) {
+        double* const a = jacobian.data + (size_t)r * (jacobian.strides[0] / sizeof(double));
+        double* const b = response.data + (size_t)r * (response.strides[0] / sizeof(double));
+        for (int i = first; i < end; ++i) a[i] = b[i] = 0.0;
+    }
+""")
+def clear_three_rows(
+    row: int, first: int, end: int, jacobian: wp.array2d(dtype=wp.float64), response: wp.array2d(dtype=wp.float64)
+):
+    """Clear the entries from ``first`` to ``end`` of three rows."""
+    ...
+
+
 @wp.kernel
 def write_contact_rows(
     # model
@@ -199,15 +216,27 @@ def write_contact_rows(
     items: wp.array(dtype=wp.int32),
     bodies: PlantBodies,
     rigid: RigidBodies,
+    factors: RigidFactors,
     candidates: Candidates,
     warm_start: WarmStart,
     # out
+    spans_out: wp.array(dtype=wp.vec2i),
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """One thread per contact: its three rows. The rigid Jacobian was zeroed before."""
+    """One thread per contact: its three rows. spans_out: [contact] from which degree of freedom to which its rows of the
+    rigid Jacobian and the rigid response are not 0; all others stay as they are."""
     c = items[wp.tid()]
     slots = candidates.feature.shape[1]
+    span = spans_out[c]
+    clear_three_rows(3 * c, span[0], span[1], rows_out.rigid_jacobian, rows_out.rigid_response)
+    spans_out[c] = wp.vec2i(0, 0)
+    g = contacts_out.other[c]
+    if g >= 0:
+        last_dof = geoms.dof[g]
+        if last_dof >= 0:
+            tree = rigid.dof_tree[last_dof]
+            spans_out[c] = wp.vec2i(factors.tree_dof[tree], factors.tree_dof[tree] + factors.tree_dof_count[tree])
     write_rows(
         c, contacts_out.source[c] // slots, contacts_out.source[c] % slots, parameters, pairs, capsules, geoms, bodies,
         rigid, candidates, warm_start, contacts_out, rows_out,

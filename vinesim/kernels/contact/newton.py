@@ -18,19 +18,31 @@ SLIDING_SHARE = wp.constant(wp.float64(0.999999))
 
 
 @wp.func_native("""
-    const int pitch = a.strides[0] / (int)sizeof(double);
-    const int pitch_out = out.strides[0] / (int)sizeof(double);
-    for (int i = first; i < first + count; ++i) out.data[i * pitch_out] = a.data[i * pitch];
+    const double* const from = delassus.data + source;
+    double* const to = matrix.data + target;
+    for (int m = 0; m < count; ++m) {
+        const double* const entry = from + 3 * (place.data[contact.data[start + m]] - start);
+        for (int k = 0; k < 3; ++k) to[3 * m + k] = entry[k];
+    }
 """)
-def copy_entries(a: wp.array(dtype=wp.float64), first: int, count: int, out: wp.array(dtype=wp.float64)):
-    """Copy ``count`` numbers from ``first`` on to the same place."""
+def gather_row(
+    delassus: wp.array(dtype=wp.float64),
+    source: int,
+    contact: wp.array(dtype=wp.int32),
+    place: wp.array(dtype=wp.int32),
+    start: int,
+    count: int,
+    matrix: wp.array(dtype=wp.float64),
+    target: int,
+):
+    """Copy the entries of ``count`` contacts, listed from ``start`` on, of a row of a block that begins at ``source``."""
     ...
 
 
 @wp.func
 def write_sliding_rows(
     c: int,
-    place: int,
+    number: int,
     at: int,
     size: int,
     island: int,
@@ -41,12 +53,12 @@ def write_sliding_rows(
     rows: Rows,
     scratch_out: SolverScratch,
 ):
-    """Write both friction rows of a sliding contact, whose matrix rows begin at ``at`` and ``at + size``.
+    """Make both friction rows of a sliding contact, of entries of B that begin at ``at`` and ``at + size``.
 
     Friction is the projection of f = x_t - r_t / e on the disk of radius mu x_n, where r_t is the residual velocity along
     the tangents and e their eigenvalue. Linearised about the present f, with d = f / |f|, P = 1 - d d^T and
     s = mu x_n / |f|:  x_t - s P (x_t - r_t / e) - mu d x_n = 0 (Alart and Curnier, A mixed formulation for frictional
-    contact problems prone to Newton like solution methods, 1991).
+    contact problems prone to Newton like solution methods, 1991). ``number``: of the contact among those that press.
     """
     one = wp.float64(1.0)
     u = 3 * c + 1
@@ -62,12 +74,12 @@ def write_sliding_rows(
     uv = -share * du * dv
     vv = share * (one - dv * dv)
     for k in range(size):
-        along_u = rows.delassus[at + k] / eigenvalue
-        along_v = rows.delassus[at + size + k] / eigenvalue
+        along_u = scratch_out.matrix[at + k] / eigenvalue
+        along_v = scratch_out.matrix[at + size + k] / eigenvalue
         scratch_out.matrix[at + k] = uu * along_u + uv * along_v
         scratch_out.matrix[at + size + k] = uv * along_u + vv * along_v
     softer = one - contacts.compliance[c] / eigenvalue
-    n = at + 3 * place
+    n = at + 3 * number
     scratch_out.matrix[n] = scratch_out.matrix[n] - friction * du
     scratch_out.matrix[n + 1] = scratch_out.matrix[n + 1] + one - softer * uu
     scratch_out.matrix[n + 2] = scratch_out.matrix[n + 2] - softer * uv
@@ -88,8 +100,26 @@ def write_sliding_rows(
 
 
 @wp.func
+def list_pressed(block: int, columns: int, islands: Islands, rows: Rows, scratch_out: SolverScratch):
+    """List the contacts of a block that press, and let the others stay at 0; returns their number."""
+    start = islands.block_start[block]
+    count = int(0)
+    for place in range(start, islands.block_start[block + 1]):
+        c = islands.contact[place]
+        if rows.impulse[3 * c] > wp.float64(0.0):
+            scratch_out.pressed[start + count] = c
+            count = count + 1
+        else:
+            for row in range(3 * c, 3 * c + 3):
+                for k in range(columns):
+                    scratch_out.columns[row, k] = wp.float64(0.0)
+    return count
+
+
+@wp.func
 def write_block(
     block: int,
+    count: int,
     island: int,
     geoms: Geoms,
     rigid: RigidBodies,
@@ -98,76 +128,69 @@ def write_block(
     rows: Rows,
     scratch_out: SolverScratch,
 ):
-    """Write the linear system of one block: its matrix, and right-hand sides for w = 0 and for each entry of w.
+    """Write the linear system of the ``count`` contacts of a block that press: its matrix, and right-hand sides for w = 0
+    and for each entry of w.
 
-    Sticking rows: (B + compliance) x = -velocity - bias - J_r w. Rows of open contacts: x = 0. Friction of sliding
-    contacts: see :func:`write_sliding_rows`.
+    Sticking rows: (B + compliance) x = -velocity - bias - J_r w. Friction of sliding contacts: see
+    :func:`write_sliding_rows`.
     """
-    zero = wp.float64(0.0)
     start = islands.block_start[block]
-    size = 3 * (islands.block_start[block + 1] - start)
+    full = 3 * (islands.block_start[block + 1] - start)
+    size = 3 * count
     dofs = islands.first_dof[island + 1] - islands.first_dof[island]
-    for p in range(size // 3):
-        c = islands.contact[start + p]
+    for p in range(count):
+        c = scratch_out.pressed[start + p]
         n = 3 * c
-        normal = rows.impulse[n]
+        limit = contacts.friction[c] * rows.impulse[n]
         tangential = wp.sqrt(rows.impulse[n + 1] * rows.impulse[n + 1] + rows.impulse[n + 2] * rows.impulse[n + 2])
-        slides = normal > zero and tangential >= contacts.friction[c] * normal * SLIDING_SHARE
+        slides = tangential >= limit * SLIDING_SHARE
+        source = islands.matrix_start[block] + 3 * (contacts.place[c] - start) * full
+        at = islands.matrix_start[block] + 3 * p * size
         for axis in range(3):
-            row = n + axis
-            at = islands.matrix_start[block] + (3 * p + axis) * size
-            if normal <= zero:
-                for k in range(size):
-                    scratch_out.matrix[at + k] = zero
-                for k in range(1 + dofs):
-                    scratch_out.columns[row, k] = zero
-                scratch_out.matrix[at + 3 * p + axis] = wp.float64(1.0)
-            elif axis == 0 or not slides:
-                copy_entries(rows.delassus, at, size, scratch_out.matrix)
-                scratch_out.matrix[at + 3 * p + axis] = scratch_out.matrix[at + 3 * p + axis] + contacts.compliance[c]
+            gather_row(
+                rows.delassus, source + axis * full, scratch_out.pressed, contacts.place, start, count,
+                scratch_out.matrix, at + axis * size,
+            )  # fmt: skip
+            if axis == 0 or not slides:
+                row = n + axis
+                entry = at + axis * size + 3 * p + axis
+                scratch_out.matrix[entry] = scratch_out.matrix[entry] + contacts.compliance[c]
                 scratch_out.columns[row, 0] = -rows.velocity_free[row] - rows.bias[row]
                 for k in range(dofs):
                     dof = islands.dof[islands.first_dof[island] + k]
                     scratch_out.columns[row, 1 + k] = -rows.rigid_jacobian[row, dof]
         if slides:
-            at = islands.matrix_start[block] + (3 * p + 1) * size
             write_sliding_rows(
-                c, p, at, size, island, geoms, rigid, contacts, islands, rows, scratch_out
+                c, p, at + size, size, island, geoms, rigid, contacts, islands, rows, scratch_out
             )  # fmt: skip
 
 
 @wp.func_native("""
-    const int pitch = matrix.strides[0] / (int)sizeof(double);
-    const int column_pitch = columns.strides[1] / (int)sizeof(double);
-    const int row_pitch = columns.strides[0] / (int)sizeof(double);
-    double* const a = matrix.data + at * pitch;
+    double* const a = matrix.data + at;
+    const int pitch = columns.strides[0] / (int)sizeof(double);
+    const auto right_side = [&](int k) { return columns.data + (3 * contact.data[start + k / 3] + k % 3) * pitch; };
     for (int k = 0; k < size; ++k) {
-        const double* const __restrict__ pivot = a + k * size * pitch;
-        const double* const __restrict__ pivot_columns = columns.data + (3 * contact.data[start + k / 3] + k % 3) * row_pitch;
-        const double scale = 1.0 / pivot[k * pitch];
+        const double* const __restrict__ pivot = a + k * size;
+        const double* const __restrict__ pivot_right = right_side(k);
+        const double scale = 1.0 / pivot[k];
         for (int m = k + 1; m < size; ++m) {
-            double* const __restrict__ row = a + m * size * pitch;
-            const double factor = row[k * pitch] * scale;
+            double* const __restrict__ row = a + m * size;
+            const double factor = row[k] * scale;
             if (factor == 0.0) continue;
-            if (pitch == 1) {
-                for (int i = k + 1; i < size; ++i) row[i] -= factor * pivot[i];
-            } else {
-                for (int i = k + 1; i < size; ++i) row[i * pitch] -= factor * pivot[i * pitch];
-            }
-            double* const __restrict__ right = columns.data + (3 * contact.data[start + m / 3] + m % 3) * row_pitch;
-            for (int c = 0; c < count; ++c) right[c * column_pitch] -= factor * pivot_columns[c * column_pitch];
+            for (int i = k + 1; i < size; ++i) row[i] -= factor * pivot[i];
+            double* const __restrict__ right = right_side(m);
+            for (int i = 0; i < count; ++i) right[i] -= factor * pivot_right[i];
         }
     }
     for (int k = size - 1; k >= 0; --k) {
-        const double* const row = a + k * size * pitch;
-        double* const right = columns.data + (3 * contact.data[start + k / 3] + k % 3) * row_pitch;
+        const double* const row = a + k * size;
+        double* const __restrict__ right = right_side(k);
         for (int m = k + 1; m < size; ++m) {
-            const double entry = row[m * pitch];
-            const double* const below = columns.data + (3 * contact.data[start + m / 3] + m % 3) * row_pitch;
-            for (int c = 0; c < count; ++c) right[c * column_pitch] -= entry * below[c * column_pitch];
+            const double* const __restrict__ below = right_side(m);
+            for (int i = 0; i < count; ++i) right[i] -= row[m] * below[i];
         }
-        const double scale = 1.0 / row[k * pitch];
-        for (int c = 0; c < count; ++c) right[c * column_pitch] *= scale;
+        const double scale = 1.0 / row[k];
+        for (int i = 0; i < count; ++i) right[i] *= scale;
     }
 """)
 def eliminate(
@@ -181,20 +204,10 @@ def eliminate(
 ):
     """Gaussian elimination without pivoting of the matrix that begins at ``at``; its solutions replace ``columns``.
 
-    Row k of the matrix is row 3 * contact[start + k / 3] + k % 3 of the columns. Native, as Warp's loops over arrays in
-    structs are not vectorised, and a call copies its structs.
+    Row k of the matrix is row 3 * contact[start + k / 3] + k % 3 of the columns. B is positive definite, and sliding rows
+    change that little. Native, as Warp's loops over arrays in structs are not vectorised, and a call copies its structs.
     """
     ...
-
-
-@wp.func
-def solve_block(block: int, columns: int, islands: Islands, scratch_out: SolverScratch):
-    """Solve the system of one block. No pivoting: B is positive definite, and sliding rows change that little."""
-    start = islands.block_start[block]
-    size = 3 * (islands.block_start[block + 1] - start)
-    eliminate(
-        scratch_out.matrix, islands.matrix_start[block], size, islands.contact, start, scratch_out.columns, columns
-    )
 
 
 @wp.func_native("""
@@ -295,8 +308,12 @@ def newton_step(
     first = islands.first_dof[island]
     dofs = islands.first_dof[island + 1] - first
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
-        write_block(block, island, geoms, rigid, contacts, islands, rows_out, scratch_out)
-        solve_block(block, 1 + dofs, islands, scratch_out)
+        count = list_pressed(block, 1 + dofs, islands, rows_out, scratch_out)
+        write_block(block, count, island, geoms, rigid, contacts, islands, rows_out, scratch_out)
+        eliminate(
+            scratch_out.matrix, islands.matrix_start[block], 3 * count, scratch_out.pressed,
+            islands.block_start[block], scratch_out.columns, 1 + dofs,
+        )  # fmt: skip
     solve_rigid(island, contacts, islands, rows_out, scratch_out)
     for m in range(islands.start[island], islands.start[island + 1]):
         for row in range(3 * islands.contact[m], 3 * islands.contact[m] + 3):

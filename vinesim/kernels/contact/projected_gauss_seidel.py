@@ -44,6 +44,8 @@ def relax_contact(
 
     u = n + 1
     v = n + 2
+    if normal == zero and rows_out.impulse[u] == zero and rows_out.impulse[v] == zero:
+        return wp.abs(normal - before)
     ru = row_residual(u, geoms, rigid, contacts, islands, rows_out)
     rv = row_residual(v, geoms, rigid, contacts, islands, rows_out)
     eigenvalue = tangential_eigenvalue(c, geoms, rigid, contacts, islands, rows_out)

@@ -445,7 +445,9 @@ class SolverScratch:
     """What the solver of an island works with."""
 
     matrix: wp.array(dtype=wp.float64)
-    """[entry] as ``Rows.delassus``: the linear system of a Newton step."""
+    """[entry] the linear system of a Newton step, block by block as ``Rows.delassus``, of its pressed contacts alone."""
+    pressed: wp.array(dtype=wp.int32)
+    """[contact] those of each block that press, from the block's first place in the list on."""
     columns: wp.array2d(dtype=wp.float64)
     """[row, 1 + dof of the island] its right-hand sides: velocities without impulses, and Jacobians of the dofs."""
     rigid_system: wp.array2d(dtype=wp.float64)

@@ -23,9 +23,9 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
 
-ITEMS_PER_CHUNK = {"write_contact_rows": 16, "respond_rigidly": 48, "assemble_delassus": 16, "solve_islands": 1,
+ITEMS_PER_CHUNK = {"write_contact_rows": 16, "respond_rigidly": 16, "assemble_delassus": 16, "solve_islands": 1,
                    "store_warm_start": 48}  # fmt: skip
-"""Contacts, rows or islands that a thread takes at a time: work of 5 us and more."""
+"""Contacts or islands that a thread takes at a time: work of 5 us and more."""
 MATRIX_CONTACTS = 16
 """Room for the matrices of the blocks is made for blocks of so many contacts, and more when they are larger."""
 REMOVED_GEOM = np.iinfo(np.int32).max
@@ -70,6 +70,11 @@ class ImpulseSolver:
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
         }
+        self._rigid_spans, self._most_rows, self._columns = np.zeros((n, 2), np.int32), 0, 0
+        """[contact, 2] From which degree of freedom to which its rows of rigid bodies may be other than 0; the most
+        rows of one solve, and how long they are."""
+        self._dofs = slice(0, 0)
+        """From the first degree of freedom in contact to the last."""
         self._memory: dict[str, np.ndarray] = {}
         """See :meth:`_kept`."""
         self._wrench = np.zeros((2 * n, 6))
@@ -109,9 +114,14 @@ class ImpulseSolver:
         """Arrays whose size depends on the rigid world or on the matrices of the blocks.
 
         The large ones lie in memory that is kept: new pages took 4 ms when an actor joined. Every solve overwrites what
-        it reads of them.
+        it reads of them; rows of rigid bodies are 0 outside of their spans.
         """
         world, rows = self.rigid.mj_model, 3 * self.capacity
+        for name in ("rigid_jacobian", "rigid_response"):
+            if name in self._memory:
+                self._memory[name][: self._most_rows * self._columns] = 0.0
+        self._rigid_spans[:] = self._most_rows = 0
+        self._columns = world.nv
         self.rows = SharedArrays(
             structs.Rows,
             rigid_jacobian=self._kept("rigid_jacobian", (rows, world.nv)),
@@ -123,6 +133,7 @@ class ImpulseSolver:
         self.scratch = SharedArrays(
             structs.SolverScratch,
             matrix=self._kept("matrix", self._matrix.shape),
+            pressed=np.zeros(self.capacity, np.int32),
             columns=self._kept("columns", (rows, 1 + world.nv)),
             rigid_system=np.zeros((world.nv, 1 + world.nv)),
             **{name: self._kept(name, (rows,)) for name in ("impulse_first", "impulse_before", "direction")},
@@ -162,9 +173,7 @@ class ImpulseSolver:
             self._build_islands(1)
         rows, touched, island_count = self.rows, int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
         self.bodies = self.touched.body[:touched].copy()
-        rigid_jacobian, rigid_response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
-        rigid_jacobian[:] = 0.0
-        rigid_response[:] = 0.0
+        self._most_rows = max(self._most_rows, row_count)
         if self._wires is not None:
             self._end_at_wires(n, self._wires)
         self._write_contact_rows(n)
@@ -172,11 +181,15 @@ class ImpulseSolver:
         self.response.compute(n)
         is_constrained = bool(self.rigid.mj_data.nefc) and self.rigid.is_constrained(self._touched_rigid_bodies(n))
         if is_constrained:
-            rigid_response[:] = self.rigid.impulse_response(rigid_jacobian).T
+            self._rigid_spans[:n] = 0, self.rigid.mj_model.nv
+            response = self.rigid.impulse_response(rows.rigid_jacobian[:row_count])
+            rows.rigid_response[:row_count] = response.T
         else:
-            self._respond_rigidly(row_count)
+            self._respond_rigidly(n)
         self._assemble_delassus(n)
         self._solve_islands(island_count)
+        used = self.islands.dof[: self.islands.first_dof[island_count]]
+        self._dofs = slice(int(used.min()), int(used.max()) + 1) if len(used) else slice(0, 0)
         self._set_rigid_force(row_count)
         if is_constrained:
             self._follow_constraints(n, island_count)
@@ -215,8 +228,10 @@ class ImpulseSolver:
             wires.add_presses(force, -(force / share + self.rows.bias[3 * at]))
 
     def _set_rigid_force(self, row_count: int) -> None:
-        rows = self.rows
-        self.rigid_force = rows.impulse[:row_count] @ rows.rigid_jacobian[:row_count] / -self.parameters.dt
+        rows, dofs = self.rows, self._dofs
+        self.rigid_force = force = np.zeros(self.rigid.mj_model.nv)
+        impulse = rows.impulse[:row_count] @ rows.rigid_jacobian[:row_count, dofs]
+        force[dofs] = impulse / -self.parameters.dt
 
     def _follow_constraints(self, count: int, island_count: int) -> None:
         """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve took them to.
@@ -284,8 +299,8 @@ class ImpulseSolver:
         self._write_contact_rows = bind_shared(
             jacobians.write_contact_rows,
             [parameters, self._pairs.struct, capsules, geoms],
-            [bodies, rigid_bodies, candidates, warm_start],
-            [contacts, rows],
+            [bodies, rigid_bodies, rigid.factors.struct, candidates, warm_start],
+            [share(self._rigid_spans, wp.vec2i), contacts, rows],
         )
         self._respond_rigidly = bind_shared(
             delassus.respond_rigidly, [geoms], [rigid_bodies, rigid.factors.struct, contacts], [rows]

@@ -1,4 +1,5 @@
-"""Stamps of scans: those of the steps in which they began, however late they are computed."""
+"""What sensors read of the client's world: stamps of scans are those of the steps in which they began, however late
+they are computed; wires are where they are."""
 
 from __future__ import annotations
 
@@ -20,6 +21,8 @@ from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraOutput, LidarScan
 
@@ -50,12 +53,11 @@ class Node:
 class OneProcess:
     """The client's writer of snapshots and the worker that reads them, in one process, by turns."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, stack: contextlib.ExitStack) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, stack: contextlib.ExitStack, model: Model) -> None:
         self.node = Node()
         monkeypatch.setattr(SensorWorker, "_open_node", lambda *_: self.node)
         monkeypatch.setattr(sensor_process, "WorkerProcess", self._worker_process)
         scene, vinebot = load_scene("demo"), load_description("vinebot")
-        model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
         self.client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
         self.sensors = stack.enter_context(SensorProcess("robot", scene, model, vinebot, ros=True))
         self.sensors.attach(self.client)
@@ -81,7 +83,7 @@ class OneProcess:
 @pytest.fixture
 def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[OneProcess]:
     with contextlib.ExitStack() as stack:
-        yield OneProcess(monkeypatch, stack)
+        yield OneProcess(monkeypatch, stack, assemble([cane((50.0, 5.0, 1.0), radius=0.005)]))
 
 
 @pytest.mark.parametrize("turn", [2, 30], ids=["worker in time", "worker 0.3 s late"])
@@ -104,3 +106,23 @@ def test_scans_are_stamped_when_they_began_while_a_client_catches_up(world: OneP
     assert (np.diff(found) > 0.0).all()
     revolutions = np.diff(np.interp(found, stamps, simulated)) / SCAN_PERIOD
     np.testing.assert_allclose(revolutions, np.round(revolutions), atol=1e-3)
+
+
+def test_wires_that_a_swinging_shoot_takes_along_are_read_as_they_are(monkeypatch: pytest.MonkeyPatch):
+    model = generate(load_scene("demo"))
+    tree = int(model.body_tree[model.tie_body[model.tie_wire >= 0]][0])
+    with contextlib.ExitStack() as stack:
+        world = OneProcess(monkeypatch, stack, model)
+        physics, seen = world.client.physics, 0
+        physics.plants.wake(np.array([tree]))
+        physics.state.joint_qd[model.bodies_of(tree)] = 0.3
+        for _ in range(20):
+            world.client.tick()
+            world.client.tick()  # a snapshot is written every second step
+            assert world.worker._take_requests()
+            snapshot, _ = world.worker._read()
+            expected = physics.snapshot().wires
+            np.testing.assert_array_equal(snapshot.wires.segment, expected.segment)
+            np.testing.assert_array_equal(snapshot.wires.q, expected.q)
+            seen = max(seen, len(expected.segment))
+        assert seen > 0
