@@ -134,16 +134,32 @@ def follow(
 
 
 @wp.kernel(enable_backward=False)
-def lead_threads(address: wp.uint64, job: wp.uint64, threads: int, write: wp.uint64, yield_address: wp.uint64):
-    """The thread that launches."""
+def lead_threads(
+    # model
+    threads: int,
+    write: wp.uint64,
+    yield_address: wp.uint64,
+    # in
+    address: wp.uint64,
+    job: wp.uint64,
+):
+    """One thread in all: the one that launches."""
     lead(address, job, threads, write, yield_address)
 
 
 @wp.kernel(enable_backward=False)
 def follow_thread(
-    address: wp.uint64, thread: int, poll_time: int, pipe: int, clock: int, read: wp.uint64, get_time: wp.uint64
-):  # fmt: skip
-    """The others."""
+    # model
+    thread: int,
+    poll_time: int,
+    pipe: int,
+    clock: int,
+    read: wp.uint64,
+    get_time: wp.uint64,
+    # in
+    address: wp.uint64,
+):
+    """One thread in all: each of the others."""
     follow(address, thread, poll_time, pipe, clock, read, get_time)
 
 
@@ -168,7 +184,7 @@ class LaunchPool:
             reading, writing = os.pipe()
             self._pipes.append(writing)
             self._memory[self._states[i] + 1] = writing
-            given = [self._address, i, POLL_TIME, reading, time.CLOCK_MONOTONIC, *self._calls[:2]]
+            given = [i, POLL_TIME, reading, time.CLOCK_MONOTONIC, *self._calls[:2], self._address]
             run = bind_launch(follow_thread, given, [])
             arguments = (run, reading, self._memory)
             threading.Thread(target=_follow, args=arguments, name=f"launch pool {i}", daemon=True).start()
@@ -195,7 +211,7 @@ class LaunchPool:
         head = [0, chunk, 0, 0, len(numbers), len(numbers[0])]
         job = (ctypes.c_int64 * (len(head) + sum(map(len, numbers))))(*head, *(n for each in numbers for n in each))
         at_job = wp.uint64(ctypes.addressof(job))
-        run = bind_launch(lead_threads, [self._address, at_job, self.size, *self._calls[2:]], [])
+        run = bind_launch(lead_threads, [self.size, *self._calls[2:], self._address, at_job], [])
 
         def launch(threads: int, first: int = 0, partition: int = 0) -> None:
             if threads < 2 * chunk:
