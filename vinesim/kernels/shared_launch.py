@@ -18,22 +18,24 @@ from typing import cast
 
 import warp as wp
 
-from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.kernels.launch import BoundLaunch, bind_launch, usable_cores
 
 POLL_TIME = 300_000
 """[ns] More than passes between the launches of a step, much less than a step."""
 
 _IDLE, _ASSIGNED, _WORKING, _ASLEEP, _ENDED = range(5)
-"""States of a thread. It sleeps in a read from a pipe, into which one byte is written when it leaves that state."""
+"""States of a thread. It sleeps at a semaphore, which is posted when it leaves that state."""
 _NEXT_CHUNK, _JOB, _FIRST_THREAD, _LINE = 0, 8, 16, 8
 """Places in the memory of a pool: the next chunk to be taken, the address of the job, the states of the threads, each in
-a cache line of its own with the end of the pipe to write to."""
-_C_FUNCTIONS = ("read", "clock_gettime", "write", "sched_yield")
+a cache line of its own with the address of the semaphore."""
+_SEMAPHORE_SIZE = 128
+"""[bytes] More than any C library's ``sem_t``."""
+_C_FUNCTIONS = ("sem_wait", "clock_gettime", "sem_post", "sched_yield")
 """Functions of the C library that native code calls, by their addresses."""
 
 _COMMON = """
     typedef void (*Kernel)(void*, void*);
-    typedef long (*ReadOrWrite)(long, void*, size_t);
+    typedef signed (*Semaphore)(void*);
     typedef long (*GetTime)(long, long*);
     typedef void (*Yield)();
     long long* const pool = (long long*)(size_t)address;
@@ -77,8 +79,8 @@ _COMMON = """
     __atomic_store_n(pool, 0, __ATOMIC_RELAXED);
     __atomic_store_n(pool + 8, (long long)job, __ATOMIC_RELEASE);
     const long long wanted = threads < work[0] ? threads : work[0];
-    for (int i = 1; i < wanted; ++i) {
-        if (!is_set(i, 0, 1) && is_set(i, 3, 1)) ((ReadOrWrite)(size_t)write)((long)state_of(i)[1], pool, 1);
+    for (int i = 1; i < wanted; ++i) {  // to wake one takes as long as eight chunks
+        if (!is_set(i, 0, 1) && work[0] >= 8 && is_set(i, 3, 1)) ((Semaphore)(size_t)post)((void*)state_of(i)[1]);
     }
     while (run_chunk(work, 0)) {}
     for (int i = 1; i < threads; ++i) {
@@ -91,7 +93,7 @@ _COMMON = """
 #endif
 """
 )
-def lead(address: wp.uint64, job: wp.uint64, threads: int, write: wp.uint64, yield_: wp.uint64):
+def lead(address: wp.uint64, job: wp.uint64, threads: int, post: wp.uint64, yield_: wp.uint64):
     """Work on a job with the other threads until all of it is done."""
     ...
 
@@ -117,8 +119,7 @@ def lead(address: wp.uint64, job: wp.uint64, threads: int, write: wp.uint64, yie
             __atomic_store_n(state_of(thread), 0, __ATOMIC_RELEASE);
             since = now();
         } else if (polls % 64 == 0 && now() - since > poll_time && is_set(thread, 0, 3)) {
-            char byte;
-            while (((ReadOrWrite)(size_t)read)(pipe, &byte, 1) < 0) {}  // interrupted by a signal
+            while (((Semaphore)(size_t)wait)((void*)state_of(thread)[1])) {}  // interrupted by a signal
             since = now();
         }
         pause();
@@ -127,8 +128,8 @@ def lead(address: wp.uint64, job: wp.uint64, threads: int, write: wp.uint64, yie
 """
 )
 def follow(
-    address: wp.uint64, thread: int, poll_time: int, pipe: int, clock: int, read: wp.uint64, get_time: wp.uint64
-):
+    address: wp.uint64, thread: int, poll_time: int, clock: int, wait: wp.uint64, get_time: wp.uint64
+):  # fmt: skip
     """Work on every job, and sleep when there has been none for ``poll_time`` [ns]."""
     ...
 
@@ -137,14 +138,14 @@ def follow(
 def lead_threads(
     # model
     threads: int,
-    write: wp.uint64,
+    post: wp.uint64,
     yield_address: wp.uint64,
     # in
     address: wp.uint64,
     job: wp.uint64,
 ):
     """One thread in all: the one that launches."""
-    lead(address, job, threads, write, yield_address)
+    lead(address, job, threads, post, yield_address)
 
 
 @wp.kernel(enable_backward=False)
@@ -152,42 +153,47 @@ def follow_thread(
     # model
     thread: int,
     poll_time: int,
-    pipe: int,
     clock: int,
-    read: wp.uint64,
+    wait: wp.uint64,
     get_time: wp.uint64,
     # in
     address: wp.uint64,
 ):
     """One thread in all: each of the others."""
-    follow(address, thread, poll_time, pipe, clock, read, get_time)
+    follow(address, thread, poll_time, clock, wait, get_time)
 
 
 class LaunchPool:
     """Threads that share launches with the caller; see the module."""
 
     def __init__(self, size: int) -> None:
-        """``size``: how many work at once, the caller of a launch included."""
+        """``size``: how many work at once, the caller of a launch included; it works alone where it has one core."""
+        self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(usable_cores()))
+        size = size if len(self._cores) > 1 else 1
+        self._semaphores = [ctypes.create_string_buffer(_SEMAPHORE_SIZE) for _ in range(size)]
         try:
             library = ctypes.CDLL(None)
             calls = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value or 0 for name in _C_FUNCTIONS]
-        except (OSError, AttributeError, TypeError):  # not POSIX: the caller works alone
-            size, calls = 1, []
-        self.size = size
+            self._post = library.sem_post
+            can_sleep = not any(library.sem_init(semaphore, 0, 0) for semaphore in self._semaphores)
+        except (OSError, AttributeError, TypeError):
+            calls, can_sleep = [], False
+        self.size = size if can_sleep else 1  # without POSIX semaphores the caller works alone
         self._calls = [wp.uint64(call) for call in calls]
         self._memory = (ctypes.c_int64 * (_FIRST_THREAD + _LINE * (size + 1)))()
         base = -ctypes.addressof(self._memory) % 64 // 8
         self._address = wp.uint64(ctypes.addressof(self._memory) + 8 * base)
         self._states = [base + _FIRST_THREAD + _LINE * i for i in range(size)]
-        self._pipes: list[int] = []
-        for i in range(1, size):
-            reading, writing = os.pipe()
-            self._pipes.append(writing)
-            self._memory[self._states[i] + 1] = writing
-            given = [i, POLL_TIME, reading, time.CLOCK_MONOTONIC, *self._calls[:2], self._address]
-            run = bind_launch(follow_thread, given, [])
-            arguments = (run, reading, self._memory)
-            threading.Thread(target=_follow, args=arguments, name=f"launch pool {i}", daemon=True).start()
+        self._threads: list[threading.Thread] = []
+        self._current_core = getattr(library, "sched_getcpu", lambda: -1) if can_sleep else lambda: -1
+        self._core = -1
+        """Of the caller when it woke the others last."""
+        for i in range(1, self.size):
+            self._memory[self._states[i] + 1] = ctypes.addressof(self._semaphores[i])
+            given = [i, POLL_TIME, time.CLOCK_MONOTONIC, *self._calls[:2], self._address]
+            arguments = (bind_launch(follow_thread, given, []), self._memory, self._semaphores)
+            self._threads.append(threading.Thread(target=_follow, args=arguments, name=f"launch pool {i}", daemon=True))
+            self._threads[-1].start()
 
     def share(self, launches: Sequence[BoundLaunch], chunk: int) -> BoundLaunch:
         """A launch that the threads share in chunks of so many entries of its list.
@@ -224,11 +230,21 @@ class LaunchPool:
         return cast(BoundLaunch, launch)
 
     def wake(self) -> None:
-        """Wake the threads that sleep, for a launch that comes soon."""
+        """Wake the threads that sleep, for a launch that comes soon; on other cores than the caller's.
+
+        Where a virtual machine does not tell that its cores share a cache, Linux wakes a thread on the core on which it
+        ran last, even if the caller is there now and others are free: the caller would wait for as long as it polls.
+        """
+        if self.size > 1 and (core := self._current_core()) != self._core:
+            self._core = core
+            if others := self._cores - {core}:
+                for thread in self._threads:
+                    with contextlib.suppress(OSError):
+                        os.sched_setaffinity(thread.native_id or 0, others)
         for i in range(1, self.size):
             if self._memory[self._states[i]] == _ASLEEP:  # which only this thread changes
                 self._memory[self._states[i]] = _IDLE
-                os.write(self._pipes[i - 1], b" ")
+                self._post(self._semaphores[i])
 
     @property
     def sleeping(self) -> int:
@@ -239,15 +255,14 @@ class LaunchPool:
         """End the threads."""
         for i in range(1, self.size):
             self._memory[self._states[i]] = _ENDED
-            os.close(self._pipes[i - 1])  # which ends a read, too
-        self.size, self._pipes = 1, []
+            self._post(self._semaphores[i])
+        self.size = 1
 
     def __del__(self) -> None:
         with contextlib.suppress(AttributeError):  # of one that could not be made
             self.close()
 
 
-def _follow(run: BoundLaunch, pipe: int, memory: object) -> None:
-    """The life of a thread; ``memory`` is kept as long as it lives."""
+def _follow(run: BoundLaunch, *_memory: object) -> None:
+    """The life of a thread, which keeps its memory."""
     run(1)
-    os.close(pipe)
