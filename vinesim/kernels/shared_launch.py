@@ -238,9 +238,9 @@ class LaunchPool:
         if self.size > 1 and (core := self._current_core()) != self._core:
             self._core = core
             if others := self._cores - {core}:
-                for thread in self._threads:
+                for number in filter(None, (thread.native_id for thread in self._threads)):
                     with contextlib.suppress(OSError):
-                        os.sched_setaffinity(thread.native_id or 0, others)
+                        os.sched_setaffinity(number, others)
         for i in range(1, self.size):
             if self._memory[self._states[i]] == _ASLEEP:  # which only this thread changes
                 self._memory[self._states[i]] = _IDLE

@@ -50,7 +50,7 @@ Device = Annotated[
     str, typer.Option(help="Where plants are simulated, cameras and lidars compute: cpu, cuda or cuda:N.")
 ]
 Threads = Annotated[
-    int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 32 awake trees, on free cores.")
+    int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 100 awake trees, on free cores.")
 ]
 Out = Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")]
 SensorRate = Annotated[
