@@ -1,4 +1,5 @@
-"""A launch that threads share does each entry of its list once, whoever sleeps, and leaves no thread behind."""
+"""A launch that threads share runs its kernels once for each entry of its list, whichever threads of the pool sleep; a
+pool that is closed or garbage-collected leaves no thread running."""
 
 from __future__ import annotations
 
@@ -137,4 +138,4 @@ def test_a_pool_that_is_closed_or_gone_leaves_no_thread() -> None:
     pool.close()
     wait(lambda: not new(), "the end of the threads")
     use()
-    wait(lambda: not new(), "the end of the threads of a pool that nobody has any more")
+    wait(lambda: not new(), "the end of the threads of a pool that was garbage-collected")

@@ -480,10 +480,11 @@ class InterestAudit:
         """Count one tick, by where the remote actors say that they are: copies appear later, spectators have none."""
         replicators = client.replicators.values()
         sent = sum(replicator.counters.environment.bytes_out for replicator in replicators)
-        there = [position[:2] for replicator in replicators for position in replicator.peer_positions()]
-        here = [client.physics.rigid.actor_position(name)[:2] for name in client.replicators]
-        away = np.linalg.norm(np.reshape(here, (-1, 1, 2)) - np.reshape(there, (1, -1, 2)), axis=-1)
-        if away.min(initial=np.inf) > client.replicator.interest_radius + self.MARGIN:
-            self.bytes += sent - self._seen
-            self.ticks_touching += touching
+        if touching or sent != self._seen:
+            there = [position[:2] for replicator in replicators for position in replicator.peer_positions()]
+            here = [client.physics.rigid.actor_position(name)[:2] for name in client.replicators]
+            away = np.linalg.norm(np.reshape(here, (-1, 1, 2)) - np.reshape(there, (1, -1, 2)), axis=-1)
+            if away.min(initial=np.inf) > client.replicator.interest_radius + self.MARGIN:
+                self.bytes += sent - self._seen
+                self.ticks_touching += touching
         self._seen = sent

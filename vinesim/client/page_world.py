@@ -20,7 +20,7 @@ from vinesim.scene.appearance import load_shears
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
-from vinesim.scene.wire_segments import WireSegments, wire_segments
+from vinesim.scene.wire_segments import wire_segments
 from vinesim.sensors.camera.exposure import usual_exposure
 from vinesim.sensors.camera.sunlight import OutdoorLight
 from vinesim.sensors.scene import textures
@@ -178,7 +178,7 @@ class PageWorld:
     def _follow_wires(self, wires: SegmentPoses) -> None:
         """Note which segments have moved."""
         which = np.union1d(self._wires_away, wires.segment).astype(int)
-        now = _wire_poses(self._wires, which, wires)
+        now = self._wires.poses(which, wires)
         moved = which[(now != self._wire_q[which]).any(1)]
         self._wire_q[which], self._wire_moved_at[moved], self._wires_away = now, self._tick, wires.segment
 
@@ -253,7 +253,7 @@ class PageWorld:
             self._follow_visuals(self._primitives, snapshot)
         body = self._bodies(np.flatnonzero(self._moved_at > since))
         wire = np.flatnonzero(self._wire_moved_at > since)
-        pose = np.concatenate([snapshot.body_q[body], _wire_poses(self._wires, wire, snapshot.wires)])
+        pose = np.concatenate([snapshot.body_q[body], self._wires.poses(wire, snapshot.wires)])
         body = np.concatenate([body, len(self._client.model.body_mass) + wire])
         rigid = np.asarray(snapshot.visual_q).reshape(-1, 7)
         haptics, self._haptics = self._haptics, {}
@@ -389,14 +389,6 @@ def _within_reach(model: Model) -> dict[str, np.ndarray]:
         "bunch_radius": model.bunch_radius.astype(np.float32), "bunch_stalk": stalk.astype(np.uint32),
         "stalk_length": model.body_length[stalk].astype(np.float32),
     }  # fmt: skip
-
-
-def _wire_poses(segments: WireSegments, which: np.ndarray, away: SegmentPoses) -> np.ndarray:
-    """Poses [k, 7] m, 1 of some segments [k], ascending."""
-    q = segments.rest_q[which].astype(np.float32)
-    _, here, there = np.intersect1d(which, away.segment, assume_unique=True, return_indices=True)
-    q[here] = away.q[there]
-    return q
 
 
 def _turns(pose: np.ndarray) -> np.ndarray:

@@ -94,7 +94,12 @@ def bind_launch(
             forward(at_bounds, at_packed)
 
     launch.keeps = (commands, inputs, outputs, calls)  # type: ignore[attr-defined]
-    launch.packed = PackedLaunch((address, start, step), tuple(parts)) if index_list else None  # type: ignore[attr-defined]
+    return bound(launch, PackedLaunch((address, start, step), tuple(parts)) if index_list else None)
+
+
+def bound(launch: Callable[..., None], packed: PackedLaunch | None = None) -> BoundLaunch:
+    """A function that launches kernels, as a :class:`BoundLaunch`."""
+    launch.packed = packed  # type: ignore[attr-defined]
     return cast(BoundLaunch, launch)
 
 
@@ -106,8 +111,7 @@ def join_partitions(launches: Sequence[BoundLaunch]) -> BoundLaunch:
 
     packed = [one.packed for one in launches]
     parts = tuple(one.parts[0] for one in packed if one is not None)
-    launch.packed = PackedLaunch(packed[0].head, parts) if packed[0] is not None else None  # type: ignore[attr-defined]
-    return cast(BoundLaunch, launch)
+    return bound(launch, PackedLaunch(packed[0].head, parts) if packed[0] is not None else None)
 
 
 def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> BoundLaunch:
@@ -122,8 +126,7 @@ def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> BoundLaunch:
             commands[partition].set_dim(threads)
             commands[partition].launch()
 
-    launch.packed = None  # type: ignore[attr-defined]
-    return cast(BoundLaunch, launch)
+    return bound(launch)
 
 
 def usable_cores() -> int:

@@ -1,9 +1,9 @@
 """Launches that several threads of a CPU share, chunk by chunk, without Python between them.
 
 To wake a thread takes 30 to 60 us, as long as half of the trees of a step take. So a thread that has nothing to do polls
-memory for the next launch, for :data:`POLL_TIME`, before it sleeps, and the thread that launches begins at once: whoever is
-free takes the next chunk, and one that wakes late finds less to do. Results do not depend on who took which, since
-every chunk is work of its own. The threads never hold the interpreter's lock.
+memory for the next launch, for :data:`POLL_TIME`, before it sleeps, and the thread that launches begins at once: each thread
+that is free takes the next chunk, and one that wakes late finds fewer left. Results do not depend on which thread took
+which chunk, since chunks share no data that they write. The threads never hold the interpreter's lock.
 """
 
 from __future__ import annotations
@@ -14,20 +14,19 @@ import os
 import threading
 import time
 from collections.abc import Sequence
-from typing import cast
 
 import warp as wp
 
-from vinesim.kernels.launch import BoundLaunch, bind_launch, usable_cores
+from vinesim.kernels.launch import BoundLaunch, bind_launch, bound, usable_cores
 
 POLL_TIME = 300_000
 """[ns] More than passes between the launches of a step, much less than a step."""
 
-_IDLE, _ASSIGNED, _WORKING, _ASLEEP, _ENDED = range(5)
-"""States of a thread. It sleeps at a semaphore, which is posted when it leaves that state."""
-_NEXT_CHUNK, _JOB, _FIRST_THREAD, _LINE = 0, 8, 16, 8
-"""Places in the memory of a pool: the next chunk to be taken, the address of the job, the states of the threads, each in
-a cache line of its own with the address of the semaphore."""
+_IDLE, _ASLEEP, _ENDED = 0, 3, 4
+"""States of a thread that Python knows; native code has them all."""
+_FIRST_THREAD, _LINE = 16, 8
+"""Places in the memory of a pool, by numbers of eight bytes: the states of the threads, each in a cache line of its own
+with the address of its semaphore. Before them, in lines of their own, are the next chunk and the address of the job."""
 _SEMAPHORE_SIZE = 128
 """[bytes] More than any C library's ``sem_t``."""
 _C_FUNCTIONS = ("sem_wait", "clock_gettime", "sem_post", "sched_yield")
@@ -38,9 +37,12 @@ _COMMON = """
     typedef signed (*Semaphore)(void*);
     typedef long (*GetTime)(long, long*);
     typedef void (*Yield)();
+    // a thread that is ASSIGNED to a job is WORKING as soon as it takes the first chunk, and IDLE again if none is left by
+    // then; one that is ASLEEP waits at its semaphore, which is posted when it leaves that state
+    enum { IDLE, ASSIGNED, WORKING, ASLEEP, ENDED };
     long long* const pool = (long long*)(size_t)address;
     const auto state_of = [&](int i) { return pool + 16 + 8 * i; };
-    const auto is_set = [&](int i, long long from, long long to) {
+    const auto change = [&](int i, long long from, long long to) {
         return __atomic_compare_exchange_n(state_of(i), &from, to, false, __ATOMIC_ACQ_REL, __ATOMIC_ACQUIRE);
     };
     const auto pause = [] {
@@ -80,12 +82,12 @@ _COMMON = """
     __atomic_store_n(pool + 8, (long long)job, __ATOMIC_RELEASE);
     const long long wanted = threads < work[0] ? threads : work[0];
     for (int i = 1; i < wanted; ++i) {  // to wake one takes as long as eight chunks
-        if (!is_set(i, 0, 1) && work[0] >= 8 && is_set(i, 3, 1)) ((Semaphore)(size_t)post)((void*)state_of(i)[1]);
+        if (!change(i, IDLE, ASSIGNED) && work[0] >= 8 && change(i, ASLEEP, ASSIGNED)) ((Semaphore)(size_t)post)((void*)state_of(i)[1]);
     }
     while (run_chunk(work, 0)) {}
     for (int i = 1; i < threads; ++i) {
-        is_set(i, 1, 0);  // one that has not begun, perhaps for want of a core, is not waited for
-        for (int polls = 0; __atomic_load_n(state_of(i), __ATOMIC_ACQUIRE) == 2; ++polls) {
+        change(i, ASSIGNED, IDLE);  // one that has not begun, perhaps for want of a core, is not waited for
+        for (int polls = 0; __atomic_load_n(state_of(i), __ATOMIC_ACQUIRE) == WORKING; ++polls) {
             pause();
             if (polls > 1000 && yield_) ((Yield)(size_t)yield_)();
         }
@@ -112,13 +114,13 @@ def lead(address: wp.uint64, job: wp.uint64, threads: int, post: wp.uint64, yiel
     long long since = now();
     for (int polls = 1;; ++polls) {
         const long long state = __atomic_load_n(state_of(thread), __ATOMIC_RELAXED);
-        if (state == 4) break;
-        if (state == 1 && is_set(thread, 1, 2)) {
+        if (state == ENDED) break;
+        if (state == ASSIGNED && change(thread, ASSIGNED, WORKING)) {
             const long long* const work = (const long long*)__atomic_load_n(pool + 8, __ATOMIC_ACQUIRE);
             while (run_chunk(work, thread)) {}
-            __atomic_store_n(state_of(thread), 0, __ATOMIC_RELEASE);
+            __atomic_store_n(state_of(thread), IDLE, __ATOMIC_RELEASE);
             since = now();
-        } else if (polls % 64 == 0 && now() - since > poll_time && is_set(thread, 0, 3)) {
+        } else if (polls % 64 == 0 && now() - since > poll_time && change(thread, IDLE, ASLEEP)) {
             while (((Semaphore)(size_t)wait)((void*)state_of(thread)[1])) {}  // interrupted by a signal
             since = now();
         }
@@ -210,9 +212,8 @@ class LaunchPool:
                 launch(threads, first)
 
         packed = [launch.packed for launch in launches]
-        launch_here.packed = None  # type: ignore[attr-defined]
         if self.size == 1 or not all(packed):
-            return cast(BoundLaunch, launch_here)
+            return bound(launch_here)
         numbers = [[*one.head, *(number for part in one.parts for number in part)] for one in packed if one]
         head = [0, chunk, 0, 0, len(numbers), len(numbers[0])]
         job = (ctypes.c_int64 * (len(head) + sum(map(len, numbers))))(*head, *(n for each in numbers for n in each))
@@ -226,8 +227,7 @@ class LaunchPool:
                 job[0], job[2], job[3] = -(-threads // chunk), threads, first
                 run(1)
 
-        launch.packed = None  # type: ignore[attr-defined]
-        return cast(BoundLaunch, launch)
+        return bound(launch)
 
     def wake(self) -> None:
         """Wake the threads that sleep, for a launch that comes soon; on other cores than the caller's.

@@ -8,6 +8,7 @@ import numpy as np
 
 from vinesim import frames
 from vinesim.scene.model import Model
+from vinesim.scene.values import SegmentPoses
 
 MAX_LENGTH = 0.25
 """Longest segment [m]: a force F on a wire of tension T is drawn with an error of F / T times a quarter of it at most,
@@ -29,6 +30,13 @@ class WireSegments:
 
     def __len__(self) -> int:
         return len(self.piece)
+
+    def poses(self, which: np.ndarray, away: SegmentPoses) -> np.ndarray:
+        """Poses [k, 7] float32 m, 1 of some segments [k], ascending, of which all but those ``away`` are as drawn."""
+        q = self.rest_q[which].astype(np.float32)
+        _, here, there = np.intersect1d(which, away.segment, assume_unique=True, return_indices=True)
+        q[here] = away.q[there]
+        return q
 
 
 def wire_segments(model: Model) -> WireSegments:

@@ -9,6 +9,7 @@ from vinesim.kernels.contact import wire_shapes as kernels
 from vinesim.kernels.launch import bind_launch
 from vinesim.physics.contact.deflected_wires import DeflectedWires
 from vinesim.physics.contact.warp_arrays import SharedArrays, share
+from vinesim.physics.plants.berry_clusters import spans
 from vinesim.physics.plants.elastic_supports import ElasticSupports
 from vinesim.scene.model import Model
 from vinesim.scene.values import SegmentPoses
@@ -49,9 +50,7 @@ class WireShapes:
             return self._poses
         self._listed[: len(pieces)] = pieces
         self._pose(len(pieces))
-        size = self._first[pieces + 1] - self._first[pieces]
-        inner = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
-        segment = np.repeat(self._first[pieces], size) + inner
+        segment = spans(self._first[pieces], self._first[pieces + 1] - self._first[pieces])
         segment = segment[self._shapes.is_moved[segment]]
         marked[pieces] = False
         marked[self._piece[segment]] = True

@@ -21,7 +21,7 @@ from vinesim.scene import berries
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import RigidVisual, SegmentPoses, Shape, Snapshot
+from vinesim.scene.values import RigidVisual, Shape, Snapshot
 from vinesim.scene.wire_segments import wire_segments
 from vinesim.sensors.raster import renderer_selection
 from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
@@ -84,7 +84,8 @@ class Primitives:
         self._static_carrier = self._bodies + len(self._wires)
         """Carrier of the static scene; before it are those of plants' bodies and of segments of wires, behind it those
         of rigid bodies."""
-        self._moved_wires = SegmentPoses()
+        self._wires_away = np.zeros(0, int)
+        """Segments [k] that were away from where they were drawn."""
         self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
@@ -344,9 +345,9 @@ class Primitives:
         if len(changed):
             self._attached = attached.copy()
             self.clusters.shown.assign(_clusters_shown(self.cluster_bunch, attached))
-        wires, before = snapshot.wires, self._moved_wires.segment
-        of_wires = self._wires.piece[np.union1d(before, wires.segment).astype(int)]
-        dirty = self._clusters_of(np.concatenate([trees, len(self.model.tree_first) + np.unique(of_wires)]))
+        wires = np.union1d(self._wires_away, snapshot.wires.segment).astype(int)
+        pieces = np.unique(self._wires.piece[wires])
+        dirty = self._clusters_of(np.concatenate([trees, len(self.model.tree_first) + pieces]))
         if len(changed):
             dirty = np.union1d(dirty, np.flatnonzero(np.isin(self.cluster_bunch, changed)))
         first_visual = self._static_carrier + 1
@@ -354,9 +355,8 @@ class Primitives:
             dirty = np.concatenate([dirty, self.rigid_clusters])
         if len(dirty):
             self._poses[: self._bodies] = body_q
-            self._poses[self._bodies + before] = self._wires.rest_q[before]
-            self._poses[self._bodies + wires.segment] = wires.q
-            self._moved_wires = wires
+            self._poses[self._bodies + wires] = self._wires.poses(wires, snapshot.wires)
+            self._wires_away = snapshot.wires.segment
             self._poses[first_visual:] = visual_q
             self._pose(dirty)
         return dirty
