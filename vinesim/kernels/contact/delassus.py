@@ -142,8 +142,8 @@ def assemble_delassus(
     block = contacts.block[c]
     first = islands.block_start[block]
     last = islands.block_start[block + 1]
-    size = 3 * (last - first)
-    at = islands.matrix_start[block] + 3 * (contacts.place[c] - first) * size
+    pitch = islands.row_start[block + 1] - islands.row_start[block]
+    at = islands.matrix_start[block] + 3 * (contacts.place[c] - first) * pitch
     is_pair = contacts.other_slot[c] >= 0
     for m in range(first, last):
         source = islands.contact[m]
@@ -156,4 +156,7 @@ def assemble_delassus(
                 entries = sides_entries(entries, 2 * c + 1, 2 * source + 1, contacts, touched, sides)
         for r in range(3):
             for k in range(3):
-                rows_out.delassus[at + r * size + 3 * (m - first) + k] = wp.float64(entries[r, k])
+                rows_out.delassus[at + r * pitch + 3 * (m - first) + k] = wp.float64(entries[r, k])
+    for k in range(3 * (last - first), pitch):
+        for r in range(3):
+            rows_out.delassus[at + r * pitch + k] = wp.float64(0.0)

@@ -164,7 +164,7 @@ def list_contacts(contact_count: int, islands_out: Islands):
 def number_sets(
     contact_count: int, counters_out: wp.array(dtype=wp.int32), contacts_out: Contacts, islands_out: Islands
 ):
-    """Number islands and blocks in the order of the list, and place the blocks' matrices one after the other."""
+    """Number islands and blocks in the order of the list."""
     islands = int(-1)
     blocks = int(-1)
     for place in range(contact_count):
@@ -183,14 +183,8 @@ def number_sets(
     islands_out.start[islands + 1] = contact_count
     islands_out.first_block[islands + 1] = blocks + 1
     islands_out.block_start[blocks + 1] = contact_count
-    entries = int(0)
-    for b in range(blocks + 1):
-        islands_out.matrix_start[b] = entries
-        rows = 3 * (islands_out.block_start[b + 1] - islands_out.block_start[b])
-        entries = entries + rows * rows
     counters_out[ISLANDS] = islands + 1
     counters_out[BLOCKS] = blocks + 1
-    counters_out[MATRIX_ENTRIES] = entries
 
 
 @wp.func
@@ -225,6 +219,38 @@ def list_dofs(island_count: int, rigid: RigidBodies, contacts: Contacts, islands
     for k in range(island_count):  # each first place was moved to the next one's
         islands_out.first_dof[island_count - k] = islands_out.first_dof[island_count - k - 1]
     islands_out.first_dof[0] = 0
+
+
+@wp.func
+def padded(size: int):
+    """The multiple of eight that so many numbers fit in."""
+    return (size + 7) / 8 * 8
+
+
+@wp.func
+def place_systems(counters_out: wp.array(dtype=wp.int32), islands_out: Islands):
+    """Place what the solver needs for each block and each island one after the other."""
+    rows = int(0)
+    entries = int(0)
+    for block in range(counters_out[BLOCKS]):
+        islands_out.row_start[block] = rows
+        islands_out.matrix_start[block] = entries
+        size = 3 * (islands_out.block_start[block + 1] - islands_out.block_start[block])
+        rows = rows + padded(size)
+        entries = entries + size * padded(size)
+    islands_out.row_start[counters_out[BLOCKS]] = rows
+    rigid = int(0)
+    system = int(0)
+    for island in range(counters_out[ISLANDS]):
+        islands_out.rigid_start[island] = rigid
+        islands_out.system_start[island] = system
+        dofs = islands_out.first_dof[island + 1] - islands_out.first_dof[island]
+        rigid = rigid + (islands_out.start[island + 1] - islands_out.start[island]) * dofs
+        largest = int(0)
+        for block in range(islands_out.first_block[island], islands_out.first_block[island + 1]):
+            largest = wp.max(largest, 3 * (islands_out.block_start[block + 1] - islands_out.block_start[block]))
+        system = system + largest * (padded(1 + dofs) + padded(largest))
+    counters_out[MATRIX_ENTRIES] = wp.max(entries, system)
 
 
 @wp.kernel
@@ -282,3 +308,4 @@ def build_islands(
     list_contacts(contact_count, islands_out)
     number_sets(contact_count, counters_out, contacts_out, islands_out)
     list_dofs(counters_out[ISLANDS], rigid, contacts_out, islands_out)
+    place_systems(counters_out, islands_out)

@@ -23,7 +23,7 @@ SORT_AXIS = wp.constant(5)
 ISLANDS = wp.constant(6)
 BLOCKS = wp.constant(8)
 MATRIX_ENTRIES = wp.constant(9)
-"""Entries of the matrices of all blocks."""
+"""Entries of the matrices of all blocks, or of those of the Newton steps of all islands, whichever are more."""
 SKIPPED_GEOMS = wp.constant(7)
 """Static geoms beyond what one tree can be near to."""
 COUNTERS = 10
@@ -400,8 +400,14 @@ class Islands:
     """[island + 1]"""
     block_start: wp.array(dtype=wp.int32)
     """[block + 1] first place of each in ``contact``."""
+    row_start: wp.array(dtype=wp.int32)
+    """[block + 1] first row of each in :class:`vinesim.kernels.contact.island_system.IslandSystem`: a multiple of eight."""
     matrix_start: wp.array(dtype=wp.int32)
     """[block + 1] first entry of its matrix in ``Rows.delassus``."""
+    rigid_start: wp.array(dtype=wp.int32)
+    """[island + 1] first entry of its rigid Jacobian in the same system."""
+    system_start: wp.array(dtype=wp.int32)
+    """[island + 1] first entry of its Newton steps in the same system."""
     contact: wp.array(dtype=wp.int32)
     """[place] contacts, island by island and block by block."""
     label: wp.array(dtype=wp.int32)
@@ -429,35 +435,14 @@ class Rows:
     rigid_response: wp.array2d(dtype=wp.float64)
     """[row, dof] M^-1 J^T: change of velocity of the rigid world for a unit impulse along the row."""
     delassus: wp.array(dtype=wp.float64)
-    """J M^-1 J^T of the plants [entry], a matrix of rows for each block."""
+    """J M^-1 J^T of the plants [entry], a matrix for each block, whose rows are filled up with zeros to a multiple of
+    eight."""
     velocity_free: wp.array(dtype=wp.float64)
     """[row] m/s along the row at the end of the step without contacts."""
     bias: wp.array(dtype=wp.float64)
     """[row] m/s"""
     impulse: wp.array(dtype=wp.float64)
     """[row] N s"""
-    rigid_velocity: wp.array(dtype=wp.float64)
-    """[dof] by which the impulses change the velocities of the rigid world."""
-
-
-@wp.struct
-class SolverScratch:
-    """What the solver of an island works with."""
-
-    matrix: wp.array(dtype=wp.float64)
-    """[entry] the linear system of a Newton step, block by block as ``Rows.delassus``, of its pressed contacts alone."""
-    pressed: wp.array(dtype=wp.int32)
-    """[contact] those of each block that press, from the block's first place in the list on."""
-    columns: wp.array2d(dtype=wp.float64)
-    """[row, 1 + dof of the island] its right-hand sides: velocities without impulses, and Jacobians of the dofs."""
-    rigid_system: wp.array2d(dtype=wp.float64)
-    """[dof, 1 + dof of the island] what is left of it for the rigid velocities, right-hand side first."""
-    impulse_first: wp.array(dtype=wp.float64)
-    """[row] N s before the first Newton step."""
-    impulse_before: wp.array(dtype=wp.float64)
-    """[row] N s before the last sweep."""
-    direction: wp.array(dtype=wp.float64)
-    """[row] N s, direction of search."""
 
 
 @wp.struct

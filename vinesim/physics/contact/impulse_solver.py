@@ -13,6 +13,7 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
+from vinesim.kernels.contact.island_system import IslandSystem
 from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
 from vinesim.physics.contact.deflected_wires import DeflectedWires, WireContacts
@@ -59,8 +60,8 @@ class ImpulseSolver:
         self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1, **listed)
         self._island_arrays = {
             name: np.zeros(n + 1, np.int32)
-            for name in ("start", "first_block", "block_start", "matrix_start", "contact", "label", "block_label",
-                         "first_dof", "sweeps")
+            for name in ("start", "first_block", "block_start", "row_start", "matrix_start", "rigid_start",
+                         "system_start", "contact", "label", "block_label", "first_dof", "sweeps")
         }  # fmt: skip
         self._items = np.arange(3 * n, dtype=np.int32)
         self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
@@ -70,6 +71,11 @@ class ImpulseSolver:
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
         }
+        padded = 10 * n  # a block of one contact has eight rows
+        self._place_arrays = {
+            "friction": np.zeros(n), "compliance": np.zeros(n), "own": np.zeros((n, 3, 3)), "mass": np.zeros((n, 2)),
+            "pressed": np.zeros(n, np.int32),
+        } | {name: np.zeros(padded) for name in ("free", "impulse", "impulse_first", "impulse_before", "direction")}  # fmt: skip
         self._rigid_spans, self._most_rows, self._columns = np.zeros((n, 2), np.int32), 0, 0
         """[contact, 2] From which degree of freedom to which its rows of rigid bodies may be other than 0; the most
         rows of one solve, and how long they are."""
@@ -126,17 +132,18 @@ class ImpulseSolver:
             structs.Rows,
             rigid_jacobian=self._kept("rigid_jacobian", (rows, world.nv)),
             rigid_response=self._kept("rigid_response", (rows, world.nv)),
-            rigid_velocity=np.zeros(world.nv),
             delassus=self._matrix,
             **self._row_arrays,
         )
-        self.scratch = SharedArrays(
-            structs.SolverScratch,
+        self.system = SharedArrays(
+            IslandSystem,
+            **self._place_arrays,
+            jacobian=self._kept("jacobian", (self.capacity * world.nv, 3)),
+            response=self._kept("response", (self.capacity * world.nv, 3)),
+            velocity=np.zeros(world.nv),
             matrix=self._kept("matrix", self._matrix.shape),
-            pressed=np.zeros(self.capacity, np.int32),
-            columns=self._kept("columns", (rows, 1 + world.nv)),
-            rigid_system=np.zeros((world.nv, 1 + world.nv)),
-            **{name: self._kept(name, (rows,)) for name in ("impulse_first", "impulse_before", "direction")},
+            solution=self._kept("solution", (self.capacity * (1 + world.nv), 3)),
+            rigid_matrix=np.zeros((world.nv, 1 + world.nv)),
         )
         labels = np.zeros(2 * world.ntree, np.int32)  # see EffectiveMass.island_labels
         dofs = np.zeros(world.nv, np.int32)
@@ -244,7 +251,7 @@ class ImpulseSolver:
         rows, row_count, p = self.rows, 3 * count, self.parameters
         jacobian, response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
         impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
-        kept = (impulse, velocity_free, response, rows.rigid_velocity)
+        kept = (impulse, velocity_free, response, self.system.impulse, self.system.velocity)
         free, best, best_error, error = self.rigid.velocity_free, (), np.inf, np.inf
         for round_number in range(p.solver_constraint_steps + 1):
             assert self.rigid_force is not None
@@ -281,6 +288,7 @@ class ImpulseSolver:
         geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
         candidates, contacts = detection.candidates.struct, self.contacts.struct
         groups, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
+        system = self.system.struct
         counters, touched = share(detection.counters, wp.int32), self.touched.struct
         self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
         items = share(self._items, wp.int32)
@@ -311,11 +319,11 @@ class ImpulseSolver:
         self._solve_islands = bind_shared(
             projected_gauss_seidel.solve_islands,
             [p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
-            [rigid_bodies, contacts],
-            [groups, self.scratch.struct, rows],
+            [contacts],
+            [groups, system, rows],
         )
         self._store_warm_start = bind_shared(
-            forces.store_warm_start, [parameters, geoms], [rigid_bodies, groups, rows], [contacts, warm_start]
+            forces.store_warm_start, [parameters], [groups, system, rows], [contacts, warm_start]
         )
         self._accumulate_wrenches = bind_launch(
             forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
