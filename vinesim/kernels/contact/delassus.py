@@ -25,43 +25,27 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native("""
-    const auto pitch = [](const auto& array) { return array.strides[0] / (int)sizeof(double); };
-    const double* const from = jacobian.data + row * pitch(jacobian);
-    double* const to = response.data + row * pitch(response);
-    const int shift = pitch(response);
-    for (int i = first; i < end; ++i) {
-        for (int axis = 0; axis < 3; ++axis) to[axis * shift + i] = from[axis * pitch(jacobian) + i];
-    }
+    const wp::vec3d* const from = jacobian.data + contact * (jacobian.strides[0] / (int)sizeof(wp::vec3d));
+    wp::vec3d* const to = response.data + contact * (response.strides[0] / (int)sizeof(wp::vec3d));
+    for (int i = first; i < end; ++i) to[i] = from[i];
     for (int i = end - 1; i >= first; --i) {
-        const double x = to[i], y = to[shift + i], z = to[2 * shift + i];
-        if (x == 0.0 && y == 0.0 && z == 0.0) continue;
-        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) {
-            double* const at = to + column.data[e];
-            at[0] -= entry.data[e] * x;
-            at[shift] -= entry.data[e] * y;
-            at[2 * shift] -= entry.data[e] * z;
-        }
+        const wp::vec3d value = to[i];
+        if (value[0] == 0.0 && value[1] == 0.0 && value[2] == 0.0) continue;
+        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) to[column.data[e]] -= entry.data[e] * value;
     }
     for (int i = first; i < end; ++i) {
-        double x = to[i] * inverse.data[i], y = to[shift + i] * inverse.data[i], z = to[2 * shift + i] * inverse.data[i];
-        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) {
-            const double* const at = to + column.data[e];
-            x -= entry.data[e] * at[0];
-            y -= entry.data[e] * at[shift];
-            z -= entry.data[e] * at[2 * shift];
-        }
-        to[i] = x;
-        to[shift + i] = y;
-        to[2 * shift + i] = z;
+        wp::vec3d value = to[i] * inverse.data[i];
+        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) value -= entry.data[e] * to[column.data[e]];
+        to[i] = value;
     }
 """)
-def solve_three_rows(
-    row: int, first: int, end: int, start: wp.array(dtype=wp.int32), size: wp.array(dtype=wp.int32),
+def solve_rigid_rows(
+    contact: int, first: int, end: int, start: wp.array(dtype=wp.int32), size: wp.array(dtype=wp.int32),
     column: wp.array(dtype=wp.int32), entry: wp.array(dtype=wp.float64), inverse: wp.array(dtype=wp.float64),
-    jacobian: wp.array2d(dtype=wp.float64), response: wp.array2d(dtype=wp.float64),
+    jacobian: wp.array2d(dtype=wp.vec3d), response: wp.array2d(dtype=wp.vec3d),
 ):  # fmt: skip
-    """Solve L^T D L x = j for the three rows j of the Jacobian from ``row`` on, within the degrees of freedom from
-    ``first`` to ``end`` of one kinematic tree; ``entry`` of L, ``inverse`` of D."""
+    """Solve L^T D L x = j for the three rows j of a contact, within the degrees of freedom from ``first`` to ``end`` of
+    one kinematic tree; ``entry`` of L, ``inverse`` of D."""
     ...
 
 
@@ -86,13 +70,13 @@ def respond_rigidly(
         first = factors.tree_dof[tree]
         end = first + factors.tree_dof_count[tree]
         if factors.implicit_inverse[last_dof] != wp.float64(0.0):
-            solve_three_rows(
-                3 * c, first, end, factors.row_start, factors.row_count, factors.column, factors.implicit,
+            solve_rigid_rows(
+                c, first, end, factors.row_start, factors.row_count, factors.column, factors.implicit,
                 factors.implicit_inverse, rows_out.rigid_jacobian, rows_out.rigid_response,
             )  # fmt: skip
         else:
-            solve_three_rows(
-                3 * c, first, end, factors.row_start, factors.row_count, factors.column, factors.plain,
+            solve_rigid_rows(
+                c, first, end, factors.row_start, factors.row_count, factors.column, factors.plain,
                 factors.plain_inverse, rows_out.rigid_jacobian, rows_out.rigid_response,
             )  # fmt: skip
 

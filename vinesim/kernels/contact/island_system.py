@@ -47,6 +47,8 @@ class IslandSystem:
     """[entry] G^T, in the same way."""
     velocity: wp.array(dtype=wp.float64)
     """[place of dof] w: by which the impulses change the velocities of rigid bodies."""
+    rigid_impulse: wp.array(dtype=wp.float64)
+    """[place of dof] N s, generalised impulse of all contacts."""
     pressed: wp.array(dtype=wp.int32)
     """[place] contacts of each block that press, by their numbers in the block, from its first place on."""
     matrix: wp.array(dtype=wp.float64)
@@ -100,7 +102,8 @@ def push_rigid_bodies(
     impulse: wp.vec3d, response: wp.array(dtype=wp.vec3d), at: int, velocity: wp.array(dtype=wp.float64), first: int,
     count: int,
 ):  # fmt: skip
-    """Change the velocities of ``count`` degrees of freedom by impulses [N s] along three rows."""
+    """Change the velocities of ``count`` degrees of freedom by impulses [N s] along three rows; with the Jacobian instead
+    of the response, their generalised impulses."""
     ...
 
 
@@ -182,10 +185,8 @@ def gather_rigid_rows(
         jacobian = wp.vec3d()
         response = wp.vec3d()
         if moves:
-            dof = islands.dof[first + k]
-            for axis in range(3):
-                jacobian[axis] = rows.rigid_jacobian[3 * c + axis, dof]
-                response[axis] = rows.rigid_response[3 * c + axis, dof]
+            jacobian = rows.rigid_jacobian[c, islands.dof[first + k]]
+            response = rows.rigid_response[c, islands.dof[first + k]]
         system_out.jacobian[at + k] = jacobian
         system_out.response[at + k] = response
 
@@ -253,9 +254,15 @@ def gather_island(island: int, geoms: Geoms, contacts: Contacts, islands: Island
 
 
 @wp.func
-def scatter_impulses(island: int, islands: Islands, system: IslandSystem, rows_out: Rows):
-    """Write the impulses of an island back to the rows of its contacts."""
+def scatter_impulses(island: int, islands: Islands, system_out: IslandSystem, rows_out: Rows):
+    """Write the impulses of an island back to the rows of its contacts, and sum what rigid bodies get of them."""
+    first = islands.first_dof[island]
+    dofs = island_dofs(island, islands)
+    for k in range(dofs):
+        system_out.rigid_impulse[first + k] = wp.float64(0.0)
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         for place in range(islands.block_start[block], islands.block_start[block + 1]):
-            row = islands.row_start[block] + 3 * (place - islands.block_start[block])
-            set_three(3 * islands.contact[place], three(row, system.impulse), rows_out.impulse)
+            x = three(islands.row_start[block] + 3 * (place - islands.block_start[block]), system_out.impulse)
+            set_three(3 * islands.contact[place], x, rows_out.impulse)
+            at = rigid_entry(place, island, islands)
+            push_rigid_bodies(x, system_out.jacobian, at, system_out.rigid_impulse, first, dofs)

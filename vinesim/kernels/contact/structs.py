@@ -430,10 +430,10 @@ class Rows:
 
     plant_jacobian: wp.array2d(dtype=wp.float64)
     """[row, 12] of the body and of the other plant body, each linear and angular."""
-    rigid_jacobian: wp.array2d(dtype=wp.float64)
-    """[row, dof]"""
-    rigid_response: wp.array2d(dtype=wp.float64)
-    """[row, dof] M^-1 J^T: change of velocity of the rigid world for a unit impulse along the row."""
+    rigid_jacobian: wp.array2d(dtype=wp.vec3d)
+    """[contact, dof] of its three rows"""
+    rigid_response: wp.array2d(dtype=wp.vec3d)
+    """[contact, dof] M^-1 J^T: change of velocity of the rigid world for unit impulses along them."""
     delassus: wp.array(dtype=wp.float64)
     """J M^-1 J^T of the plants [entry], a matrix for each block, whose rows are filled up with zeros to a multiple of
     eight."""

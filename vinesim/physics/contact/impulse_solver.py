@@ -76,11 +76,9 @@ class ImpulseSolver:
             "friction": np.zeros(n), "compliance": np.zeros(n), "own": np.zeros((n, 3, 3)), "mass": np.zeros((n, 2)),
             "pressed": np.zeros(n, np.int32),
         } | {name: np.zeros(padded) for name in ("free", "impulse", "impulse_first", "impulse_before", "direction")}  # fmt: skip
-        self._rigid_spans, self._most_rows, self._columns = np.zeros((n, 2), np.int32), 0, 0
+        self._rigid_spans, self._most_contacts, self._columns = np.zeros((n, 2), np.int32), 0, 0
         """[contact, 2] From which degree of freedom to which its rows of rigid bodies may be other than 0; the most
-        rows of one solve, and how long they are."""
-        self._dofs = slice(0, 0)
-        """From the first degree of freedom in contact to the last."""
+        contacts of one solve, and how long their rows are."""
         self._memory: dict[str, np.ndarray] = {}
         """See :meth:`_kept`."""
         self._wrench = np.zeros((2 * n, 6))
@@ -122,16 +120,16 @@ class ImpulseSolver:
         The large ones lie in memory that is kept: new pages took 4 ms when an actor joined. Every solve overwrites what
         it reads of them; rows of rigid bodies are 0 outside of their spans.
         """
-        world, rows = self.rigid.mj_model, 3 * self.capacity
+        world = self.rigid.mj_model
         for name in ("rigid_jacobian", "rigid_response"):
             if name in self._memory:
-                self._memory[name][: self._most_rows * self._columns] = 0.0
-        self._rigid_spans[:] = self._most_rows = 0
+                self._memory[name][: 3 * self._most_contacts * self._columns] = 0.0
+        self._rigid_spans[:] = self._most_contacts = 0
         self._columns = world.nv
         self.rows = SharedArrays(
             structs.Rows,
-            rigid_jacobian=self._kept("rigid_jacobian", (rows, world.nv)),
-            rigid_response=self._kept("rigid_response", (rows, world.nv)),
+            rigid_jacobian=self._kept("rigid_jacobian", (self.capacity, world.nv, 3)),
+            rigid_response=self._kept("rigid_response", (self.capacity, world.nv, 3)),
             delassus=self._matrix,
             **self._row_arrays,
         )
@@ -141,6 +139,7 @@ class ImpulseSolver:
             jacobian=self._kept("jacobian", (self.capacity * world.nv, 3)),
             response=self._kept("response", (self.capacity * world.nv, 3)),
             velocity=np.zeros(world.nv),
+            rigid_impulse=np.zeros(world.nv),
             matrix=self._kept("matrix", self._matrix.shape),
             solution=self._kept("solution", (self.capacity * (1 + world.nv), 3)),
             rigid_matrix=np.zeros((world.nv, 1 + world.nv)),
@@ -170,7 +169,7 @@ class ImpulseSolver:
 
     def solve(self, count: int, counters: np.ndarray) -> None:
         """Find the impulses of the first ``count`` contacts, and what they do to either side."""
-        n, row_count = count, 3 * count
+        n = count
         self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
         self._build_islands(1)
         if counters[structs.MATRIX_ENTRIES] > len(self._matrix):
@@ -178,9 +177,9 @@ class ImpulseSolver:
             self._allocate()
             self.bind_launches(self._detection)
             self._build_islands(1)
-        rows, touched, island_count = self.rows, int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
+        touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
         self.bodies = self.touched.body[:touched].copy()
-        self._most_rows = max(self._most_rows, row_count)
+        self._most_contacts = max(self._most_contacts, n)
         if self._wires is not None:
             self._end_at_wires(n, self._wires)
         self._write_contact_rows(n)
@@ -189,15 +188,12 @@ class ImpulseSolver:
         is_constrained = bool(self.rigid.mj_data.nefc) and self.rigid.is_constrained(self._touched_rigid_bodies(n))
         if is_constrained:
             self._rigid_spans[:n] = 0, self.rigid.mj_model.nv
-            response = self.rigid.impulse_response(rows.rigid_jacobian[:row_count])
-            rows.rigid_response[:row_count] = response.T
+            self._respond_constrained(by_rows(self.rows.rigid_jacobian[:n]))
         else:
             self._respond_rigidly(n)
         self._assemble_delassus(n)
         self._solve_islands(island_count)
-        used = self.islands.dof[: self.islands.first_dof[island_count]]
-        self._dofs = slice(int(used.min()), int(used.max()) + 1) if len(used) else slice(0, 0)
-        self._set_rigid_force(row_count)
+        self._set_rigid_force(island_count)
         if is_constrained:
             self._follow_constraints(n, island_count)
         self.island_count = island_count
@@ -234,11 +230,16 @@ class ImpulseSolver:
             share = contacts.stiffness[at] * dt + contacts.damping[at]
             wires.add_presses(force, -(force / share + self.rows.bias[3 * at]))
 
-    def _set_rigid_force(self, row_count: int) -> None:
-        rows, dofs = self.rows, self._dofs
+    def _set_rigid_force(self, island_count: int) -> None:
+        used = self.islands.first_dof[island_count]
         self.rigid_force = force = np.zeros(self.rigid.mj_model.nv)
-        impulse = rows.impulse[:row_count] @ rows.rigid_jacobian[:row_count, dofs]
-        force[dofs] = impulse / -self.parameters.dt
+        force[self.islands.dof[:used]] = self.system.rigid_impulse[:used] / -self.parameters.dt
+
+    def _respond_constrained(self, jacobian: np.ndarray) -> np.ndarray:
+        """Take over the response of rigid bodies that MuJoCo's constraints bind, and return it [row, dof]."""
+        response = self.rigid.impulse_response(jacobian).T
+        self.rows.rigid_response[: len(response) // 3] = response.reshape(-1, 3, response.shape[1]).transpose(0, 2, 1)
+        return response
 
     def _follow_constraints(self, count: int, island_count: int) -> None:
         """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve took them to.
@@ -248,10 +249,10 @@ class ImpulseSolver:
         with the tangent stiffness of the constraints under them. The impulses of the round with the least error are
         kept.
         """
-        rows, row_count, p = self.rows, 3 * count, self.parameters
-        jacobian, response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
+        rows, system, row_count, p = self.rows, self.system, 3 * count, self.parameters
+        jacobian, response = by_rows(rows.rigid_jacobian[:count]), by_rows(rows.rigid_response[:count])
         impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
-        kept = (impulse, velocity_free, response, self.system.impulse, self.system.velocity)
+        kept = (impulse, velocity_free, system.impulse, system.velocity, system.rigid_impulse)
         free, best, best_error, error = self.rigid.velocity_free, (), np.inf, np.inf
         for round_number in range(p.solver_constraint_steps + 1):
             assert self.rigid_force is not None
@@ -264,16 +265,16 @@ class ImpulseSolver:
                 best, best_error = tuple(values.copy() for values in kept), error
             if round_number == p.solver_constraint_steps:
                 break
-            response[:] = self.rigid.impulse_response(jacobian).T
+            response = self._respond_constrained(jacobian)
             free_before, free = free, velocity + impulse @ response
             velocity_free -= jacobian @ (free - free_before)
             self._assemble_delassus(count)
             self._solve_islands(island_count)
-            self._set_rigid_force(row_count)
+            self._set_rigid_force(island_count)
         if error > best_error:
             for values, those in zip(kept, best, strict=True):
                 values[:] = those
-            self._set_rigid_force(row_count)
+            self._set_rigid_force(island_count)
 
     def _touched_rigid_bodies(self, count: int) -> np.ndarray:
         """MuJoCo's bodies [k] on the other side of the first ``count`` contacts, once for each."""
@@ -328,3 +329,8 @@ class ImpulseSolver:
         self._accumulate_wrenches = bind_launch(
             forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
         )
+
+
+def by_rows(jacobian: np.ndarray) -> np.ndarray:
+    """A rigid Jacobian [contact, dof, 3] as rows [row, dof]."""
+    return jacobian.transpose(0, 2, 1).reshape(-1, jacobian.shape[1])
