@@ -11,10 +11,12 @@ from vinesim.kernels.contact.structs import (
     BLOCKS,
     BODIES,
     CONTACTS,
+    GROUPS,
     IMPACTED_TREES,
     ISLANDS,
     MATRIX_ENTRIES,
     OVERFLOW,
+    RESPONSE_NUMBERS,
     SKIPPED_GEOMS,
     Candidates,
     Capsules,
@@ -23,10 +25,14 @@ from vinesim.kernels.contact.structs import (
     Islands,
     PlantBodies,
     RigidBodies,
+    SideGroups,
     TouchedBodies,
 )
 
 wp.set_module_options({"enable_backward": False})
+
+MOST_SIDES = wp.constant(10)
+"""Sides of contacts in a group: thirty rows fill thirty-two columns."""
 
 
 @wp.kernel
@@ -228,6 +234,58 @@ def padded(size: int):
 
 
 @wp.func
+def list_side(slot: int, side: int, touched: TouchedBodies, groups_out: SideGroups):
+    """List a side of a contact with those of its tree; none if it has no ``slot``."""
+    if slot >= 0:
+        tree = touched.tree_start[slot]
+        groups_out.side[groups_out.listed[tree]] = side
+        groups_out.listed[tree] = groups_out.listed[tree] + 1
+
+
+@wp.func
+def group_sides(
+    counters_out: wp.array(dtype=wp.int32), touched: TouchedBodies, contacts: Contacts, islands: Islands,
+    groups_out: SideGroups,
+):  # fmt: skip
+    """List the sides of all contacts by trees, part those of each tree into groups, and place the responses to them."""
+    for slot in range(counters_out[BODIES]):
+        groups_out.listed[slot] = 0
+    for c in range(counters_out[CONTACTS]):
+        tree = touched.tree_start[contacts.body_slot[c]]
+        groups_out.listed[tree] = groups_out.listed[tree] + 1
+        if contacts.other_slot[c] >= 0:
+            tree = touched.tree_start[contacts.other_slot[c]]
+            groups_out.listed[tree] = groups_out.listed[tree] + 1
+    place = int(0)
+    groups = int(0)
+    numbers = int(0)
+    slot = int(0)
+    while slot < counters_out[BODIES]:
+        sides = groups_out.listed[slot]
+        groups_out.first[slot] = groups
+        groups_out.listed[slot] = place
+        of_tree = (sides + MOST_SIDES - 1) / MOST_SIDES
+        for k in range(of_tree):
+            begin = sides * k / of_tree
+            groups_out.start[groups] = place + begin
+            groups_out.tree[groups] = slot
+            groups_out.response[groups] = numbers
+            width = padded(3 * (sides * (k + 1) / of_tree - begin))
+            numbers = numbers + (touched.tree_end[slot] - slot) * 6 * width
+            groups = groups + 1
+        place = place + sides
+        slot = touched.tree_end[slot]
+    groups_out.start[groups] = place
+    groups_out.tree[groups] = -1
+    for i in range(counters_out[CONTACTS]):
+        c = islands.contact[i]
+        list_side(contacts.body_slot[c], 2 * c, touched, groups_out)
+        list_side(contacts.other_slot[c], 2 * c + 1, touched, groups_out)
+    counters_out[GROUPS] = groups
+    counters_out[RESPONSE_NUMBERS] = numbers
+
+
+@wp.func
 def place_systems(counters_out: wp.array(dtype=wp.int32), islands_out: Islands):
     """Place what the solver needs for each block and each island one after the other."""
     rows = int(0)
@@ -267,6 +325,7 @@ def build_islands(
     touched_out: TouchedBodies,
     contacts_out: Contacts,
     islands_out: Islands,
+    groups_out: SideGroups,
 ):
     """One thread in all: number the plant bodies in contact, sorted, each once; part the contacts into islands."""
     contact_count = counters_out[CONTACTS]
@@ -309,3 +368,4 @@ def build_islands(
     number_sets(contact_count, counters_out, contacts_out, islands_out)
     list_dofs(counters_out[ISLANDS], rigid, contacts_out, islands_out)
     place_systems(counters_out, islands_out)
+    group_sides(counters_out, touched_out, contacts_out, islands_out, groups_out)

@@ -26,7 +26,11 @@ MATRIX_ENTRIES = wp.constant(9)
 """Entries of the matrices of all blocks, or of those of the Newton steps of all islands, whichever are more."""
 SKIPPED_GEOMS = wp.constant(7)
 """Static geoms beyond what one tree can be near to."""
-COUNTERS = 10
+GROUPS = wp.constant(10)
+"""Groups of sides of contacts."""
+RESPONSE_NUMBERS = wp.constant(11)
+"""Numbers of the responses to all groups."""
+COUNTERS = 12
 
 AABB_BLOCK = wp.constant(32)
 """So many static boxes share one box around them, and are skipped by one comparison."""
@@ -385,6 +389,24 @@ class TouchedBodies:
     """[slot] slot after the last of the same tree."""
     last_contact: wp.array(dtype=wp.int32)
     """[slot] scratch: the contact of the tree that begins here that was linked last."""
+
+
+@wp.struct
+class SideGroups:
+    """Sides of contacts on plants, in groups of at most ten on one tree: see :mod:`vinesim.kernels.contact.row_response`."""
+
+    side: wp.array(dtype=wp.int32)
+    """[place] 2 * contact, and 1 more for the other plant body, by trees; in the order of the list of islands."""
+    start: wp.array(dtype=wp.int32)
+    """[group + 1] first place of each in ``side``."""
+    tree: wp.array(dtype=wp.int32)
+    """[group + 1] slot of the first touched body of its tree; -1 after the last group."""
+    response: wp.array(dtype=wp.int32)
+    """[group] first number of its response: by touched bodies of the tree, linear and angular velocity, columns."""
+    first: wp.array(dtype=wp.int32)
+    """[slot] first group of the tree whose touched bodies begin there."""
+    listed: wp.array(dtype=wp.int32)
+    """[slot] scratch: where the next side of that tree is listed."""
 
 
 @wp.struct

@@ -56,7 +56,7 @@ class ImpulseSolver:
         slots = {"body_slot": response.body_slot, "other_slot": response.other_slot}
         self.contacts = SharedArrays.zeros(structs.Contacts, n, **slots)
         self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
-        listed = {"body": response.body, "tree_start": response.tree_start}
+        listed = {"body": response.body, "tree_end": response.tree_end}
         self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1, **listed)
         self._island_arrays = {
             name: np.zeros(n + 1, np.int32)
@@ -172,10 +172,7 @@ class ImpulseSolver:
         n = count
         self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
         self._build_islands(1)
-        if counters[structs.MATRIX_ENTRIES] > len(self._matrix):
-            self._matrix = np.zeros(2 * int(counters[structs.MATRIX_ENTRIES]))
-            self._allocate()
-            self.bind_launches(self._detection)
+        if self._make_room(counters):
             self._build_islands(1)
         touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
         self.bodies = self.touched.body[:touched].copy()
@@ -184,7 +181,7 @@ class ImpulseSolver:
             self._end_at_wires(n, self._wires)
         self._write_contact_rows(n)
 
-        self.response.compute(n)
+        self.response.compute(int(counters[structs.GROUPS]))
         is_constrained = bool(self.rigid.mj_data.nefc) and self.rigid.is_constrained(self._touched_rigid_bodies(n))
         if is_constrained:
             self._rigid_spans[:n] = 0, self.rigid.mj_model.nv
@@ -203,6 +200,16 @@ class ImpulseSolver:
         self._store_warm_start(n)
         self._accumulate_wrenches(1)
         self.wrenches = self._wrench[:touched].copy()
+
+    def _make_room(self, counters: np.ndarray) -> bool:
+        """Make room for the matrices and responses of the listed contacts; whether they must be listed again."""
+        larger = int(counters[structs.MATRIX_ENTRIES]) > len(self._matrix)
+        if larger:
+            self._matrix = np.zeros(2 * int(counters[structs.MATRIX_ENTRIES]))
+            self._allocate()
+        if self.response.make_room(int(counters[structs.RESPONSE_NUMBERS])) or larger:
+            self.bind_launches(self._detection)
+        return larger
 
     def _end_at_wires(self, count: int, wires: WireContacts) -> None:
         """Find the springs of the wires that are in contact."""
@@ -288,8 +295,9 @@ class ImpulseSolver:
         capsules, bodies = self.arrays.capsules.struct, self.arrays.bodies.struct
         geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
         candidates, contacts = detection.candidates.struct, self.contacts.struct
-        groups, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
-        system = self.system.struct
+        island_lists, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
+        system, side_groups = self.system.struct, self.response.groups.struct
+        response = share(self.response.numbers, wp.float32)
         counters, touched = share(detection.counters, wp.int32), self.touched.struct
         self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
         items = share(self._items, wp.int32)
@@ -303,7 +311,7 @@ class ImpulseSolver:
         self._build_islands = bind_launch(
             islands.build_islands,
             [capsules, geoms, bodies, rigid_bodies, candidates],
-            [counters, touched, contacts, groups],
+            [counters, touched, contacts, island_lists, side_groups],
         )
         self._write_contact_rows = bind_shared(
             jacobians.write_contact_rows,
@@ -315,16 +323,16 @@ class ImpulseSolver:
             delassus.respond_rigidly, [geoms], [rigid_bodies, rigid.factors.struct, contacts], [rows]
         )
         self._assemble_delassus = bind_shared(
-            delassus.assemble_delassus, [], [contacts, touched, groups, self.response.sides], [rows]
+            delassus.assemble_delassus, [], [contacts, touched, island_lists, side_groups, response], [rows]
         )
         self._solve_islands = bind_shared(
             projected_gauss_seidel.solve_islands,
             [p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
             [contacts],
-            [groups, system, rows],
+            [island_lists, system, rows],
         )
         self._store_warm_start = bind_shared(
-            forces.store_warm_start, [parameters], [groups, system, rows], [contacts, warm_start]
+            forces.store_warm_start, [parameters], [island_lists, system, rows], [contacts, warm_start]
         )
         self._accumulate_wrenches = bind_launch(
             forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
