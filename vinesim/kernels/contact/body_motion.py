@@ -44,6 +44,8 @@ def extrapolate_point(
 @wp.func
 def velocity_product_acceleration(
     body: int,
+    known: int,
+    known_acceleration: wp.spatial_vector,
     body_parent: wp.array(dtype=wp.int32),
     body_cut: wp.array(dtype=wp.bool),
     body_q: wp.array(dtype=wp.transform),
@@ -51,13 +53,14 @@ def velocity_product_acceleration(
 ):
     """Acceleration (linear, angular) of a body while all joints between it and its root turn at constant rates.
 
-    Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product accelerations.
+    ``known``: a body whose acceleration is known, -1 for none; if it carries this one, only the joints between are looked
+    at. Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product accelerations.
     """
     origin = wp.transform_get_translation(body_q[body])
     linear = wp.vec3()
     angular = wp.vec3()
     k = int(body)
-    while k >= 0:
+    while k >= 0 and k != known:
         parent = body_parent[k]
         if body_cut[k]:
             parent = -1
@@ -69,6 +72,11 @@ def velocity_product_acceleration(
             linear += wp.cross(relative, origin - joint)
             linear += wp.cross(omega, wp.cross(omega, joint - wp.transform_get_translation(body_q[parent])))
         k = parent
+    if k >= 0:
+        turn = wp.spatial_bottom(known_acceleration)
+        angular += turn
+        linear += wp.spatial_top(known_acceleration)
+        linear += wp.cross(turn, origin - wp.transform_get_translation(body_q[k]))
     return wp.spatial_vector(linear, angular)
 
 

@@ -50,8 +50,11 @@ def distance_after_step(
     capsule_states: CapsuleStates,
 ):
     """:func:`segment_segment_distance` of two capsules' axes at the end of the step if both move on as they do."""
-    acceleration = velocity_product_acceleration(body, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
-    other_acceleration = velocity_product_acceleration(other_body, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
+    none = wp.spatial_vector()
+    acceleration = velocity_product_acceleration(body, -1, none, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
+    other_acceleration = velocity_product_acceleration(
+        other_body, -1, none, bodies.parent, bodies.is_cut, bodies.q, bodies.qd
+    )
     return segment_segment_distance(
         to_double(extrapolate_point(dt, bodies.q[body], bodies.qd[body], acceleration, capsule_states.start[s])),
         to_double(extrapolate_point(dt, bodies.q[body], bodies.qd[body], acceleration, capsule_states.end[s])),

@@ -323,6 +323,8 @@ class Candidates:
     """[awake tree] whether one of them is an impact."""
     near_geoms: wp.array2d(dtype=wp.int32)
     """[awake tree, k] scratch: geoms whose box overlaps that of the tree."""
+    near_pairs: wp.array(dtype=wp.vec2i)
+    """[awake tree * room + k] scratch: capsules and geoms whose boxes overlap."""
     skipped_geoms: wp.array(dtype=wp.int32)
     """[awake tree] static geoms whose box overlaps it as well, for which ``near_geoms`` has no room."""
     feature: wp.array2d(dtype=wp.int32)

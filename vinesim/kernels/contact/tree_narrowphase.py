@@ -7,7 +7,7 @@ at many places of a long kernel waits for instructions more than for anything el
 import warp as wp
 
 from vinesim.kernels.contact.broadphase import aabbs_disjoint, sweep_capsule
-from vinesim.kernels.contact.narrowphase_rigid import add_pair
+from vinesim.kernels.contact.narrowphase_rigid import add_pairs
 from vinesim.kernels.contact.structs import (
     AABB_BLOCK,
     Aabbs,
@@ -112,15 +112,10 @@ def find_contacts_of_tree(
                 capsule_states_out.low[s] = low
                 capsule_states_out.high[s] = high
     room = tree_contacts_out.near.shape[0] / trees
-    count = int(0)
-    is_impact = bool(False)
-    for i in range(wp.min(near_count, room)):
-        pair = tree_contacts_out.near[i * trees + tree]
-        count, hits = add_pair(
-            is_round, tree, count, pair[0], pair[1], parameters, capsules, geoms, bodies, capsule_states_out, rigid,
-            hulls, geom_states, candidates_out,
-        )  # fmt: skip
-        is_impact = is_impact or hits
+    count, is_impact = add_pairs(
+        is_round, tree, 0, tree_contacts_out.near, tree, trees, wp.min(near_count, room), parameters, capsules, geoms,
+        bodies, capsule_states_out, rigid, hulls, geom_states, candidates_out,
+    )  # fmt: skip
     tree_contacts_out.is_impact[tree] = is_impact
     tree_contacts_out.count[tree] = wp.min(count, slots)
     dropped = wp.max(count - slots, 0) + wp.max(near_count - room, 0)
