@@ -71,19 +71,25 @@ def quat_at(a: wp.array(dtype=float), i: int) -> wp.quat:
     ...
 
 
-@wp.func_native("const float* const p = a.data + i; wp::vec_t<6, float> v; for (int c = 0; c < 6; ++c) v[c] = p[8 * c]; return v;")
+@wp.func_native(
+    "const float* const p = a.data + i; wp::vec_t<6, float> v; for (int c = 0; c < 6; ++c) v[c] = p[8 * c]; return v;"
+)
 def spatial_at(a: wp.array(dtype=float), i: int) -> wp.spatial_vector:
     """A spatial vector of one lane."""
     ...
 
 
-@wp.func_native("const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[24], p[32], p[40], p[48], p[56], p[64]);")
+@wp.func_native(
+    "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[24], p[32], p[40], p[48], p[56], p[64]);"
+)
 def mat33_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
     """A matrix of one lane."""
     ...
 
 
-@wp.func_native("const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[8], p[24], p[32], p[16], p[32], p[40]);")
+@wp.func_native(
+    "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[8], p[24], p[32], p[16], p[32], p[40]);"
+)
 def symmetric_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
     """A symmetric matrix of one lane, of which the upper triangle is kept."""
     ...

@@ -47,8 +47,8 @@ class IslandSystem:
     """[entry] G^T, in the same way."""
     velocity: wp.array(dtype=wp.float64)
     """[place of dof] w: by which the impulses change the velocities of rigid bodies."""
-    rigid_impulse: wp.array(dtype=wp.float64)
-    """[place of dof] N s, generalised impulse of all contacts."""
+    rigid_force: wp.array(dtype=wp.float64)
+    """[dof of MuJoCo] N or N m, generalised force of all contacts on rigid bodies; 0 where there is none."""
     pressed: wp.array(dtype=wp.int32)
     """[place] contacts of each block that press, by their numbers in the block, from its first place on."""
     matrix: wp.array(dtype=wp.float64)
@@ -102,8 +102,7 @@ def push_rigid_bodies(
     impulse: wp.vec3d, response: wp.array(dtype=wp.vec3d), at: int, velocity: wp.array(dtype=wp.float64), first: int,
     count: int,
 ):  # fmt: skip
-    """Change the velocities of ``count`` degrees of freedom by impulses [N s] along three rows; with the Jacobian instead
-    of the response, their generalised impulses."""
+    """Change the velocities of ``count`` degrees of freedom by impulses [N s] along three rows."""
     ...
 
 
@@ -240,7 +239,9 @@ def update_rigid_velocity(island: int, islands: Islands, system_out: IslandSyste
 
 
 @wp.func
-def gather_island(island: int, geoms: Geoms, contacts: Contacts, islands: Islands, rows: Rows, system_out: IslandSystem):
+def gather_island(
+    island: int, geoms: Geoms, contacts: Contacts, islands: Islands, rows: Rows, system_out: IslandSystem
+):
     """Gather all contacts of an island, from the impulses in ``rows`` on."""
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         for place in range(islands.block_start[block], islands.block_start[block + 1]):
@@ -253,16 +254,27 @@ def gather_island(island: int, geoms: Geoms, contacts: Contacts, islands: Island
     update_rigid_velocity(island, islands, system_out)
 
 
+@wp.func_native("""
+    for (int i = 0; i < count; ++i) force.data[dof.data[first + i]] -= dot(jacobian.data[at + i], impulse) / dt;
+""")
+def add_rigid_force(
+    impulse: wp.vec3d, dt: wp.float64, jacobian: wp.array(dtype=wp.vec3d), at: int, dof: wp.array(dtype=wp.int32),
+    first: int, count: int, force: wp.array(dtype=wp.float64),
+):  # fmt: skip
+    """Add what impulses [N s] along three rows exert on ``count`` degrees of freedom, listed from ``first`` on."""
+    ...
+
+
 @wp.func
-def scatter_impulses(island: int, islands: Islands, system_out: IslandSystem, rows_out: Rows):
-    """Write the impulses of an island back to the rows of its contacts, and sum what rigid bodies get of them."""
+def scatter_impulses(island: int, dt: wp.float64, islands: Islands, system_out: IslandSystem, rows_out: Rows):
+    """Write the impulses of an island back to the rows of its contacts, and the force that rigid bodies feel of them."""
     first = islands.first_dof[island]
     dofs = island_dofs(island, islands)
     for k in range(dofs):
-        system_out.rigid_impulse[first + k] = wp.float64(0.0)
+        system_out.rigid_force[islands.dof[first + k]] = wp.float64(0.0)
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         for place in range(islands.block_start[block], islands.block_start[block + 1]):
             x = three(islands.row_start[block] + 3 * (place - islands.block_start[block]), system_out.impulse)
             set_three(3 * islands.contact[place], x, rows_out.impulse)
             at = rigid_entry(place, island, islands)
-            push_rigid_bodies(x, system_out.jacobian, at, system_out.rigid_impulse, first, dofs)
+            add_rigid_force(x, dt, system_out.jacobian, at, islands.dof, first, dofs, system_out.rigid_force)

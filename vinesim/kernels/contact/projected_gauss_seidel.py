@@ -8,7 +8,6 @@ import warp as wp
 
 from vinesim.kernels.compiler_flags import INLINE_ALL
 from vinesim.kernels.contact.conjugate_gradient import follow_conjugate_direction
-from vinesim.kernels.contact.newton import newton_step
 from vinesim.kernels.contact.island_system import (
     IslandSystem,
     contact_residual,
@@ -20,7 +19,8 @@ from vinesim.kernels.contact.island_system import (
     three,
     update_rigid_velocity,
 )
-from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Rows
+from vinesim.kernels.contact.newton import newton_step
+from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Parameters, Rows
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
@@ -145,6 +145,7 @@ def solve_island(
 @wp.kernel
 def solve_islands(
     # model
+    parameters: Parameters,
     max_sweeps: int,
     max_newton_steps: int,
     max_newton_contacts: int,
@@ -164,4 +165,4 @@ def solve_islands(
     solve_island(
         island, max_sweeps, max_newton_steps, max_newton_contacts, tolerance, islands_out, rows_out.delassus, system_out
     )
-    scatter_impulses(island, islands_out, system_out, rows_out)
+    scatter_impulses(island, parameters.dt, islands_out, system_out, rows_out)

@@ -71,11 +71,12 @@ class ImpulseSolver:
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
         }
-        padded = 10 * n  # a block of one contact has eight rows
         self._place_arrays = {
             "friction": np.zeros(n), "compliance": np.zeros(n), "own": np.zeros((n, 3, 3)), "mass": np.zeros((n, 2)),
             "pressed": np.zeros(n, np.int32),
-        } | {name: np.zeros(padded) for name in ("free", "impulse", "impulse_first", "impulse_before", "direction")}  # fmt: skip
+        }  # fmt: skip
+        for name in ("free", "impulse", "impulse_first", "impulse_before", "direction"):
+            self._place_arrays[name] = np.zeros(10 * n)  # a block of one contact has eight rows
         self._rigid_spans, self._most_contacts, self._columns = np.zeros((n, 2), np.int32), 0, 0
         """[contact, 2] From which degree of freedom to which its rows of rigid bodies may be other than 0; the most
         contacts of one solve, and how long their rows are."""
@@ -139,7 +140,7 @@ class ImpulseSolver:
             jacobian=self._kept("jacobian", (self.capacity * world.nv, 3)),
             response=self._kept("response", (self.capacity * world.nv, 3)),
             velocity=np.zeros(world.nv),
-            rigid_impulse=np.zeros(world.nv),
+            rigid_force=np.zeros(world.nv),
             matrix=self._kept("matrix", self._matrix.shape),
             solution=self._kept("solution", (self.capacity * (1 + world.nv), 3)),
             rigid_matrix=np.zeros((world.nv, 1 + world.nv)),
@@ -189,8 +190,9 @@ class ImpulseSolver:
         else:
             self._respond_rigidly(n)
         self._assemble_delassus(n)
+        self.rigid_force = self.system.rigid_force
+        self.rigid_force.fill(0.0)
         self._solve_islands(island_count)
-        self._set_rigid_force(island_count)
         if is_constrained:
             self._follow_constraints(n, island_count)
         self.island_count = island_count
@@ -237,11 +239,6 @@ class ImpulseSolver:
             share = contacts.stiffness[at] * dt + contacts.damping[at]
             wires.add_presses(force, -(force / share + self.rows.bias[3 * at]))
 
-    def _set_rigid_force(self, island_count: int) -> None:
-        used = self.islands.first_dof[island_count]
-        self.rigid_force = force = np.zeros(self.rigid.mj_model.nv)
-        force[self.islands.dof[:used]] = self.system.rigid_impulse[:used] / -self.parameters.dt
-
     def _respond_constrained(self, jacobian: np.ndarray) -> np.ndarray:
         """Take over the response of rigid bodies that MuJoCo's constraints bind, and return it [row, dof]."""
         response = self.rigid.impulse_response(jacobian).T
@@ -259,7 +256,7 @@ class ImpulseSolver:
         rows, system, row_count, p = self.rows, self.system, 3 * count, self.parameters
         jacobian, response = by_rows(rows.rigid_jacobian[:count]), by_rows(rows.rigid_response[:count])
         impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
-        kept = (impulse, velocity_free, system.impulse, system.velocity, system.rigid_impulse)
+        kept = (impulse, velocity_free, system.impulse, system.velocity, system.rigid_force)
         free, best, best_error, error = self.rigid.velocity_free, (), np.inf, np.inf
         for round_number in range(p.solver_constraint_steps + 1):
             assert self.rigid_force is not None
@@ -277,11 +274,9 @@ class ImpulseSolver:
             velocity_free -= jacobian @ (free - free_before)
             self._assemble_delassus(count)
             self._solve_islands(island_count)
-            self._set_rigid_force(island_count)
         if error > best_error:
             for values, those in zip(kept, best, strict=True):
                 values[:] = those
-            self._set_rigid_force(island_count)
 
     def _touched_rigid_bodies(self, count: int) -> np.ndarray:
         """MuJoCo's bodies [k] on the other side of the first ``count`` contacts, once for each."""
@@ -327,7 +322,7 @@ class ImpulseSolver:
         )
         self._solve_islands = bind_shared(
             projected_gauss_seidel.solve_islands,
-            [p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
+            [parameters, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
             [contacts],
             [island_lists, system, rows],
         )

@@ -23,9 +23,9 @@ ROWS_ON_A_GPU = 256
 class RowResponse:
     """Response of the plants to unit impulses along the rows of up to so many contacts.
 
-    The device of the plants reaches ``jacobian`` [row, 12], the lists ``body``, ``tree_start`` and ``tree_end`` [slot] of
-    the plant bodies in contact, ``body_slot`` and ``other_slot`` [contact], and ``groups`` of sides, all of which the
-    contact kernels fill.
+    The device of the plants reaches ``jacobian`` [row, 12], the lists ``body`` and ``tree_end`` [slot] of the plant
+    bodies in contact, ``body_slot`` and ``other_slot`` [contact], and ``groups`` of sides, all of which the contact
+    kernels fill.
     """
 
     def __init__(self, plants: ArticulationSolver, contacts: int) -> None:
