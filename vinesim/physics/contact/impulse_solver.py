@@ -91,6 +91,8 @@ class ImpulseSolver:
         """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
         self.island_count = 0
         """Islands of the last solve."""
+        self._padded_rows = 0
+        """Rows of all blocks of the last solve, those that fill them up included."""
         self.unfinished = 0
         """How often an island of a solve ended at the largest number of sweeps, perhaps not within its tolerance."""
 
@@ -176,6 +178,7 @@ class ImpulseSolver:
         if self._make_room(counters):
             self._build_islands(1)
         touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
+        self._padded_rows = int(self.islands.row_start[counters[structs.BLOCKS]])
         self.bodies = self.touched.body[:touched].copy()
         self._most_contacts = max(self._most_contacts, n)
         if self._wires is not None:
@@ -256,7 +259,8 @@ class ImpulseSolver:
         rows, system, row_count, p = self.rows, self.system, 3 * count, self.parameters
         jacobian, response = by_rows(rows.rigid_jacobian[:count]), by_rows(rows.rigid_response[:count])
         impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
-        kept = (impulse, velocity_free, system.impulse, system.velocity, system.rigid_force)
+        of_islands = system.impulse[: self._padded_rows]
+        kept = (impulse, velocity_free, of_islands, system.velocity, system.rigid_force)
         free, best, best_error, error = self.rigid.velocity_free, (), np.inf, np.inf
         for round_number in range(p.solver_constraint_steps + 1):
             assert self.rigid_force is not None
@@ -272,7 +276,6 @@ class ImpulseSolver:
             response = self._respond_constrained(jacobian)
             free_before, free = free, velocity + impulse @ response
             velocity_free -= jacobian @ (free - free_before)
-            self._assemble_delassus(count)
             self._solve_islands(island_count)
         if error > best_error:
             for values, those in zip(kept, best, strict=True):
