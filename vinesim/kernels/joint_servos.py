@@ -127,7 +127,8 @@ def apply_controls(
         pull = drives.stiffness[i] * drives.target[i] + damping * drives.target_velocity[i]
         control = pull - drives.damping_at_start[i] * qvel[drives.v[i]] + drives.feedforward[i]
         control_out[i] = control
-        ctrl_out[drives.actuator[i]] = control
+        actuator = drives.actuator[i]
+        ctrl_out[actuator] = control
     yaw = qpos[base.q[2]]
     c = wp.cos(yaw)
     s = wp.sin(yaw)
@@ -141,4 +142,5 @@ def apply_controls(
         position = qpos[base.q[i]]  # held back too far, the base slips: its target comes along
         target = wp.clamp(base_target_out[i] + dt * velocity, position - slip, position + slip)
         base_target_out[i] = target
-        ctrl_out[base.actuator[i]] = base.stiffness[i] * target + base.damping[i] * velocity
+        actuator = base.actuator[i]
+        ctrl_out[actuator] = base.stiffness[i] * target + base.damping[i] * velocity

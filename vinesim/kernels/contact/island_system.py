@@ -271,7 +271,8 @@ def scatter_impulses(island: int, dt: wp.float64, islands: Islands, system_out: 
     first = islands.first_dof[island]
     dofs = island_dofs(island, islands)
     for k in range(dofs):
-        system_out.rigid_force[islands.dof[first + k]] = wp.float64(0.0)
+        dof = islands.dof[first + k]
+        system_out.rigid_force[dof] = wp.float64(0.0)
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         for place in range(islands.block_start[block], islands.block_start[block + 1]):
             x = three(islands.row_start[block] + 3 * (place - islands.block_start[block]), system_out.impulse)
