@@ -16,7 +16,7 @@ from vinesim.kernels.contact.body_motion import (
     velocity_product_acceleration,
     was_cut_off,
 )
-from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
+from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable, next_overlap
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import (
     MESH,
@@ -79,20 +79,25 @@ def list_near_geoms(
     """List the geoms whose boxes overlap that of a tree, at most ``most`` static ones; returns the number of all."""
     count = int(0)
     movable = geoms.count[0]
-    for g in range(movable):
-        counts = is_remote or not geoms.is_remote[g]
-        if counts and not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
+    g = next_overlap(0, movable, low, high, geom_states.low, geom_states.high)
+    while g < movable:
+        if is_remote or not geoms.is_remote[g]:
             near_geoms_out[row, count] = g
             count = count + 1
+        g = next_overlap(g + 1, movable, low, high, geom_states.low, geom_states.high)
     room = wp.min(movable + most, near_geoms_out.shape[1])
-    for block in range(static_blocks.low.shape[0]):
-        if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
-            first = movable + block * AABB_BLOCK
-            for g in range(first, wp.min(first + AABB_BLOCK, geoms.count[1])):
-                if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
-                    if count < room:
-                        near_geoms_out[row, count] = g
-                    count = count + 1
+    blocks = static_blocks.low.shape[0]
+    block = next_overlap(0, blocks, low, high, static_blocks.low, static_blocks.high)
+    while block < blocks:
+        first = movable + block * AABB_BLOCK
+        end = wp.min(first + AABB_BLOCK, geoms.count[1])
+        g = next_overlap(first, end, low, high, geom_states.low, geom_states.high)
+        while g < end:
+            if count < room:
+                near_geoms_out[row, count] = g
+            count = count + 1
+            g = next_overlap(g + 1, end, low, high, geom_states.low, geom_states.high)
+        block = next_overlap(block + 1, blocks, low, high, static_blocks.low, static_blocks.high)
     return count
 
 
