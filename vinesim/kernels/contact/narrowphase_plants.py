@@ -203,7 +203,12 @@ def find_plant_contacts(
                 if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):
                     if other != tree or may_touch_own_tree(s, tree, s_low, s_high, capsules, wood_boxes):
                         t = next_overlap(
-                            capsules.tree_start[other], last_other, s_low, s_high, capsule_states.low, capsule_states.high
+                            capsules.tree_start[other],
+                            last_other,
+                            s_low,
+                            s_high,
+                            capsule_states.low,
+                            capsule_states.high,
                         )
                 while t < last_other:
                     pair = is_collidable(

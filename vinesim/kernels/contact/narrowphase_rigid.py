@@ -16,7 +16,7 @@ from vinesim.kernels.contact.body_motion import (
     velocity_product_acceleration,
     was_cut_off,
 )
-from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable, next_overlap
+from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable, list_near_geoms
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import (
     MESH,
@@ -29,7 +29,6 @@ from vinesim.kernels.contact.distance import (
 )
 from vinesim.kernels.contact.hull_distance import interval_along_hull, segment_hull_distance
 from vinesim.kernels.contact.structs import (
-    AABB_BLOCK,
     Aabbs,
     Candidates,
     Capsules,
@@ -62,43 +61,6 @@ class Pair:
     """2 if a part of the capsule lies along a face of the geom: a contact at each end of it; else 1."""
     rotation: wp.mat33d
     """of the geom."""
-
-
-@wp.func
-def list_near_geoms(
-    row: int,
-    low: wp.vec3,
-    high: wp.vec3,
-    is_remote: bool,
-    most: int,
-    geoms: Geoms,
-    geom_states: GeomStates,
-    static_blocks: Aabbs,
-    near_geoms_out: wp.array2d(dtype=wp.int32),
-):
-    """List the geoms whose boxes overlap that of a tree, at most ``most`` static ones; returns the number of all."""
-    count = int(0)
-    movable = geoms.count[0]
-    g = next_overlap(0, movable, low, high, geom_states.low, geom_states.high)
-    while g < movable:
-        if is_remote or not geoms.is_remote[g]:
-            near_geoms_out[row, count] = g
-            count = count + 1
-        g = next_overlap(g + 1, movable, low, high, geom_states.low, geom_states.high)
-    room = wp.min(movable + most, near_geoms_out.shape[1])
-    blocks = static_blocks.low.shape[0]
-    block = next_overlap(0, blocks, low, high, static_blocks.low, static_blocks.high)
-    while block < blocks:
-        first = movable + block * AABB_BLOCK
-        end = wp.min(first + AABB_BLOCK, geoms.count[1])
-        g = next_overlap(first, end, low, high, geom_states.low, geom_states.high)
-        while g < end:
-            if count < room:
-                near_geoms_out[row, count] = g
-            count = count + 1
-            g = next_overlap(g + 1, end, low, high, geom_states.low, geom_states.high)
-        block = next_overlap(block + 1, blocks, low, high, static_blocks.low, static_blocks.high)
-    return count
 
 
 @wp.func
