@@ -220,10 +220,10 @@ class ImpulseSolver:
         """Find the springs of the wires that are in contact."""
         contacts, candidates = self.contacts, self._detection.candidates
         piece = self.rigid_arrays.wire_of_geom[np.maximum(contacts.other[:count], -1)]
-        at = self._at_wires = np.flatnonzero(piece >= 0)
         contacts.wire_stiffness[:count] = contacts.wire_shift[:count] = 0.0
-        if len(at) == 0:
+        if piece.max() < 0:
             return
+        at = self._at_wires = np.flatnonzero(piece >= 0)
         row, slot = np.divmod(contacts.source[at], candidates.feature.shape[1])
         body, point, normal = contacts.body[at], candidates.point[row, slot], candidates.normal[row, slot]
         free, arm = self.plants.velocity_free[body], point - self.plants.state.body_q[body, :3]
