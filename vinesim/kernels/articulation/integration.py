@@ -5,6 +5,7 @@ import warp as wp
 from vinesim.kernels.articulation.kinematics import max_joint_rate, max_root_speed
 from vinesim.kernels.articulation.spatial import exponential
 from vinesim.kernels.articulation.structs import ArticulationModel, JointState, Prediction, SolverParameters
+from vinesim.kernels.prefetch import prefetch_int, prefetch_quat, prefetch_vec3
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,6 +52,11 @@ def integrate(
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
     pitch = model.pitch
+    for k in range(first, first + size * pitch, pitch):
+        prefetch_int(model.body_parent, k)
+        prefetch_int(model.body_root, k)
+        prefetch_quat(joints.joint_q, k)
+        prefetch_vec3(joints.joint_qd, k)
     dt = p.dt / float(substeps)
     turning = max_joint_rate(prediction.joint_qd_free, first, size, pitch)
     falling = max_root_speed(

@@ -123,14 +123,22 @@ def state_mark(q: wp.array(dtype=wp.quat), qd: wp.array(dtype=wp.vec3), first: i
 
 
 @wp.func_native("""
-unsigned any = 0;
-for (int row = 0; row < (pitch == 1 ? 1 : count); ++row) {
-    const int length = 6 * (pitch == 1 ? count : 1);
-    const unsigned* a = (const unsigned*)(load.data + first + row * pitch);
-    const unsigned* b = (const unsigned*)(wrench.data + first + row * pitch);
-    for (int i = 0; i < length; ++i) any |= a[i] | b[i];
+unsigned long long any = 0;
+if (pitch == 1) {
+    const unsigned* a = (const unsigned*)(load.data + first);
+    const unsigned* b = (const unsigned*)(wrench.data + first);
+    unsigned bits = 0;
+    for (int i = 0; i < 6 * count; ++i) bits |= a[i] | b[i];
+    any = bits;
+} else {  // on a GPU: as many words at a time as it fetches at once
+    #pragma unroll 4
+    for (int row = 0; row < count; ++row) {
+        const unsigned long long* a = (const unsigned long long*)(load.data + first + row * pitch);
+        const unsigned long long* b = (const unsigned long long*)(wrench.data + first + row * pitch);
+        any |= a[0] | a[1] | a[2] | b[0] | b[1] | b[2];
+    }
 }
-return any << 1 != 0;
+return (unsigned)(any >> 32 | any) << 1 != 0;
 """)
 def is_pushed(
     load: wp.array(dtype=wp.spatial_vector),

@@ -12,7 +12,7 @@ from vinesim.kernels.contact.jacobians import row_columns
 from vinesim.kernels.contact.structs import Contacts, Rows
 from vinesim.kernels.contact.tree_narrowphase import TreeContacts
 from vinesim.kernels.contact.tree_solver import TreeSystem
-from vinesim.kernels.contact.tree_views import view_contacts, view_rows, view_system
+from vinesim.kernels.contact.tree_views import tree_and_entry, view_contacts, view_rows, view_system
 
 wp.set_module_options({"enable_backward": False})
 
@@ -170,9 +170,8 @@ def write_delassus(
     Its impulses go inward; what they do at a body with another contact, that one's response says, both being one
     symmetric matrix.
     """
-    tree = wp.tid() % trees
-    c = wp.tid() // trees
-    if c >= tree_contacts.count[tree]:
+    tree, c = tree_and_entry(wp.tid(), width / 3)
+    if tree >= trees or c >= tree_contacts.count[wp.min(tree, trees - 1)]:
         return
     contacts = view_contacts(contacts_all, tree, trees)
     rows = view_rows(rows_all, tree, trees)

@@ -50,6 +50,7 @@ from vinesim.kernels.contact.tree_solver import (
 from vinesim.kernels.contact.tree_views import (
     part_of_search,
     part_of_system,
+    tree_and_entry,
     view_contacts,
     view_int,
     view_rows,
@@ -96,6 +97,7 @@ def write_tree_rows(
     geoms: Geoms,
     # in
     trees: int,
+    slots: int,
     bodies: PlantBodies,
     rigid: RigidBodies,
     candidates: Candidates,
@@ -106,16 +108,16 @@ def write_tree_rows(
     rows_out: Rows,
 ):
     """One thread per slot of a tree: the rows of its contact."""
-    tree = wp.tid() % trees
-    c = wp.tid() // trees
-    if c < tree_contacts.count[tree]:
+    tree, c = tree_and_entry(wp.tid(), slots)
+    if tree < trees and c < tree_contacts.count[wp.min(tree, trees - 1)]:
         contacts = view_contacts(contacts_out, tree, trees)
-        contacts.feature[c] = candidates.feature[tree, c]
-        contacts.other[c] = candidates.other[tree, c]
-        contacts.body[c] = capsules.body[candidates.feature[tree, c] // 2]
+        found = contacts.source[c]
+        contacts.feature[c] = candidates.feature[tree, found]
+        contacts.other[c] = candidates.other[tree, found]
+        contacts.body[c] = capsules.body[candidates.feature[tree, found] // 2]
         contacts.other_body[c] = -1
         write_rows(
-            c, tree, c, parameters, pairs, capsules, geoms, bodies, rigid, candidates,
+            c, tree, found, parameters, pairs, capsules, geoms, bodies, rigid, candidates,
             view_warm_start(warm_start, tree, trees), contacts, view_rows(rows_out, tree, trees),
         )  # fmt: skip
 

@@ -1,7 +1,8 @@
-"""Narrowphase of trees that are worlds of their own with geoms that do not move: a thread finds the contacts of a tree.
+"""Narrowphase of trees that are worlds of their own with geoms that do not move: pairs, contacts of each, their numbers.
 
-In a kernel for geoms of any kind, and in a far shorter one for planes, spheres and capsules alone: a GPU whose threads are
-at many places of a long kernel waits for instructions more than for anything else.
+Contacts are found in a kernel for geoms of any kind, and in a far shorter one for planes, spheres and capsules alone: a GPU
+whose threads are at many places of a long kernel waits for instructions more than for anything else. The number of a
+contact in its tree follows from the pairs before its own, so that it is the same in every run.
 """
 
 import warp as wp
@@ -21,6 +22,7 @@ from vinesim.kernels.contact.structs import (
     PlantBodies,
     RigidBodies,
 )
+from vinesim.kernels.contact.tree_views import tree_and_entry
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,6 +35,10 @@ class TreeContacts:
     """of this step."""
     near: wp.array(dtype=wp.vec2i)
     """[i * trees + tree] scratch: capsules and geoms whose boxes overlap."""
+    near_count: wp.array(dtype=wp.int32)
+    """how many such pairs there is room for."""
+    found: wp.array(dtype=wp.int32)
+    """[i * trees + tree] scratch: contacts of such a pair, 0 to 2."""
     busy_count: wp.array(dtype=wp.int32)
     """[1] number of trees that need more sweeps than one thread takes."""
     busy: wp.array(dtype=wp.int32)
@@ -74,29 +80,26 @@ def list_near_geoms(
     return near_count
 
 
-@wp.func
-def find_contacts_of_tree(
-    tree: int,
-    is_round: bool,
+@wp.kernel
+def list_near_pairs(
+    # model
     parameters: Parameters,
     capsules: Capsules,
     geoms: Geoms,
+    # in
     trees: int,
-    slots: int,
     bodies: PlantBodies,
-    rigid: RigidBodies,
-    hulls: Hulls,
     geom_states: GeomStates,
     static_blocks: Aabbs,
+    # out
     capsule_states_out: CapsuleStates,
     tree_contacts_out: TreeContacts,
-    candidates_out: Candidates,
 ):
-    """Contacts of a tree with static geoms, in the order of (capsule, geom, end).
+    """One thread per tree: pairs of a capsule and a geom whose boxes overlap, and where these capsules are.
 
-    Capsule i of a tree is ``i * trees + tree``; one without a body is none. What exceeds the slots is only counted. First
-    boxes are compared, then threads in step go through what each of them found near: pairs beyond their room count as dropped.
+    Capsule i of a tree is ``i * trees + tree``; one without a body is none. Pairs beyond their room count as dropped.
     """
+    tree = wp.tid()
     near_count = int(0)
     for s in range(tree, capsules.body.shape[0], trees):
         if capsules.body[s] >= 0:
@@ -109,23 +112,40 @@ def find_contacts_of_tree(
                 capsule_states_out.start[s] = start
                 capsule_states_out.end[s] = end
                 capsule_states_out.speed[s] = speed
-                capsule_states_out.low[s] = low
-                capsule_states_out.high[s] = high
     room = tree_contacts_out.near.shape[0] / trees
-    count = int(0)
-    is_impact = bool(False)
-    for i in range(wp.min(near_count, room)):
+    tree_contacts_out.near_count[tree] = wp.min(near_count, room)
+    tree_contacts_out.is_impact[tree] = False
+    if near_count > room:
+        tree_contacts_out.dropped[tree] += near_count - room
+
+
+@wp.func
+def find_contacts_of_pair(
+    thread: int,
+    is_round: bool,
+    parameters: Parameters,
+    capsules: Capsules,
+    geoms: Geoms,
+    trees: int,
+    bodies: PlantBodies,
+    capsule_states: CapsuleStates,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    tree_contacts_out: TreeContacts,
+    candidates_out: Candidates,
+):
+    """Contacts of pair i of a tree, as candidates 2 i and 2 i + 1."""
+    tree, i = tree_and_entry(thread, tree_contacts_out.near.shape[0] / trees)
+    if tree < trees and i < tree_contacts_out.near_count[wp.min(tree, trees - 1)]:
         pair = tree_contacts_out.near[i * trees + tree]
-        count, hits = add_pair(
-            is_round, tree, count, pair[0], pair[1], parameters, capsules, geoms, bodies, capsule_states_out, rigid,
-            hulls, geom_states, candidates_out,
+        end, is_impact = add_pair(
+            is_round, tree, 2 * i, pair[0], pair[1], parameters, capsules, geoms, bodies, capsule_states, rigid, hulls,
+            geom_states, candidates_out,
         )  # fmt: skip
-        is_impact = is_impact or hits
-    tree_contacts_out.is_impact[tree] = is_impact
-    tree_contacts_out.count[tree] = wp.min(count, slots)
-    dropped = wp.max(count - slots, 0) + wp.max(near_count - room, 0)
-    if dropped > 0:
-        tree_contacts_out.dropped[tree] += dropped
+        tree_contacts_out.found[i * trees + tree] = end - 2 * i
+        if is_impact:
+            tree_contacts_out.is_impact[tree] = True
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -136,21 +156,19 @@ def find_tree_contacts(
     geoms: Geoms,
     # in
     trees: int,
-    slots: int,
     bodies: PlantBodies,
+    capsule_states: CapsuleStates,
     rigid: RigidBodies,
     hulls: Hulls,
     geom_states: GeomStates,
-    static_blocks: Aabbs,
     # out
-    capsule_states_out: CapsuleStates,
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """One thread per tree: :func:`find_contacts_of_tree` with geoms of any kind."""
-    find_contacts_of_tree(
-        wp.tid(), False, parameters, capsules, geoms, trees, slots, bodies, rigid, hulls, geom_states, static_blocks,
-        capsule_states_out, tree_contacts_out, candidates_out,
+    """One thread per pair of a tree: :func:`find_contacts_of_pair` with geoms of any kind."""
+    find_contacts_of_pair(
+        wp.tid(), False, parameters, capsules, geoms, trees, bodies, capsule_states, rigid, hulls, geom_states,
+        tree_contacts_out, candidates_out,
     )  # fmt: skip
 
 
@@ -162,19 +180,42 @@ def find_round_tree_contacts(
     geoms: Geoms,
     # in
     trees: int,
-    slots: int,
     bodies: PlantBodies,
+    capsule_states: CapsuleStates,
     rigid: RigidBodies,
     hulls: Hulls,
     geom_states: GeomStates,
-    static_blocks: Aabbs,
     # out
-    capsule_states_out: CapsuleStates,
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """One thread per tree: :func:`find_contacts_of_tree` where all geoms are planes, spheres and capsules."""
-    find_contacts_of_tree(
-        wp.tid(), True, parameters, capsules, geoms, trees, slots, bodies, rigid, hulls, geom_states, static_blocks,
-        capsule_states_out, tree_contacts_out, candidates_out,
+    """One thread per pair of a tree: :func:`find_contacts_of_pair` where all geoms are planes, spheres and capsules."""
+    find_contacts_of_pair(
+        wp.tid(), True, parameters, capsules, geoms, trees, bodies, capsule_states, rigid, hulls, geom_states,
+        tree_contacts_out, candidates_out,
     )  # fmt: skip
+
+
+@wp.kernel
+def number_tree_contacts(
+    # in
+    trees: int,
+    slots: int,
+    # out
+    tree_contacts_out: TreeContacts,
+    source_out: wp.array(dtype=wp.int32),
+):
+    """One thread per tree: its contacts in the order of (capsule, geom, end). What exceeds the slots is only counted.
+
+    source_out: [slot * trees + tree] which candidate each contact is.
+    """
+    tree = wp.tid()
+    count = int(0)
+    for i in range(tree_contacts_out.near_count[tree]):
+        for end in range(tree_contacts_out.found[i * trees + tree]):
+            if count < slots:
+                source_out[count * trees + tree] = 2 * i + end
+            count = count + 1
+    tree_contacts_out.count[tree] = wp.min(count, slots)
+    if count > slots:
+        tree_contacts_out.dropped[tree] += count - slots

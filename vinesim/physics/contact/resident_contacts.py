@@ -17,6 +17,7 @@ from vinesim.kernels.articulation import structs as plant_structs
 from vinesim.kernels.contact import broadphase, structs, tree_delassus, tree_islands, tree_narrowphase
 from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
 from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem
+from vinesim.kernels.contact.tree_views import GROUP
 from vinesim.kernels.launch import THREADS_PER_BLOCK, bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters, material_pairs
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
@@ -181,10 +182,10 @@ class ResidentContacts:
     def _allocate(self) -> None:
         trees, slots = self._trees, self.slots
         self._groups = 1 if self._device.is_cpu else min(trees, WARPS)
-        rows = 3 * slots
+        rows, pairs = 3 * slots, PAIRS_PER_SLOT * slots
         self.candidates = self._allocated(structs.Candidates, {}, {})
         for name in ("feature", "other", "gap", "end_gap", "normal", "point"):
-            setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, slots))
+            setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, 2 * pairs))
         of_all: dict[str, int] = dict.fromkeys(structs.Contacts.vars, trees * slots)
         self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("island", "block", "place"), 1), {})
         of_rows: dict[str, int] = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
@@ -202,8 +203,8 @@ class ResidentContacts:
         )
         of_all = dict.fromkeys(structs.WarmStart.vars, trees * slots) | {"count": trees}
         self._warm_start = self._allocated(structs.WarmStart, of_all, {})
-        of_trees = dict.fromkeys(("count", "is_impact", "dropped", "sweeps", "loaded_count", "busy"), trees)
-        of_trees |= {"loaded": trees * slots, "near": trees * slots * PAIRS_PER_SLOT}
+        of_trees = dict.fromkeys(tree_narrowphase.TreeContacts.vars, trees)
+        of_trees |= {"busy_count": 1, "loaded": trees * slots} | dict.fromkeys(("near", "found"), trees * pairs)
         self._tree_contacts = self._allocated(tree_narrowphase.TreeContacts, of_trees, {})
         self._response = self._allocated(tree_delassus.ResponseRows, dict.fromkeys(("a", "alpha"), trees * slots), {})
         self._was_in_contact = self._zeros(wp.bool, trees)
@@ -221,6 +222,7 @@ class ResidentContacts:
         scratch, prediction, work = fill(s.Scratch), fill(s.Prediction), fill(s.WrenchScratch)
         onset, contacts = self.plants.onset_steps, self._tree_contacts
         width = 3 * self.slots
+        entries = -(-trees // GROUP) * GROUP
         few, lanes, block = (1, 1, 1) if self._device.is_cpu else (FIRST_LANES, WARP_SIZE, FULL_BLOCK)
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
@@ -231,17 +233,20 @@ class ResidentContacts:
         find = tree_narrowphase.find_round_tree_contacts if is_round else tree_narrowphase.find_tree_contacts
         compliances = fill(tree_delassus.BodyCompliances, P="M", Q="H", R="J")  # free since the prediction
         return [
-            bound(find, trees, parameters, capsules, geoms, trees, self.slots,
-                  self._bodies, self._rigid_bodies, self._hulls, self._geom_states, self._static_blocks,
-                  self._capsule_states, contacts, self.candidates),
+            bound(tree_narrowphase.list_near_pairs, trees, parameters, capsules, geoms, trees, self._bodies,
+                  self._geom_states, self._static_blocks, self._capsule_states, contacts),
+            bound(find, entries * self.slots * PAIRS_PER_SLOT, parameters, capsules, geoms, trees, self._bodies,
+                  self._capsule_states, self._rigid_bodies, self._hulls, self._geom_states, contacts,
+                  self.candidates),
+            bound(tree_narrowphase.number_tree_contacts, trees, trees, self.slots, contacts, self.contacts.source),
             bound(tree_islands.predict_impacted_trees, trees, plants.parameters, model, onset, contacts.is_impact,
                   forces, joints, arrays["phi_used"], arrays["tree_euler_steps"], bodies, factors, scratch, prediction),
-            bound(tree_islands.write_tree_rows, trees * self.slots, parameters, self._pairs, capsules, geoms, trees,
-                  self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts, self.contacts,
+            bound(tree_islands.write_tree_rows, entries * self.slots, parameters, self._pairs, capsules, geoms, trees,
+                  self.slots, self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts, self.contacts,
                   self.rows),
             bound(tree_delassus.respond_at_contacts, trees, model, arrays["body_branches"], trees, factors,
                   self.contacts, self.rows, contacts, compliances, self._response),
-            bound(tree_delassus.write_delassus, trees * self.slots, model, trees, width, factors, contacts,
+            bound(tree_delassus.write_delassus, entries * self.slots, model, trees, width, factors, contacts,
                   self.contacts, self.rows, compliances, self._response, self._system),
             bound(tree_islands.solve_trees, -(-trees * few // block) * block, p.solver_sweeps, p.solver_newton_steps,
                   p.solver_newton_contacts, p.solver_tolerance, trees, width, few, contacts, self._system,
