@@ -80,19 +80,26 @@ def tree_energy(
     first = model.tree_first[tree]
     origin = wp.transform_get_translation(model.tree_pose[tree])
     standing = wp.transform(wp.vec3(), wp.transform_get_rotation(model.tree_pose[tree]))
+    pose = wp.transform()
+    motion = wp.spatial_vector()
     for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
         parent = model.body_parent[k]
-        above = standing
-        above_motion = wp.spatial_vector()
-        if parent >= 0:
-            above = bodies_out.body_q[parent]
-            above_motion = bodies_out.body_qd[parent]
+        offset = model.body_offset[k]
+        rest = model.body_rest[k]
+        q = joints.joint_q[k]
+        qd = joints.joint_qd[k]
+        if parent < 0:
+            pose = standing
+            motion = wp.spatial_vector()
+        elif parent != k - model.pitch:  # else the last body is the parent
+            pose = bodies_out.body_q[parent]
+            motion = bodies_out.body_qd[parent]
         _axes, _lever, pose, motion = body_kinematics(
-            above, above_motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
+            pose, motion, offset, rest, q, qd
         )
+        energy += body_energy(k, p, model, forces, q, origin, pose, motion)
         bodies_out.body_q[k] = pose
         bodies_out.body_qd[k] = motion
-        energy += body_energy(k, p, model, forces, joints.joint_q[k], origin, pose, motion)
     return energy
 
 

@@ -57,17 +57,21 @@ def velocity_product_acceleration(
     linear = wp.vec3()
     angular = wp.vec3()
     k = int(body)
+    joint = origin
+    turning = wp.spatial_bottom(body_qd[body])
     while k >= 0:
         parent = body_parent[k]
         if body_cut[k]:
             parent = -1
         if parent >= 0:
-            joint = wp.transform_get_translation(body_q[k])
+            above = wp.transform_get_translation(body_q[parent])
             omega = wp.spatial_bottom(body_qd[parent])
-            relative = wp.cross(omega, wp.spatial_bottom(body_qd[k]))
+            relative = wp.cross(omega, turning)
             angular += relative
             linear += wp.cross(relative, origin - joint)
-            linear += wp.cross(omega, wp.cross(omega, joint - wp.transform_get_translation(body_q[parent])))
+            linear += wp.cross(omega, wp.cross(omega, joint - above))
+            joint = above
+            turning = omega
         k = parent
     return wp.spatial_vector(linear, angular)
 

@@ -162,22 +162,32 @@ def apply_loaded_wrenches(
             work_out.subtree_wrench[k] = wp.spatial_vector()
     carried = wp.spatial_vector()
     at = int(count - 1)
+    touched = int(last)
     for i in range((last - first) / model.pitch + 1):
         k = last - i * model.pitch
-        wrench = carried
-        if is_branching[k]:
-            wrench = wrench + work_out.subtree_wrench[k]
-        if at >= 0 and loaded[wp.max(at, 0)] == k:
-            wrench = wrench + body_wrench[k]
-            while at >= 0 and loaded[wp.max(at, 0)] == k:
-                at = at - 1
-        moment = wp.spatial_bottom(wrench)
-        scratch_out.Du[k] = factors.D[k] * moment
-        carried = wp.spatial_vector()
+        # all that a body needs is read before anything is asked: a GPU then waits for memory once
         parent = model.body_parent[k]
+        branches = is_branching[k]
+        lever = factors.lever[k]
+        D = factors.D[k]
+        DH = factors.DH[k]
+        DJ = factors.DJ[k]
+        wrench = carried
+        if branches:
+            wrench = wrench + work_out.subtree_wrench[k]
+        if touched == k:
+            wrench = wrench + body_wrench[k]
+            while touched == k:
+                at = at - 1
+                touched = -1
+                if at >= 0:
+                    touched = loaded[at]
+        moment = wp.spatial_bottom(wrench)
+        scratch_out.Du[k] = D * moment
+        carried = wp.spatial_vector()
         if parent >= 0:
-            force = wp.spatial_top(wrench) - wp.transpose(factors.DH[k]) * moment
-            moment = moment - wp.transpose(factors.DJ[k]) * moment + wp.cross(factors.lever[k], force)
+            force = wp.spatial_top(wrench) - wp.transpose(DH) * moment
+            moment = moment - wp.transpose(DJ) * moment + wp.cross(lever, force)
             carried = wp.spatial_vector(force, moment)
             if parent != k - model.pitch:
                 work_out.subtree_wrench[parent] = work_out.subtree_wrench[parent] + carried
@@ -186,24 +196,30 @@ def apply_loaded_wrenches(
     alpha = wp.vec3()
     for k in range(first, end, model.pitch):
         parent = model.body_parent[k]
+        branches = is_branching[k]
+        lever = factors.lever[k]
+        DH = factors.DH[k]
+        DJ = factors.DJ[k]
+        Du = scratch_out.Du[k]
+        axes = factors.axes[k]
+        acceleration = prediction_out.body_acceleration[k]
+        rate = prediction_out.joint_qd_free[k]
         if parent < 0:
             a = wp.vec3()
             alpha = wp.vec3()
         elif parent != k - model.pitch:
             a = wp.spatial_top(work_out.added_acceleration[parent])
             alpha = wp.spatial_bottom(work_out.added_acceleration[parent])
-        a = a + wp.cross(alpha, factors.lever[k])
-        relative = -(factors.DJ[k] * alpha + factors.DH[k] * a)
+        a = a + wp.cross(alpha, lever)
+        relative = -(DJ * alpha + DH * a)
         if k <= last:
-            relative = relative + scratch_out.Du[k]
+            relative = relative + Du
         alpha = alpha + relative
         added = wp.spatial_vector(a, alpha)
-        if is_branching[k]:
+        if branches:
             work_out.added_acceleration[k] = added
-        prediction_out.body_acceleration[k] = prediction_out.body_acceleration[k] + added
-        prediction_out.joint_qd_free[k] = prediction_out.joint_qd_free[k] + dt * wp.quat_rotate_inv(
-            factors.axes[k], relative
-        )
+        prediction_out.body_acceleration[k] = acceleration + added
+        prediction_out.joint_qd_free[k] = rate + dt * wp.quat_rotate_inv(axes, relative)
 
 
 @wp.func
@@ -242,10 +258,10 @@ def solve_trees(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """``lanes`` threads per tree solve for its impulses; lists the trees that need more threads or sweeps.
+    """``lanes`` threads per tree solve for its impulses.
 
     On a GPU 16 threads solve trees of few contacts at once, see :func:`vinesim.kernels.contact.row_solver.solve_few_rows`,
-    in full warps. On a CPU two sweeps are done here.
+    in full warps; nothing happens with the others. On a CPU two sweeps are done here, and trees that need more are listed.
     """
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
@@ -258,14 +274,14 @@ def solve_trees(
         count, max_sweeps, FIRST_SWEEPS, newton_end, tolerance, system.matrix, system.free, system.friction,
         system.compliance, system.impulse, system.velocity,
     )  # fmt: skip
-    busy = sweeps < 0
+    busy = bool(False)
     if lanes == 1 and count > 0:
         search = view_search(search_out, tree, trees, width + 1)
         update_velocities(lane, lanes, 3 * count, system)
         limit = wp.min(FIRST_SWEEPS, max_sweeps)
         sweeps, busy = solve_tree(0, lane, lanes, count, limit, newton_end, tolerance, system, search)
-    if lane == 0 and count > 0:
-        tree_contacts_out.sweeps[tree] = wp.max(sweeps, 0)
+    if lane == 0 and count > 0 and sweeps >= 0:
+        tree_contacts_out.sweeps[tree] = sweeps
         if busy and sweeps < max_sweeps:
             tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
 

@@ -40,7 +40,7 @@ class TreeContacts:
     found: wp.array(dtype=wp.int32)
     """[i * trees + tree] scratch: contacts of such a pair, 0 to 2."""
     busy_count: wp.array(dtype=wp.int32)
-    """[1] number of trees that need more sweeps than one thread takes."""
+    """[1] number of trees that need more threads or sweeps than most."""
     busy: wp.array(dtype=wp.int32)
     """[i] these trees, in any order."""
     is_impact: wp.array(dtype=wp.bool)
@@ -100,6 +100,8 @@ def list_near_pairs(
     Capsule i of a tree is ``i * trees + tree``; one without a body is none. Pairs beyond their room count as dropped.
     """
     tree = wp.tid()
+    if tree == 0:
+        tree_contacts_out.busy_count[0] = 0
     near_count = int(0)
     for s in range(tree, capsules.body.shape[0], trees):
         if capsules.body[s] >= 0:
@@ -201,13 +203,14 @@ def number_tree_contacts(
     # in
     trees: int,
     slots: int,
+    few: int,
     # out
     tree_contacts_out: TreeContacts,
     source_out: wp.array(dtype=wp.int32),
 ):
     """One thread per tree: its contacts in the order of (capsule, geom, end). What exceeds the slots is only counted.
 
-    source_out: [slot * trees + tree] which candidate each contact is.
+    few: trees with more contacts are listed as busy. source_out: [slot * trees + tree] which candidate each contact is.
     """
     tree = wp.tid()
     count = int(0)
@@ -217,5 +220,8 @@ def number_tree_contacts(
                 source_out[count * trees + tree] = 2 * i + end
             count = count + 1
     tree_contacts_out.count[tree] = wp.min(count, slots)
+    tree_contacts_out.sweeps[tree] = 0
+    if count > few:
+        tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
     if count > slots:
         tree_contacts_out.dropped[tree] += count - slots
