@@ -12,6 +12,12 @@ def to_double(v: wp.vec3):
 
 
 @wp.func
+def to_single(v: wp.vec3d):
+    """A vector of double precision in single precision."""
+    return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
+
+
+@wp.func
 def velocity_at(pose: wp.transform, velocity: wp.spatial_vector, point: wp.vec3d):
     """World velocity [m/s] of a body's material at a point; ``velocity`` (linear, angular) is that of its origin."""
     lever = point - to_double(wp.transform_get_translation(pose))

@@ -18,9 +18,7 @@ constexpr int ROWS = %(rows)d, LANES = %(lanes)d;
 constexpr unsigned ALL = 0xffffffffu;
 const int lane = threadIdx.x %% LANES, c = lane / 3, part = lane %% 3;
 const int size = 3 * count <= ROWS ? 3 * count : 0;
-int most = size;  // all trees of a warp go through the same steps
-#pragma unroll
-for (int other = 16; other > 0; other /= 2) most = max(most, __shfl_xor_sync(ALL, most, other));
+const int most = __reduce_max_sync(ALL, size);  // all trees of a warp go through the same steps
 if (most == 0) return count > 0 ? -1 : 0;
 const bool is_row = lane < size;
 

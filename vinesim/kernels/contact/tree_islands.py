@@ -21,8 +21,9 @@ from vinesim.kernels.articulation.structs import (
     SolverParameters,
     WrenchScratch,
 )
+from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
-from vinesim.kernels.contact.jacobians import row_vector, write_rows
+from vinesim.kernels.contact.jacobians import write_rows
 from vinesim.kernels.contact.row_solver import solve_few_rows, solve_many_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
@@ -123,16 +124,11 @@ def write_tree_rows(
 
 
 @wp.func
-def wrench_of_contact(c: int, dt: wp.float64, rows: Rows):
+def wrench_of_contact(c: int, body_q: wp.array(dtype=wp.transform), contacts: Contacts):
     """Force and moment [N, N m] of one contact on its body."""
-    wrench = wp.spatial_vector()
-    for r in range(3):
-        row = 3 * c + r
-        share = wp.float32(rows.impulse[row] / dt)
-        wrench = wrench + share * wp.spatial_vector(
-            row_vector(row, 0, rows.plant_jacobian), row_vector(row, 3, rows.plant_jacobian)
-        )
-    return wrench
+    force = contacts.force[c]
+    lever = contacts.point[c] - to_double(wp.transform_get_translation(body_q[contacts.body[c]]))
+    return wp.spatial_vector(to_single(force), to_single(wp.cross(lever, force)))
 
 
 @wp.func
@@ -242,7 +238,7 @@ def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out
     synchronize_lanes(lanes)
 
 
-@wp.kernel(cuda_max_registers=128)
+@wp.kernel(cuda_max_registers=168)
 def solve_trees(
     # model
     max_sweeps: int,
@@ -348,6 +344,7 @@ def apply_tree_impulses(
     # in
     trees: int,
     width: int,
+    body_q: wp.array(dtype=wp.transform),
     rows_all: Rows,
     system_all: TreeSystem,
     factors: Factors,
@@ -390,7 +387,7 @@ def apply_tree_impulses(
         store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts, warm_start)
         body = contacts.body[c]
         loaded[c] = body
-        body_wrench_out[body] = body_wrench_out[body] + wrench_of_contact(c, parameters.dt, rows)
+        body_wrench_out[body] = body_wrench_out[body] + wrench_of_contact(c, body_q, contacts)
     apply_loaded_wrenches(
         tree, count, wp.float32(parameters.dt), model, is_branching, loaded, body_wrench_out, factors, work_out,
         scratch_out, prediction_out,

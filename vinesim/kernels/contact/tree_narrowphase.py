@@ -103,8 +103,13 @@ def list_near_pairs(
     if tree == 0:
         tree_contacts_out.busy_count[0] = 0
     near_count = int(0)
-    for s in range(tree, capsules.body.shape[0], trees):
-        if capsules.body[s] >= 0:
+    size = capsules.body.shape[0]
+    following = capsules.body[tree]
+    for s in range(tree, size, trees):
+        body = following
+        if s + trees < size:
+            following = capsules.body[s + trees]
+        if body >= 0:
             start, end, speed, low, high = sweep_capsule(s, wp.float32(parameters.dt), capsules, bodies)
             before = near_count
             near_count = list_near_geoms(

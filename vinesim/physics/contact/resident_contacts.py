@@ -266,7 +266,7 @@ class ResidentContacts:
         ]  # fmt: skip
         after = [
             bound(tree_islands.apply_tree_impulses, trees, parameters, model, arrays["body_branches"], onset, trees,
-                  width, self.rows, self._system, factors, self._was_in_contact, arrays["tree_euler_steps"], contacts,
+                  width, self._bodies.q, self.rows, self._system, factors, self._was_in_contact, arrays["tree_euler_steps"], contacts,
                   self.contacts, self._warm_start, arrays["body_wrench"], work, scratch, prediction),
         ]  # fmt: skip
         return before, solves, after
