@@ -33,71 +33,8 @@ from vinesim.kernels.articulation.structs import (
     SolverParameters,
     substep_parameters,
 )
-from vinesim.kernels.prefetch import (
-    AHEAD,
-    prefetch_bool,
-    prefetch_float,
-    prefetch_int,
-    prefetch_mat33,
-    prefetch_quat,
-    prefetch_spatial,
-    prefetch_transform,
-    prefetch_vec2i,
-    prefetch_vec3,
-)
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def prefetch_placed(k: int, model: ArticulationModel, joints: JointState, is_branching: wp.array(dtype=wp.bool)):
-    """Fetch what :func:`place_bodies` reads of body k."""
-    prefetch_int(model.body_parent, k)
-    prefetch_vec3(model.body_offset, k)
-    prefetch_quat(model.body_rest, k)
-    prefetch_quat(joints.joint_q, k)
-    prefetch_vec3(joints.joint_qd, k)
-    prefetch_bool(is_branching, k)
-
-
-@wp.func
-def prefetch_eliminated(
-    k: int, model: ArticulationModel, forces: AppliedForces, joints: JointState, bodies: BodyState, factors: Factors
-):
-    """Fetch what :func:`eliminate_bodies` reads of body k."""
-    prefetch_transform(bodies.body_q, k)
-    prefetch_spatial(bodies.body_qd, k)
-    prefetch_quat(factors.axes, k)
-    prefetch_vec3(factors.lever, k)
-    prefetch_quat(joints.joint_q, k)
-    prefetch_vec3(joints.joint_qd, k)
-    prefetch_int(model.body_parent, k)
-    prefetch_int(model.body_root, k)
-    prefetch_float(model.body_mass, k)
-    prefetch_vec3(model.body_com, k)
-    prefetch_vec3(model.body_inertia, k)
-    prefetch_vec3(model.body_product, k)
-    prefetch_float(model.body_drag, k)
-    prefetch_vec3(model.joint_stiffness, k)
-    prefetch_vec3(model.joint_damping, k)
-    prefetch_vec2i(model.tie_span, k)
-    prefetch_spatial(forces.body_load, k)
-    prefetch_spatial(forces.body_wrench, k)
-
-
-@wp.func
-def prefetch_accelerated(
-    k: int, model: ArticulationModel, joints: JointState, bodies: BodyState, factors: Factors, scratch: Scratch
-):
-    """Fetch what :func:`accelerate_tree` reads of body k."""
-    prefetch_int(model.body_parent, k)
-    prefetch_spatial(bodies.body_qd, k)
-    prefetch_vec3(factors.lever, k)
-    prefetch_quat(factors.axes, k)
-    prefetch_vec3(joints.joint_qd, k)
-    prefetch_mat33(factors.DJ, k)
-    prefetch_mat33(factors.DH, k)
-    prefetch_vec3(scratch.Du, k)
 
 
 @wp.func
@@ -116,7 +53,6 @@ def place_bodies(
     motion = wp.spatial_vector()
     end = first + model.tree_moving[tree] * model.pitch
     for k in range(first, end, model.pitch):
-        prefetch_placed(wp.min(k + AHEAD * model.pitch, end - model.pitch), model, joints, is_branching)
         # all that a body needs is read before anything is asked: a GPU then waits for memory once
         parent = model.body_parent[k]
         offset = model.body_offset[k]
@@ -222,7 +158,6 @@ def eliminate_bodies(
     tension_carried = wp.vec3()
     for i in range(size):
         k = last - i * model.pitch
-        prefetch_eliminated(wp.max(k - model.pitch, first), model, forces, joints, bodies, factors_out)
         parent = model.body_parent[k]
         pose = bodies.body_q[k]
         axes = factors_out.axes[k]
@@ -309,9 +244,6 @@ def accelerate_tree(
     omega = wp.vec3()
     end = first + model.tree_moving[tree] * model.pitch
     for k in range(first, end, model.pitch):
-        prefetch_accelerated(
-            wp.min(k + AHEAD * model.pitch, end - model.pitch), model, joints, bodies, factors, scratch
-        )
         parent = model.body_parent[k]
         lever = factors.lever[k]
         axes = factors.axes[k]

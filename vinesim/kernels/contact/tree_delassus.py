@@ -185,11 +185,14 @@ def write_delassus(
     contacts = view_contacts(contacts_all, tree, trees)
     rows = view_rows(rows_all, tree, trees)
     system = view_system(system_out, tree, trees, width)
-    for row in range(3 * c, 3 * c + 3):
-        system.free[row] = rows.velocity_free[row] + rows.bias[row]
+    n = 3 * c
+    velocity = wp.vec3d(rows.velocity_free[n], rows.velocity_free[n + 1], rows.velocity_free[n + 2])
+    bias = wp.vec3d(rows.bias[n], rows.bias[n + 1], rows.bias[n + 2])
     force = row_columns(c, 0, rows.plant_jacobian)
     moment = row_columns(c, 3, rows.plant_jacobian)
     k = int(contacts.body[c])
+    for r in range(3):
+        system.free[n + r] = velocity[r] + bias[r]
     for back in range(c + 1):
         other = c - back
         body = contacts.body[other]

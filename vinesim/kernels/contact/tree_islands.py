@@ -238,7 +238,7 @@ def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out
     synchronize_lanes(lanes)
 
 
-@wp.kernel(cuda_max_registers=168)
+@wp.kernel(cuda_max_registers=128)
 def solve_trees(
     # model
     max_sweeps: int,
