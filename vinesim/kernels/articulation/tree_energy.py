@@ -42,21 +42,23 @@ def body_energy(
 
     Potential is its weight's, its joint's spring and its ties. pose: [m] against ``origin`` [m], world axes.
     """
+    com = model.body_com[k]
+    mass = model.body_mass[k]
+    inertia = model.body_inertia[k]
+    product = model.body_product[k]
+    stiffness = model.joint_stiffness[k]
+    ties = model.tie_span[k]
     turn = wp.transform_get_rotation(pose)
-    arm = wp.quat_rotate(turn, model.body_com[k])
+    arm = wp.quat_rotate(turn, com)
     omega = wp.spatial_bottom(motion)
     velocity = wp.spatial_top(motion) + wp.cross(omega, arm)
     spin = wp.quat_rotate_inv(turn, omega)
     crossed = wp.vec3(spin[1] * spin[2], spin[2] * spin[0], spin[0] * spin[1])
-    mass = model.body_mass[k]
-    kinetic = 0.5 * (mass * wp.dot(velocity, velocity) + wp.dot(model.body_inertia[k], wp.cw_mul(spin, spin))) + wp.dot(
-        model.body_product[k], crossed
-    )
+    kinetic = 0.5 * (mass * wp.dot(velocity, velocity) + wp.dot(inertia, wp.cw_mul(spin, spin))) + wp.dot(product, crossed)
     place = wp.transform_get_translation(pose)
     weight = mass * wp.dot(p.gravity, place + arm)
-    elastic = spring_energy(model.joint_stiffness[k], joint_q)
+    elastic = spring_energy(stiffness, joint_q)
     held = float(0.0)
-    ties = model.tie_span[k]
     for t in range(ties[0], ties[1]):
         anchor = forces.tie_anchor[t]
         held += anchor[0] + 2.0 * anchor[1] + 4.0 * anchor[2]
@@ -105,21 +107,23 @@ def tree_energy(
 
 @wp.func_native("""
 unsigned long long sum = 0, weight = 1;
+auto word_at = [](const char* at) {
+#if defined(__CUDA_ARCH__)  // which loads byte by byte where it does not know that four of them are aligned
+    return ((const unsigned*)at)[0] | (unsigned long long)((const unsigned*)at)[1] << 32;
+#else
+    unsigned long long word;
+    memcpy(&word, at, 8);
+    return word;
+#endif
+};
 for (int row = 0; row < (pitch == 1 ? 1 : count); ++row) {
     const int length = pitch == 1 ? count : 1;
     const char* turns = (const char*)(q.data + first + row * pitch);
     const char* rates = (const char*)(qd.data + first + row * pitch);
-    unsigned long long word;
     unsigned last = 0;
-    for (int i = 0; i < 2 * length; ++i, weight += 2) {
-        memcpy(&word, turns + 8 * i, 8);
-        sum += weight * word;
-    }
-    for (int i = 0; i < 3 * length / 2; ++i, weight += 2) {
-        memcpy(&word, rates + 8 * i, 8);
-        sum += weight * word;
-    }
-    if (length % 2) memcpy(&last, rates + 12 * length - 4, 4);
+    for (int i = 0; i < 2 * length; ++i, weight += 2) sum += weight * word_at(turns + 8 * i);
+    for (int i = 0; i < 3 * length / 2; ++i, weight += 2) sum += weight * word_at(rates + 8 * i);
+    if (length % 2) last = word_at(rates + 12 * length - 8) >> 32;
     sum += weight * last;
 }
 return (int)(sum >> 32) ^ (int)sum;
@@ -130,22 +134,24 @@ def state_mark(q: wp.array(dtype=wp.quat), qd: wp.array(dtype=wp.vec3), first: i
 
 
 @wp.func_native("""
-unsigned long long any = 0;
 if (pitch == 1) {
+    unsigned any = 0;
     const unsigned* a = (const unsigned*)(load.data + first);
     const unsigned* b = (const unsigned*)(wrench.data + first);
-    unsigned bits = 0;
-    for (int i = 0; i < 6 * count; ++i) bits |= a[i] | b[i];
-    any = bits;
-} else {  // on a GPU: as many words at a time as it fetches at once
-    #pragma unroll 4
-    for (int row = 0; row < count; ++row) {
+    for (int i = 0; i < 6 * count; ++i) any |= a[i] | b[i];
+    return any << 1 != 0;
+}
+unsigned long long any = 0;
+for (int start = 0; start < count && !any; start += 4) {  // four at a time: a GPU fetches them at once
+    #pragma unroll
+    for (int i = 0; i < 4; ++i) {
+        const int row = start + i < count ? start + i : start;
         const unsigned long long* a = (const unsigned long long*)(load.data + first + row * pitch);
         const unsigned long long* b = (const unsigned long long*)(wrench.data + first + row * pitch);
-        any |= a[0] | a[1] | a[2] | b[0] | b[1] | b[2];
+        any |= (a[0] | a[1] | a[2] | b[0] | b[1] | b[2]) & 0x7fffffff7fffffff;
     }
 }
-return (unsigned)(any >> 32 | any) << 1 != 0;
+return any != 0;
 """)
 def is_pushed(
     load: wp.array(dtype=wp.spatial_vector),

@@ -127,13 +127,14 @@ def list_near_pairs(
 
 
 @wp.func
-def find_contacts_of_pair(
+def find_contacts_of_pairs(
     thread: int,
     is_round: bool,
     parameters: Parameters,
     capsules: Capsules,
     geoms: Geoms,
     trees: int,
+    slots: int,
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     rigid: RigidBodies,
@@ -142,9 +143,12 @@ def find_contacts_of_pair(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """Contacts of pair i of a tree, as candidates 2 i and 2 i + 1."""
-    tree, i = tree_and_entry(thread, tree_contacts_out.near.shape[0] / trees)
-    if tree < trees and i < tree_contacts_out.near_count[wp.min(tree, trees - 1)]:
+    """Contacts of pair i of a tree, as candidates 2 i and 2 i + 1; a thread takes each so-manieth of a tree's pairs."""
+    tree, first = tree_and_entry(thread, slots)
+    count = int(0)
+    if tree < trees:
+        count = tree_contacts_out.near_count[tree]
+    for i in range(first, count, slots):
         pair = tree_contacts_out.near[i * trees + tree]
         end, is_impact = add_pair(
             is_round, tree, 2 * i, pair[0], pair[1], parameters, capsules, geoms, bodies, capsule_states, rigid, hulls,
@@ -163,6 +167,7 @@ def find_tree_contacts(
     geoms: Geoms,
     # in
     trees: int,
+    slots: int,
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     rigid: RigidBodies,
@@ -172,10 +177,10 @@ def find_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """One thread per pair of a tree: :func:`find_contacts_of_pair` with geoms of any kind."""
-    find_contacts_of_pair(
-        wp.tid(), False, parameters, capsules, geoms, trees, bodies, capsule_states, rigid, hulls, geom_states,
-        tree_contacts_out, candidates_out,
+    """One thread per slot of a tree: :func:`find_contacts_of_pairs` with geoms of any kind."""
+    find_contacts_of_pairs(
+        wp.tid(), False, parameters, capsules, geoms, trees, slots, bodies, capsule_states, rigid, hulls,
+        geom_states, tree_contacts_out, candidates_out,
     )  # fmt: skip
 
 
@@ -187,6 +192,7 @@ def find_round_tree_contacts(
     geoms: Geoms,
     # in
     trees: int,
+    slots: int,
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     rigid: RigidBodies,
@@ -196,10 +202,10 @@ def find_round_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """One thread per pair of a tree: :func:`find_contacts_of_pair` where all geoms are planes, spheres and capsules."""
-    find_contacts_of_pair(
-        wp.tid(), True, parameters, capsules, geoms, trees, bodies, capsule_states, rigid, hulls, geom_states,
-        tree_contacts_out, candidates_out,
+    """One thread per slot of a tree: :func:`find_contacts_of_pairs` where all geoms are planes, spheres and capsules."""
+    find_contacts_of_pairs(
+        wp.tid(), True, parameters, capsules, geoms, trees, slots, bodies, capsule_states, rigid, hulls,
+        geom_states, tree_contacts_out, candidates_out,
     )  # fmt: skip
 
 

@@ -242,7 +242,7 @@ class ResidentContacts:
         before = [
             bound(tree_narrowphase.list_near_pairs, trees, parameters, capsules, geoms, trees, self._bodies,
                   self._geom_states, self._static_blocks, self._capsule_states, contacts),
-            bound(find, entries * self.slots * PAIRS_PER_SLOT, parameters, capsules, geoms, trees, self._bodies,
+            bound(find, entries * self.slots, parameters, capsules, geoms, trees, self.slots, self._bodies,
                   self._capsule_states, self._rigid_bodies, self._hulls, self._geom_states, contacts,
                   self.candidates),
             bound(tree_narrowphase.number_tree_contacts, trees, trees, self.slots, few, contacts, self.contacts.source),
