@@ -107,23 +107,21 @@ def tree_energy(
 
 @wp.func_native("""
 unsigned long long sum = 0, weight = 1;
-auto word_at = [](const char* at) {
-#if defined(__CUDA_ARCH__)  // which loads byte by byte where it does not know that four of them are aligned
-    return ((const unsigned*)at)[0] | (unsigned long long)((const unsigned*)at)[1] << 32;
-#else
-    unsigned long long word;
-    memcpy(&word, at, 8);
-    return word;
-#endif
-};
 for (int row = 0; row < (pitch == 1 ? 1 : count); ++row) {
     const int length = pitch == 1 ? count : 1;
     const char* turns = (const char*)(q.data + first + row * pitch);
     const char* rates = (const char*)(qd.data + first + row * pitch);
+    unsigned long long word;
     unsigned last = 0;
-    for (int i = 0; i < 2 * length; ++i, weight += 2) sum += weight * word_at(turns + 8 * i);
-    for (int i = 0; i < 3 * length / 2; ++i, weight += 2) sum += weight * word_at(rates + 8 * i);
-    if (length % 2) last = word_at(rates + 12 * length - 8) >> 32;
+    for (int i = 0; i < 2 * length; ++i, weight += 2) {
+        memcpy(&word, turns + 8 * i, 8);
+        sum += weight * word;
+    }
+    for (int i = 0; i < 3 * length / 2; ++i, weight += 2) {
+        memcpy(&word, rates + 8 * i, 8);
+        sum += weight * word;
+    }
+    if (length % 2) memcpy(&last, rates + 12 * length - 4, 4);
     sum += weight * last;
 }
 return (int)(sum >> 32) ^ (int)sum;

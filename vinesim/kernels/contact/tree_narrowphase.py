@@ -22,7 +22,6 @@ from vinesim.kernels.contact.structs import (
     PlantBodies,
     RigidBodies,
 )
-from vinesim.kernels.contact.tree_views import tree_and_entry
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,10 +32,12 @@ class TreeContacts:
 
     count: wp.array(dtype=wp.int32)
     """of this step."""
-    near: wp.array(dtype=wp.vec2i)
-    """[i * trees + tree] scratch: capsules and geoms whose boxes overlap."""
+    near: wp.array(dtype=wp.vec3i)
+    """[k] scratch: capsules and geoms whose boxes overlap, in any order, and which pair of its tree each is."""
+    near_total: wp.array(dtype=wp.int32)
+    """[1] number of these pairs."""
     near_count: wp.array(dtype=wp.int32)
-    """how many such pairs there is room for."""
+    """of them."""
     found: wp.array(dtype=wp.int32)
     """[i * trees + tree] scratch: contacts of such a pair, 0 to 2."""
     busy_count: wp.array(dtype=wp.int32)
@@ -58,24 +59,24 @@ class TreeContacts:
 @wp.func
 def list_near_geoms(
     s: int,
-    tree: int,
-    trees: int,
     near_count: int,
+    room: int,
     low: wp.vec3,
     high: wp.vec3,
     geoms: Geoms,
     geom_states: GeomStates,
     static_blocks: Aabbs,
-    near_out: wp.array(dtype=wp.vec2i),
+    tree_contacts_out: TreeContacts,
 ):
-    """List the geoms whose boxes overlap that of capsule ``s``; returns how many pairs the tree has then. More than there
-    is room for are only counted."""
+    """List the geoms whose boxes overlap that of capsule ``s``; returns how many pairs its tree has then. More than there
+    is ``room`` for are only counted."""
     for block in range(static_blocks.low.shape[0]):
         if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
             for g in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, geoms.count[1])):
                 if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
-                    if near_count * trees + tree < near_out.shape[0]:
-                        near_out[near_count * trees + tree] = wp.vec2i(s, g)
+                    if near_count < room:
+                        k = wp.atomic_add(tree_contacts_out.near_total, 0, 1)
+                        tree_contacts_out.near[k] = wp.vec3i(s, g, near_count)
                     near_count = near_count + 1
     return near_count
 
@@ -102,6 +103,7 @@ def list_near_pairs(
     tree = wp.tid()
     if tree == 0:
         tree_contacts_out.busy_count[0] = 0
+    room = tree_contacts_out.near.shape[0] / trees
     near_count = int(0)
     size = capsules.body.shape[0]
     following = capsules.body[tree]
@@ -113,13 +115,12 @@ def list_near_pairs(
             start, end, speed, low, high = sweep_capsule(s, wp.float32(parameters.dt), capsules, bodies)
             before = near_count
             near_count = list_near_geoms(
-                s, tree, trees, before, low, high, geoms, geom_states, static_blocks, tree_contacts_out.near
+                s, before, room, low, high, geoms, geom_states, static_blocks, tree_contacts_out
             )
             if near_count > before:
                 capsule_states_out.start[s] = start
                 capsule_states_out.end[s] = end
                 capsule_states_out.speed[s] = speed
-    room = tree_contacts_out.near.shape[0] / trees
     tree_contacts_out.near_count[tree] = wp.min(near_count, room)
     tree_contacts_out.is_impact[tree] = False
     if near_count > room:
@@ -134,7 +135,7 @@ def find_contacts_of_pairs(
     capsules: Capsules,
     geoms: Geoms,
     trees: int,
-    slots: int,
+    threads: int,
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     rigid: RigidBodies,
@@ -143,13 +144,11 @@ def find_contacts_of_pairs(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """Contacts of pair i of a tree, as candidates 2 i and 2 i + 1; a thread takes each so-manieth of a tree's pairs."""
-    tree, first = tree_and_entry(thread, slots)
-    count = int(0)
-    if tree < trees:
-        count = tree_contacts_out.near_count[tree]
-    for i in range(first, count, slots):
-        pair = tree_contacts_out.near[i * trees + tree]
+    """Contacts of every so-manieth near pair: those of pair i of a tree are its candidates 2 i and 2 i + 1."""
+    for k in range(thread, tree_contacts_out.near_total[0], threads):
+        pair = tree_contacts_out.near[k]
+        tree = pair[0] % trees
+        i = pair[2]
         end, is_impact = add_pair(
             is_round, tree, 2 * i, pair[0], pair[1], parameters, capsules, geoms, bodies, capsule_states, rigid, hulls,
             geom_states, candidates_out,
@@ -167,7 +166,7 @@ def find_tree_contacts(
     geoms: Geoms,
     # in
     trees: int,
-    slots: int,
+    threads: int,
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     rigid: RigidBodies,
@@ -177,9 +176,9 @@ def find_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """One thread per slot of a tree: :func:`find_contacts_of_pairs` with geoms of any kind."""
+    """``threads`` threads: :func:`find_contacts_of_pairs` with geoms of any kind."""
     find_contacts_of_pairs(
-        wp.tid(), False, parameters, capsules, geoms, trees, slots, bodies, capsule_states, rigid, hulls,
+        wp.tid(), False, parameters, capsules, geoms, trees, threads, bodies, capsule_states, rigid, hulls,
         geom_states, tree_contacts_out, candidates_out,
     )  # fmt: skip
 
@@ -192,7 +191,7 @@ def find_round_tree_contacts(
     geoms: Geoms,
     # in
     trees: int,
-    slots: int,
+    threads: int,
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     rigid: RigidBodies,
@@ -202,9 +201,9 @@ def find_round_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """One thread per slot of a tree: :func:`find_contacts_of_pairs` where all geoms are planes, spheres and capsules."""
+    """``threads`` threads: :func:`find_contacts_of_pairs` where all geoms are planes, spheres and capsules."""
     find_contacts_of_pairs(
-        wp.tid(), True, parameters, capsules, geoms, trees, slots, bodies, capsule_states, rigid, hulls,
+        wp.tid(), True, parameters, capsules, geoms, trees, threads, bodies, capsule_states, rigid, hulls,
         geom_states, tree_contacts_out, candidates_out,
     )  # fmt: skip
 
@@ -224,6 +223,8 @@ def number_tree_contacts(
     few: trees with more contacts are listed as busy. source_out: [slot * trees + tree] which candidate each contact is.
     """
     tree = wp.tid()
+    if tree == 0:
+        tree_contacts_out.near_total[0] = 0
     count = int(0)
     for i in range(tree_contacts_out.near_count[tree]):
         for end in range(tree_contacts_out.found[i * trees + tree]):

@@ -209,7 +209,8 @@ class ResidentContacts:
         of_all = dict.fromkeys(structs.WarmStart.vars, trees * slots) | {"count": trees}
         self._warm_start = self._allocated(structs.WarmStart, of_all, {})
         of_trees = dict.fromkeys(tree_narrowphase.TreeContacts.vars, trees)
-        of_trees |= {"busy_count": 1, "loaded": trees * slots} | dict.fromkeys(("near", "found"), trees * pairs)
+        of_trees |= dict.fromkeys(("near_total", "busy_count"), 1) | {"loaded": trees * slots}
+        of_trees |= dict.fromkeys(("near", "found"), trees * pairs)
         self._tree_contacts = self._allocated(tree_narrowphase.TreeContacts, of_trees, {})
         self._response = self._allocated(tree_delassus.ResponseRows, dict.fromkeys(("a", "alpha"), trees * slots), {})
         self._was_in_contact = self._zeros(wp.bool, trees)
@@ -242,7 +243,7 @@ class ResidentContacts:
         before = [
             bound(tree_narrowphase.list_near_pairs, trees, parameters, capsules, geoms, trees, self._bodies,
                   self._geom_states, self._static_blocks, self._capsule_states, contacts),
-            bound(find, entries * self.slots, parameters, capsules, geoms, trees, self.slots, self._bodies,
+            bound(find, trees * self.slots, parameters, capsules, geoms, trees, trees * self.slots, self._bodies,
                   self._capsule_states, self._rigid_bodies, self._hulls, self._geom_states, contacts,
                   self.candidates),
             bound(tree_narrowphase.number_tree_contacts, trees, trees, self.slots, few, contacts, self.contacts.source),
