@@ -62,23 +62,21 @@ def velocity_product_acceleration(
     origin = wp.transform_get_translation(body_q[body])
     linear = wp.vec3()
     angular = wp.vec3()
-    k = int(body)
     joint = origin
     turning = wp.spatial_bottom(body_qd[body])
-    while k >= 0:
-        parent = body_parent[k]
-        if body_cut[k]:
-            parent = -1
-        if parent >= 0:
-            above = wp.transform_get_translation(body_q[parent])
-            omega = wp.spatial_bottom(body_qd[parent])
-            relative = wp.cross(omega, turning)
-            angular += relative
-            linear += wp.cross(relative, origin - joint)
-            linear += wp.cross(omega, wp.cross(omega, joint - above))
-            joint = above
-            turning = omega
-        k = parent
+    parent = wp.where(body_cut[body], -1, body_parent[body])
+    while parent >= 0:
+        above = wp.transform_get_translation(body_q[parent])
+        omega = wp.spatial_bottom(body_qd[parent])
+        further = body_parent[parent]  # read before anything is asked: a GPU then waits for memory once a body
+        is_cut = body_cut[parent]
+        relative = wp.cross(omega, turning)
+        angular += relative
+        linear += wp.cross(relative, origin - joint)
+        linear += wp.cross(omega, wp.cross(omega, joint - above))
+        joint = above
+        turning = omega
+        parent = wp.where(is_cut, -1, further)
     return wp.spatial_vector(linear, angular)
 
 

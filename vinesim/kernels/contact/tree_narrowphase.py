@@ -183,7 +183,7 @@ def find_tree_contacts(
     )  # fmt: skip
 
 
-@wp.kernel(module="unique", enable_backward=False, cuda_max_registers=128)
+@wp.kernel(module="unique", enable_backward=False)
 def find_round_tree_contacts(
     # model
     parameters: Parameters,
