@@ -28,7 +28,22 @@ _CUDA_ONLY = (
     "vinesim.kernels.contact.tree_islands",
     "vinesim.kernels.raster.cuda_raster",
 )
-_CPU_ONLY = ("vinesim.kernels.articulation.eight_trees",)
+_CPU_ONLY = (
+    "vinesim.kernels.articulation.eight_trees",
+    "vinesim.kernels.contact.delassus",
+    "vinesim.kernels.contact.forces",
+    "vinesim.kernels.contact.islands",
+    "vinesim.kernels.contact.jacobians",
+    "vinesim.kernels.contact.narrowphase_plants",
+    "vinesim.kernels.contact.narrowphase_rigid",
+    "vinesim.kernels.contact.projected_gauss_seidel",
+    "vinesim.kernels.contact.sleeping_trees",
+    "vinesim.kernels.contact.sweep_order",
+    "vinesim.kernels.contact.wire_contacts",
+    "vinesim.kernels.contact.wire_shapes",
+    "vinesim.kernels.joint_servos",
+)
+"""Modules whose kernels are never launched on a GPU; some have vectors of a CPU in native code."""
 
 
 def compile_kernels(packages: tuple[str, ...] = (), device: str = "cpu") -> int:

@@ -59,34 +59,40 @@ def record(a: wp.array(dtype=float), at: int) -> wp.array(dtype=float):
     ...
 
 
-@wp.func
-def vec3_at(a: Floats, i: int):
+@wp.func_native("const float* const p = a.data + i; return wp::vec3(p[0], p[8], p[16]);")
+def vec3_at(a: wp.array(dtype=float), i: int) -> wp.vec3:
     """A vector of one lane, its first number at i."""
-    return wp.vec3(a[i], a[i + 8], a[i + 16])
+    ...
 
 
-@wp.func
-def quat_at(a: Floats, i: int):
+@wp.func_native("const float* const p = a.data + i; return wp::quat(p[0], p[8], p[16], p[24]);")
+def quat_at(a: wp.array(dtype=float), i: int) -> wp.quat:
     """A rotation of one lane."""
-    return wp.quat(a[i], a[i + 8], a[i + 16], a[i + 24])
+    ...
 
 
-@wp.func
-def spatial_at(a: Floats, i: int):
+@wp.func_native(
+    "const float* const p = a.data + i; wp::vec_t<6, float> v; for (int c = 0; c < 6; ++c) v[c] = p[8 * c]; return v;"
+)
+def spatial_at(a: wp.array(dtype=float), i: int) -> wp.spatial_vector:
     """A spatial vector of one lane."""
-    return wp.spatial_vector(a[i], a[i + 8], a[i + 16], a[i + 24], a[i + 32], a[i + 40])
+    ...
 
 
-@wp.func
-def mat33_at(a: Floats, i: int):
+@wp.func_native(
+    "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[24], p[32], p[40], p[48], p[56], p[64]);"
+)
+def mat33_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
     """A matrix of one lane."""
-    return wp.mat33(a[i], a[i + 8], a[i + 16], a[i + 24], a[i + 32], a[i + 40], a[i + 48], a[i + 56], a[i + 64])
+    ...
 
 
-@wp.func
-def symmetric_at(a: Floats, i: int):
+@wp.func_native(
+    "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[8], p[24], p[32], p[16], p[32], p[40]);"
+)
+def symmetric_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
     """A symmetric matrix of one lane, of which the upper triangle is kept."""
-    return wp.mat33(a[i], a[i + 8], a[i + 16], a[i + 8], a[i + 24], a[i + 32], a[i + 16], a[i + 32], a[i + 40])
+    ...
 
 
 @wp.func

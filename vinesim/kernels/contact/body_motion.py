@@ -50,6 +50,8 @@ def extrapolate_point(
 @wp.func
 def velocity_product_acceleration(
     body: int,
+    known: int,
+    known_acceleration: wp.spatial_vector,
     body_parent: wp.array(dtype=wp.int32),
     body_cut: wp.array(dtype=wp.bool),
     body_q: wp.array(dtype=wp.transform),
@@ -57,26 +59,37 @@ def velocity_product_acceleration(
 ):
     """Acceleration (linear, angular) of a body while all joints between it and its root turn at constant rates.
 
-    Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product accelerations.
+    ``known``: a body whose acceleration is known, -1 for none; if it carries this one, only the joints between are looked
+    at. Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product accelerations.
     """
     origin = wp.transform_get_translation(body_q[body])
     linear = wp.vec3()
     angular = wp.vec3()
+    k = int(body)
     joint = origin
     turning = wp.spatial_bottom(body_qd[body])
     parent = wp.where(body_cut[body], -1, body_parent[body])
-    while parent >= 0:
-        above = wp.transform_get_translation(body_q[parent])
-        omega = wp.spatial_bottom(body_qd[parent])
-        further = body_parent[parent]  # read before anything is asked: a GPU then waits for memory once a body
-        is_cut = body_cut[parent]
-        relative = wp.cross(omega, turning)
-        angular += relative
-        linear += wp.cross(relative, origin - joint)
-        linear += wp.cross(omega, wp.cross(omega, joint - above))
-        joint = above
-        turning = omega
-        parent = wp.where(is_cut, -1, further)
+    while k >= 0 and k != known:
+        if parent >= 0:
+            above = wp.transform_get_translation(body_q[parent])
+            omega = wp.spatial_bottom(body_qd[parent])
+            further = body_parent[parent]  # read with the rest, so that a GPU waits for memory once a body
+            is_cut = body_cut[parent]
+            relative = wp.cross(omega, turning)
+            angular += relative
+            linear += wp.cross(relative, origin - joint)
+            linear += wp.cross(omega, wp.cross(omega, joint - above))
+            joint = above
+            turning = omega
+            k = parent
+            parent = wp.where(is_cut, -1, further)
+        else:
+            k = -1
+    if k >= 0:
+        turn = wp.spatial_bottom(known_acceleration)
+        angular += turn
+        linear += wp.spatial_top(known_acceleration)
+        linear += wp.cross(turn, origin - joint)
     return wp.spatial_vector(linear, angular)
 
 

@@ -10,7 +10,7 @@ they add, J_r H^-1 J_r^T, has the rank of their degrees of freedom and stays in 
 
 import warp as wp
 
-from vinesim.kernels.contact.row_response import SideRows
+from vinesim.kernels.contact.row_response import EIGHT
 from vinesim.kernels.contact.structs import (
     Contacts,
     Geoms,
@@ -18,6 +18,7 @@ from vinesim.kernels.contact.structs import (
     RigidBodies,
     RigidFactors,
     Rows,
+    SideGroups,
     TouchedBodies,
 )
 
@@ -25,43 +26,27 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native("""
-    const auto pitch = [](const auto& array) { return array.strides[0] / (int)sizeof(double); };
-    const double* const from = jacobian.data + row * pitch(jacobian);
-    double* const to = response.data + row * pitch(response);
-    const int shift = pitch(response);
-    for (int i = first; i < end; ++i) {
-        for (int axis = 0; axis < 3; ++axis) to[axis * shift + i] = from[axis * pitch(jacobian) + i];
-    }
+    const wp::vec3d* const from = jacobian.data + contact * (jacobian.strides[0] / (int)sizeof(wp::vec3d));
+    wp::vec3d* const to = response.data + contact * (response.strides[0] / (int)sizeof(wp::vec3d));
+    for (int i = first; i < end; ++i) to[i] = from[i];
     for (int i = end - 1; i >= first; --i) {
-        const double x = to[i], y = to[shift + i], z = to[2 * shift + i];
-        if (x == 0.0 && y == 0.0 && z == 0.0) continue;
-        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) {
-            double* const at = to + column.data[e];
-            at[0] -= entry.data[e] * x;
-            at[shift] -= entry.data[e] * y;
-            at[2 * shift] -= entry.data[e] * z;
-        }
+        const wp::vec3d value = to[i];
+        if (value[0] == 0.0 && value[1] == 0.0 && value[2] == 0.0) continue;
+        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) to[column.data[e]] -= entry.data[e] * value;
     }
     for (int i = first; i < end; ++i) {
-        double x = to[i] * inverse.data[i], y = to[shift + i] * inverse.data[i], z = to[2 * shift + i] * inverse.data[i];
-        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) {
-            const double* const at = to + column.data[e];
-            x -= entry.data[e] * at[0];
-            y -= entry.data[e] * at[shift];
-            z -= entry.data[e] * at[2 * shift];
-        }
-        to[i] = x;
-        to[shift + i] = y;
-        to[2 * shift + i] = z;
+        wp::vec3d value = to[i] * inverse.data[i];
+        for (int e = start.data[i]; e < start.data[i] + size.data[i] - 1; ++e) value -= entry.data[e] * to[column.data[e]];
+        to[i] = value;
     }
 """)
-def solve_three_rows(
-    row: int, first: int, end: int, start: wp.array(dtype=wp.int32), size: wp.array(dtype=wp.int32),
+def solve_rigid_rows(
+    contact: int, first: int, end: int, start: wp.array(dtype=wp.int32), size: wp.array(dtype=wp.int32),
     column: wp.array(dtype=wp.int32), entry: wp.array(dtype=wp.float64), inverse: wp.array(dtype=wp.float64),
-    jacobian: wp.array2d(dtype=wp.float64), response: wp.array2d(dtype=wp.float64),
+    jacobian: wp.array2d(dtype=wp.vec3d), response: wp.array2d(dtype=wp.vec3d),
 ):  # fmt: skip
-    """Solve L^T D L x = j for the three rows j of the Jacobian from ``row`` on, within the degrees of freedom from
-    ``first`` to ``end`` of one kinematic tree; ``entry`` of L, ``inverse`` of D."""
+    """Solve L^T D L x = j for the three rows j of a contact, within the degrees of freedom from ``first`` to ``end`` of
+    one kinematic tree; ``entry`` of L, ``inverse`` of D."""
     ...
 
 
@@ -86,44 +71,55 @@ def respond_rigidly(
         first = factors.tree_dof[tree]
         end = first + factors.tree_dof_count[tree]
         if factors.implicit_inverse[last_dof] != wp.float64(0.0):
-            solve_three_rows(
-                3 * c, first, end, factors.row_start, factors.row_count, factors.column, factors.implicit,
+            solve_rigid_rows(
+                c, first, end, factors.row_start, factors.row_count, factors.column, factors.implicit,
                 factors.implicit_inverse, rows_out.rigid_jacobian, rows_out.rigid_response,
             )  # fmt: skip
         else:
-            solve_three_rows(
-                3 * c, first, end, factors.row_start, factors.row_count, factors.column, factors.plain,
+            solve_rigid_rows(
+                c, first, end, factors.row_start, factors.row_count, factors.column, factors.plain,
                 factors.plain_inverse, rows_out.rigid_jacobian, rows_out.rigid_response,
             )  # fmt: skip
 
 
-@wp.func
-def side_slot(side: int, contacts: Contacts):
-    """Place of a side's body in the list of bodies in contact; -1 if the side is empty."""
-    slot = contacts.body_slot[side // 2]
-    if side % 2 == 1:
-        slot = contacts.other_slot[side // 2]
-    return slot
+@wp.func_native(
+    EIGHT
+    + """
+    const int row_pitch = jacobian.strides[0] / (int)sizeof(double);
+    const int width = (3 * count + 7) / 8 * 8;
+    const float* const velocity = response.data + number;
+    for (int r = 0; r < 3; ++r) {
+        const double* const row = jacobian.data + (3 * (side / 2) + r) * row_pitch + 6 * (side % 2);
+        const float j[6] = {(float)row[0], (float)row[1], (float)row[2], (float)row[3], (float)row[4], (float)row[5]};
+        float entry[32];
+        for (int c = 0; c < width; c += 8) {
+            Eight sum = {};
+            for (int k = 0; k < 6; ++k) sum = sum + j[k] * *(const Eight*)(velocity + k * width + c);
+            *(Eight*)(entry + c) = sum;
+        }
+        for (int s = 0; s < count; ++s) {
+            double* const to = delassus.data + at + r * pitch + 3 * (place.data[sides.data[start + s] / 2] - first_place);
+            for (int k = 0; k < 3; ++k) to[k] += (double)entry[3 * s + k];
+        }
+    }
+"""
+)
+def add_entries(
+    side: int, jacobian: wp.array2d(dtype=wp.float64), response: wp.array(dtype=float), number: int,
+    sides: wp.array(dtype=wp.int32), start: int, count: int, place: wp.array(dtype=wp.int32), first_place: int,
+    delassus: wp.array(dtype=wp.float64), at: int, pitch: int,
+):  # fmt: skip
+    """Add the velocities along the rows of a side by unit impulses along those of a group of ``count`` sides, listed from
+    ``start`` on. ``number``: first one of the response of the side's body to them; ``at``: entry of the first row."""
+    ...
 
 
-@wp.func
-def sides_entries(value: wp.mat33, side: int, source: int, contacts: Contacts, touched: TouchedBodies, sides: SideRows):
-    """Add the velocities along the rows of ``side`` that unit impulses along those of ``source`` give.
-
-    Of two sides the one whose body comes later in the list knows the response of the other's.
-    """
-    slot = side_slot(side, contacts)
-    other = side_slot(source, contacts)
-    if slot >= 0 and other >= 0:
-        start = touched.tree_start[slot]
-        if touched.tree_start[other] == start:
-            if slot < other or (slot == other and side <= source):
-                value = value + wp.transpose(sides.force[side]) * sides.linear[source, slot - start]
-                value = value + wp.transpose(sides.moment[side]) * sides.angular[source, slot - start]
-            else:
-                value = value + wp.transpose(sides.linear[side, other - start]) * sides.force[source]
-                value = value + wp.transpose(sides.angular[side, other - start]) * sides.moment[source]
-    return value
+@wp.func_native("""
+    for (int i = 0; i < count; ++i) values.data[at + i] = 0.0;
+""")
+def clear_entries(values: wp.array(dtype=wp.float64), at: int, count: int):
+    """Clear ``count`` entries from ``at`` on."""
+    ...
 
 
 @wp.kernel
@@ -133,7 +129,8 @@ def assemble_delassus(
     contacts: Contacts,
     touched: TouchedBodies,
     islands: Islands,
-    sides: SideRows,
+    groups: SideGroups,
+    response: wp.array(dtype=float),
     # out
     rows_out: Rows,
 ):
@@ -141,19 +138,22 @@ def assemble_delassus(
     c = items[wp.tid()]
     block = contacts.block[c]
     first = islands.block_start[block]
-    last = islands.block_start[block + 1]
-    size = 3 * (last - first)
-    at = islands.matrix_start[block] + 3 * (contacts.place[c] - first) * size
-    is_pair = contacts.other_slot[c] >= 0
-    for m in range(first, last):
-        source = islands.contact[m]
-        entries = sides_entries(wp.mat33(), 2 * c, 2 * source, contacts, touched, sides)
-        if contacts.other_slot[source] >= 0:
-            entries = sides_entries(entries, 2 * c, 2 * source + 1, contacts, touched, sides)
-        if is_pair:
-            entries = sides_entries(entries, 2 * c + 1, 2 * source, contacts, touched, sides)
-            if contacts.other_slot[source] >= 0:
-                entries = sides_entries(entries, 2 * c + 1, 2 * source + 1, contacts, touched, sides)
-        for r in range(3):
-            for k in range(3):
-                rows_out.delassus[at + r * size + 3 * (m - first) + k] = wp.float64(entries[r, k])
+    pitch = islands.row_start[block + 1] - islands.row_start[block]
+    at = islands.matrix_start[block] + 3 * (contacts.place[c] - first) * pitch
+    clear_entries(rows_out.delassus, at, 3 * pitch)
+    for k in range(2):
+        slot = contacts.body_slot[c]
+        if k == 1:
+            slot = contacts.other_slot[c]
+        if slot >= 0:
+            tree = touched.tree_start[slot]
+            group = groups.first[tree]
+            while groups.tree[group] == tree:
+                start = groups.start[group]
+                count = groups.start[group + 1] - start
+                from_number = groups.response[group] + (slot - tree) * 6 * ((3 * count + 7) / 8 * 8)
+                add_entries(
+                    2 * c + k, rows_out.plant_jacobian, response, from_number, groups.side, start, count, contacts.place,
+                    first, rows_out.delassus, at, pitch,
+                )  # fmt: skip
+                group = group + 1

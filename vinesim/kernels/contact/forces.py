@@ -2,15 +2,13 @@
 
 import warp as wp
 
-from vinesim.kernels.contact.row_velocity import velocity_along
+from vinesim.kernels.contact.island_system import IslandSystem, contact_velocity, three
 from vinesim.kernels.contact.structs import (
     BODIES,
     CONTACTS,
     Contacts,
-    Geoms,
     Islands,
     Parameters,
-    RigidBodies,
     Rows,
     WarmStart,
 )
@@ -58,11 +56,10 @@ def store_contact(
 def store_warm_start(
     # model
     parameters: Parameters,
-    geoms: Geoms,
     # in
     items: wp.array(dtype=wp.int32),
-    rigid: RigidBodies,
     islands: Islands,
+    system: IslandSystem,
     rows: Rows,
     # out
     contacts_out: Contacts,
@@ -70,11 +67,10 @@ def store_warm_start(
 ):
     """One thread per contact: its impulse as a force on the plant, and what the next step starts from."""
     c = items[wp.tid()]
-    u = 3 * c + 1
-    v = 3 * c + 2
-    slip_u = velocity_along(rows.velocity_free[u], u, geoms, rigid, contacts_out, islands, rows)
-    slip_v = velocity_along(rows.velocity_free[v], v, geoms, rigid, contacts_out, islands, rows)
-    store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts_out, warm_start_out)
+    velocity = three(3 * c, rows.velocity_free) + contact_velocity(
+        contacts_out.place[c], contacts_out.block[c], contacts_out.island[c], islands, rows.delassus, system
+    )
+    store_contact(c, velocity[1], velocity[2], parameters, rows.impulse, contacts_out, warm_start_out)
 
 
 @wp.kernel

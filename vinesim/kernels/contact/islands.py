@@ -11,10 +11,12 @@ from vinesim.kernels.contact.structs import (
     BLOCKS,
     BODIES,
     CONTACTS,
+    GROUPS,
     IMPACTED_TREES,
     ISLANDS,
     MATRIX_ENTRIES,
     OVERFLOW,
+    RESPONSE_NUMBERS,
     SKIPPED_GEOMS,
     Candidates,
     Capsules,
@@ -23,10 +25,14 @@ from vinesim.kernels.contact.structs import (
     Islands,
     PlantBodies,
     RigidBodies,
+    SideGroups,
     TouchedBodies,
 )
 
 wp.set_module_options({"enable_backward": False})
+
+MOST_SIDES = wp.constant(10)
+"""Sides of contacts in a group: thirty rows fill thirty-two columns."""
 
 
 @wp.kernel
@@ -164,7 +170,7 @@ def list_contacts(contact_count: int, islands_out: Islands):
 def number_sets(
     contact_count: int, counters_out: wp.array(dtype=wp.int32), contacts_out: Contacts, islands_out: Islands
 ):
-    """Number islands and blocks in the order of the list, and place the blocks' matrices one after the other."""
+    """Number islands and blocks in the order of the list."""
     islands = int(-1)
     blocks = int(-1)
     for place in range(contact_count):
@@ -183,14 +189,8 @@ def number_sets(
     islands_out.start[islands + 1] = contact_count
     islands_out.first_block[islands + 1] = blocks + 1
     islands_out.block_start[blocks + 1] = contact_count
-    entries = int(0)
-    for b in range(blocks + 1):
-        islands_out.matrix_start[b] = entries
-        rows = 3 * (islands_out.block_start[b + 1] - islands_out.block_start[b])
-        entries = entries + rows * rows
     counters_out[ISLANDS] = islands + 1
     counters_out[BLOCKS] = blocks + 1
-    counters_out[MATRIX_ENTRIES] = entries
 
 
 @wp.func
@@ -227,6 +227,90 @@ def list_dofs(island_count: int, rigid: RigidBodies, contacts: Contacts, islands
     islands_out.first_dof[0] = 0
 
 
+@wp.func
+def padded(size: int):
+    """The multiple of eight that so many numbers fit in."""
+    return (size + 7) / 8 * 8
+
+
+@wp.func
+def list_side(slot: int, side: int, touched: TouchedBodies, groups_out: SideGroups):
+    """List a side of a contact with those of its tree; none if it has no ``slot``."""
+    if slot >= 0:
+        tree = touched.tree_start[slot]
+        groups_out.side[groups_out.listed[tree]] = side
+        groups_out.listed[tree] = groups_out.listed[tree] + 1
+
+
+@wp.func
+def group_sides(
+    counters_out: wp.array(dtype=wp.int32), touched: TouchedBodies, contacts: Contacts, islands: Islands,
+    groups_out: SideGroups,
+):  # fmt: skip
+    """List the sides of all contacts by trees, part those of each tree into groups, and place the responses to them."""
+    for slot in range(counters_out[BODIES]):
+        groups_out.listed[slot] = 0
+    for c in range(counters_out[CONTACTS]):
+        tree = touched.tree_start[contacts.body_slot[c]]
+        groups_out.listed[tree] = groups_out.listed[tree] + 1
+        if contacts.other_slot[c] >= 0:
+            tree = touched.tree_start[contacts.other_slot[c]]
+            groups_out.listed[tree] = groups_out.listed[tree] + 1
+    place = int(0)
+    groups = int(0)
+    numbers = int(0)
+    slot = int(0)
+    while slot < counters_out[BODIES]:
+        sides = groups_out.listed[slot]
+        groups_out.first[slot] = groups
+        groups_out.listed[slot] = place
+        of_tree = (sides + MOST_SIDES - 1) / MOST_SIDES
+        for k in range(of_tree):
+            begin = sides * k / of_tree
+            groups_out.start[groups] = place + begin
+            groups_out.tree[groups] = slot
+            groups_out.response[groups] = numbers
+            width = padded(3 * (sides * (k + 1) / of_tree - begin))
+            numbers = numbers + (touched.tree_end[slot] - slot) * 6 * width
+            groups = groups + 1
+        place = place + sides
+        slot = touched.tree_end[slot]
+    groups_out.start[groups] = place
+    groups_out.tree[groups] = -1
+    for i in range(counters_out[CONTACTS]):
+        c = islands.contact[i]
+        list_side(contacts.body_slot[c], 2 * c, touched, groups_out)
+        list_side(contacts.other_slot[c], 2 * c + 1, touched, groups_out)
+    counters_out[GROUPS] = groups
+    counters_out[RESPONSE_NUMBERS] = numbers
+
+
+@wp.func
+def place_systems(counters_out: wp.array(dtype=wp.int32), islands_out: Islands):
+    """Place what the solver needs for each block and each island one after the other."""
+    rows = int(0)
+    entries = int(0)
+    for block in range(counters_out[BLOCKS]):
+        islands_out.row_start[block] = rows
+        islands_out.matrix_start[block] = entries
+        size = 3 * (islands_out.block_start[block + 1] - islands_out.block_start[block])
+        rows = rows + padded(size)
+        entries = entries + size * padded(size)
+    islands_out.row_start[counters_out[BLOCKS]] = rows
+    rigid = int(0)
+    system = int(0)
+    for island in range(counters_out[ISLANDS]):
+        islands_out.rigid_start[island] = rigid
+        islands_out.system_start[island] = system
+        dofs = islands_out.first_dof[island + 1] - islands_out.first_dof[island]
+        rigid = rigid + (islands_out.start[island + 1] - islands_out.start[island]) * dofs
+        largest = int(0)
+        for block in range(islands_out.first_block[island], islands_out.first_block[island + 1]):
+            largest = wp.max(largest, 3 * (islands_out.block_start[block + 1] - islands_out.block_start[block]))
+        system = system + largest * (padded(1 + dofs) + padded(largest))
+    counters_out[MATRIX_ENTRIES] = wp.max(entries, system)
+
+
 @wp.kernel
 def build_islands(
     # model
@@ -241,6 +325,7 @@ def build_islands(
     touched_out: TouchedBodies,
     contacts_out: Contacts,
     islands_out: Islands,
+    groups_out: SideGroups,
 ):
     """One thread in all: number the plant bodies in contact, sorted, each once; part the contacts into islands."""
     contact_count = counters_out[CONTACTS]
@@ -282,3 +367,5 @@ def build_islands(
     list_contacts(contact_count, islands_out)
     number_sets(contact_count, counters_out, contacts_out, islands_out)
     list_dofs(counters_out[ISLANDS], rigid, contacts_out, islands_out)
+    place_systems(counters_out, islands_out)
+    group_sides(counters_out, touched_out, contacts_out, islands_out, groups_out)

@@ -48,22 +48,20 @@ def write_plant_row(
 
 
 @wp.func
-def write_rigid_row(
-    row: int,
-    last_dof: int,
-    axis: wp.vec3d,
-    arm: wp.vec3d,
-    rigid: RigidBodies,
-    jacobian_out: wp.array2d(dtype=wp.float64),
+def write_rigid_rows(
+    c: int, last_dof: int, axes: wp.mat33d, arm: wp.vec3d, rigid: RigidBodies, jacobian_out: wp.array2d(dtype=wp.vec3d)
 ):
-    """Write a row of the rigid world's Jacobian; returns the geom's free velocity along it [m/s]."""
-    velocity = wp.float64(0.0)
+    """Write the rigid Jacobian of a contact: velocities along its axes of a point of the body that ``last_dof`` moves.
+
+    arm: [m] from the centre of mass of its kinematic tree to that point. Returns its free velocities along the axes.
+    """
+    velocity = wp.vec3d()
     dof = int(last_dof)
     while dof >= 0:
         angular = wp.vec3d(rigid.cdof[dof, 0], rigid.cdof[dof, 1], rigid.cdof[dof, 2])
         linear = wp.vec3d(rigid.cdof[dof, 3], rigid.cdof[dof, 4], rigid.cdof[dof, 5])
-        entry = wp.dot(axis, linear + wp.cross(angular, arm))
-        jacobian_out[row, dof] = entry
+        entry = axes * (linear + wp.cross(angular, arm))
+        jacobian_out[c, dof] = entry
         velocity = velocity + entry * rigid.velocity_free[dof]
         dof = rigid.dof_parent[dof]
     return velocity
@@ -173,6 +171,7 @@ def write_rows(
         other_lever = x - to_double(wp.transform_get_translation(bodies.q[other]))
         velocity = velocity - velocity_at(bodies.q[other], bodies.qd_free[other], x)
 
+    rigid_velocity = write_rigid_rows(c, last_dof, contacts_out.axes[c], arm, rigid, rows_out.rigid_jacobian)
     for r in range(3):
         axis = n
         if r == 1:
@@ -183,26 +182,11 @@ def write_rows(
         write_plant_row(row, 0, wp.float64(1.0), axis, lever, rows_out.plant_jacobian)
         if g < 0:
             write_plant_row(row, 6, wp.float64(-1.0), axis, other_lever, rows_out.plant_jacobian)
-        rigid_velocity = write_rigid_row(row, last_dof, axis, arm, rigid, rows_out.rigid_jacobian)
-        rows_out.velocity_free[row] = wp.dot(axis, velocity) - rigid_velocity
+        rows_out.velocity_free[row] = wp.dot(axis, velocity) - rigid_velocity[r]
         rows_out.bias[row] = wp.float64(0.0)
         rows_out.impulse[row] = wp.float64(0.0)
     end_gap = candidates.end_gap[tree_row, slot] + contacts_out.wire_shift[c]
     write_bias(c, parameters, end_gap, contacts_out, warm_start, rows_out)
-
-
-@wp.func_native("""
-    for (int r = row; r < row + 3; ++r) {
-        double* const a = jacobian.data + (size_t)r * (jacobian.strides[0] / sizeof(double));
-        double* const b = response.data + (size_t)r * (response.strides[0] / sizeof(double));
-        for (int i = first; i < end; ++i) a[i] = b[i] = 0.0;
-    }
-""")
-def clear_three_rows(
-    row: int, first: int, end: int, jacobian: wp.array2d(dtype=wp.float64), response: wp.array2d(dtype=wp.float64)
-):
-    """Clear the entries from ``first`` to ``end`` of three rows."""
-    ...
 
 
 @wp.kernel
@@ -225,11 +209,13 @@ def write_contact_rows(
     rows_out: Rows,
 ):
     """One thread per contact: its three rows. spans_out: [contact] from which degree of freedom to which its rows of the
-    rigid Jacobian and the rigid response are not 0; all others stay as they are."""
+    rigid Jacobian and the rigid response are not 0; others stay as they are."""
     c = items[wp.tid()]
     slots = candidates.feature.shape[1]
     span = spans_out[c]
-    clear_three_rows(3 * c, span[0], span[1], rows_out.rigid_jacobian, rows_out.rigid_response)
+    for dof in range(span[0], span[1]):
+        rows_out.rigid_jacobian[c, dof] = wp.vec3d()
+        rows_out.rigid_response[c, dof] = wp.vec3d()
     spans_out[c] = wp.vec2i(0, 0)
     g = contacts_out.other[c]
     if g >= 0:

@@ -6,7 +6,7 @@ Two capsules that overlap while all plants rest as generated, or are that near, 
 import warp as wp
 
 from vinesim.kernels.contact.body_motion import extrapolate_point, to_double, velocity_at, velocity_product_acceleration
-from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
+from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable, next_overlap
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import segment_segment_distance, vec6d
 from vinesim.kernels.contact.structs import (
@@ -50,8 +50,11 @@ def distance_after_step(
     capsule_states: CapsuleStates,
 ):
     """:func:`segment_segment_distance` of two capsules' axes at the end of the step if both move on as they do."""
-    acceleration = velocity_product_acceleration(body, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
-    other_acceleration = velocity_product_acceleration(other_body, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
+    none = wp.spatial_vector()
+    acceleration = velocity_product_acceleration(body, -1, none, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
+    other_acceleration = velocity_product_acceleration(
+        other_body, -1, none, bodies.parent, bodies.is_cut, bodies.q, bodies.qd
+    )
     return segment_segment_distance(
         to_double(extrapolate_point(dt, bodies.q[body], bodies.qd[body], acceleration, capsule_states.start[s])),
         to_double(extrapolate_point(dt, bodies.q[body], bodies.qd[body], acceleration, capsule_states.end[s])),
@@ -119,6 +122,41 @@ def plant_candidate(
     return candidate
 
 
+@wp.func
+def may_touch_own_tree(
+    s: int, tree: int, low: wp.vec3, high: wp.vec3, capsules: Capsules, wood_boxes: Aabbs
+):  # fmt: skip
+    """Whether a capsule, of which this is the box, may touch another of its tree: bunches touch wood, and later bunches."""
+    clear = aabbs_disjoint(low, high, wood_boxes.low[tree], wood_boxes.high[tree])
+    return capsules.bunch[s] >= 0 and (not clear or capsules.bunch[s] < capsules.tree_last_bunch[tree])
+
+
+@wp.func
+def may_touch(s: int, t: int, capsules: Capsules, bodies: PlantBodies):
+    """Whether two capsules of one tree collide: of two bunches each pair is looked at once."""
+    pair = not are_adjacent(capsules.body[s], capsules.body[t], bodies.parent)
+    if capsules.bunch[t] >= 0:
+        pair = pair and capsules.bunch[t] > capsules.bunch[s]
+    return pair
+
+
+@wp.func
+def touching_candidate(
+    s: int, t: int, parameters: Parameters, bodies: PlantBodies, capsules: Capsules, capsule_states: CapsuleStates
+):
+    """The contact of two capsules whose boxes overlap, if they are near enough."""
+    nearest = segment_segment_distance(
+        to_double(capsule_states.start[s]), to_double(capsule_states.end[s]), to_double(capsule_states.start[t]),
+        to_double(capsule_states.end[t]),
+    )  # fmt: skip
+    radii = capsules.radius[s] + capsules.radius[t]
+    motion = (capsule_states.speed[s] + capsule_states.speed[t]) * wp.float32(parameters.dt)
+    candidate = Candidate()
+    if nearest[3] < wp.float64(radii + wp.float32(parameters.margin) + motion):
+        candidate = plant_candidate(parameters, s, t, nearest, bodies, capsules, capsule_states)
+    return candidate
+
+
 @wp.kernel
 def find_plant_contacts(
     # model
@@ -145,8 +183,8 @@ def find_plant_contacts(
     tree = trees.awake[row]
     count = candidates_out.count[row]
     axis = counters[SORT_AXIS]
-    skin = wp.float32(parameters.margin)
-    dt = wp.float32(parameters.dt)
+    skin = wp.vec3(wp.float32(parameters.margin))
+    last = capsules.tree_start[tree + 1]
     for other_place in range(place, counters[AWAKE_TREES]):
         other = trees.awake[sorted_rows[other_place]]
         if tree_boxes.low[other][axis] > tree_boxes.high[tree][axis]:
@@ -154,41 +192,37 @@ def find_plant_contacts(
         if not aabbs_disjoint(
             tree_boxes.low[tree], tree_boxes.high[tree], tree_boxes.low[other], tree_boxes.high[other]
         ):
-            low = wp.max(tree_boxes.low[tree], tree_boxes.low[other])
-            high = wp.min(tree_boxes.high[tree], tree_boxes.high[other])
-            for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
-                s_low = capsule_states.low[s] - wp.vec3(skin)
-                s_high = capsule_states.high[s] + wp.vec3(skin)
-                is_near = not aabbs_disjoint(s_low, s_high, low, high)
-                if other == tree:  # bunches against wood, and against later bunches
-                    clear = aabbs_disjoint(s_low, s_high, wood_boxes.low[tree], wood_boxes.high[tree])
-                    later_bunch = capsules.bunch[s] < capsules.tree_last_bunch[tree]
-                    is_near = capsules.bunch[s] >= 0 and (not clear or later_bunch)
-                if is_near and is_collidable(
-                    capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached
-                ):
-                    for t in range(capsules.tree_start[other], capsules.tree_start[other + 1]):
-                        pair = not aabbs_disjoint(s_low, s_high, capsule_states.low[t], capsule_states.high[t])
-                        if pair and other == tree:
-                            pair = not are_adjacent(capsules.body[s], capsules.body[t], bodies.parent)
-                            if capsules.bunch[t] >= 0:
-                                pair = pair and capsules.bunch[t] > capsules.bunch[s]
-                        if pair and is_collidable(
-                            capsules.level[t], trees.is_fine[other], capsules.bunch[t], trees.bunch_attached
-                        ):
-                            nearest = segment_segment_distance(
-                                to_double(capsule_states.start[s]),
-                                to_double(capsule_states.end[s]),
-                                to_double(capsule_states.start[t]),
-                                to_double(capsule_states.end[t]),
-                            )
-                            radii = capsules.radius[s] + capsules.radius[t]
-                            margin = radii + skin + (capsule_states.speed[s] + capsule_states.speed[t]) * dt
-                            if nearest[3] < wp.float64(margin):
-                                candidate = plant_candidate(parameters, s, t, nearest, bodies, capsules, capsule_states)
-                                if candidate.exists:
-                                    if candidate.is_impact:
-                                        candidates_out.is_impact[row] = True
-                                    store_candidate(row, count, 2 * s, -1 - t, candidate, candidates_out)
-                                    count = count + 1
+            low = wp.max(tree_boxes.low[tree], tree_boxes.low[other]) - skin
+            high = wp.min(tree_boxes.high[tree], tree_boxes.high[other]) + skin
+            last_other = capsules.tree_start[other + 1]
+            s = next_overlap(capsules.tree_start[tree], last, low, high, capsule_states.low, capsule_states.high)
+            while s < last:
+                s_low = capsule_states.low[s] - skin
+                s_high = capsule_states.high[s] + skin
+                t = int(last_other)
+                if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):
+                    if other != tree or may_touch_own_tree(s, tree, s_low, s_high, capsules, wood_boxes):
+                        t = next_overlap(
+                            capsules.tree_start[other],
+                            last_other,
+                            s_low,
+                            s_high,
+                            capsule_states.low,
+                            capsule_states.high,
+                        )
+                while t < last_other:
+                    pair = is_collidable(
+                        capsules.level[t], trees.is_fine[other], capsules.bunch[t], trees.bunch_attached
+                    )
+                    if pair and other == tree:
+                        pair = may_touch(s, t, capsules, bodies)
+                    if pair:
+                        candidate = touching_candidate(s, t, parameters, bodies, capsules, capsule_states)
+                        if candidate.exists:
+                            if candidate.is_impact:
+                                candidates_out.is_impact[row] = True
+                            store_candidate(row, count, 2 * s, -1 - t, candidate, candidates_out)
+                            count = count + 1
+                    t = next_overlap(t + 1, last_other, s_low, s_high, capsule_states.low, capsule_states.high)
+                s = next_overlap(s + 1, last, low, high, capsule_states.low, capsule_states.high)
     candidates_out.count[row] = count

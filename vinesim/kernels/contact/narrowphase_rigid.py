@@ -16,7 +16,7 @@ from vinesim.kernels.contact.body_motion import (
     velocity_product_acceleration,
     was_cut_off,
 )
-from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable
+from vinesim.kernels.contact.broadphase import aabbs_disjoint, is_collidable, list_near_geoms
 from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smooth, store_candidate
 from vinesim.kernels.contact.distance import (
     MESH,
@@ -29,7 +29,6 @@ from vinesim.kernels.contact.distance import (
 )
 from vinesim.kernels.contact.hull_distance import interval_along_hull, segment_hull_distance
 from vinesim.kernels.contact.structs import (
-    AABB_BLOCK,
     Aabbs,
     Candidates,
     Capsules,
@@ -62,38 +61,6 @@ class Pair:
     """2 if a part of the capsule lies along a face of the geom: a contact at each end of it; else 1."""
     rotation: wp.mat33d
     """of the geom."""
-
-
-@wp.func
-def list_near_geoms(
-    row: int,
-    low: wp.vec3,
-    high: wp.vec3,
-    is_remote: bool,
-    most: int,
-    geoms: Geoms,
-    geom_states: GeomStates,
-    static_blocks: Aabbs,
-    near_geoms_out: wp.array2d(dtype=wp.int32),
-):
-    """List the geoms whose boxes overlap that of a tree, at most ``most`` static ones; returns the number of all."""
-    count = int(0)
-    movable = geoms.count[0]
-    for g in range(movable):
-        counts = is_remote or not geoms.is_remote[g]
-        if counts and not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
-            near_geoms_out[row, count] = g
-            count = count + 1
-    room = wp.min(movable + most, near_geoms_out.shape[1])
-    for block in range(static_blocks.low.shape[0]):
-        if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
-            first = movable + block * AABB_BLOCK
-            for g in range(first, wp.min(first + AABB_BLOCK, geoms.count[1])):
-                if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
-                    if count < room:
-                        near_geoms_out[row, count] = g
-                    count = count + 1
-    return count
 
 
 @wp.func
@@ -137,6 +104,7 @@ def follow_contact(
     approach: wp.float64,
     relative: wp.vec3d,
     velocity: wp.vec3d,
+    acceleration: wp.spatial_vector,
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
     geoms: Geoms,
@@ -147,14 +115,13 @@ def follow_contact(
 
     Two ends along a face are followed each for itself; for a single contact the closest points are found anew at the end
     of the step. ``approach`` [m]: change of distance at constant velocity; ``relative`` [m/s]: ``velocity`` of the
-    capsule at the contact less that of the geom.
+    capsule at the contact less that of the geom; ``acceleration`` of the body, see :func:`velocity_product_acceleration`.
     """
     s = pair.capsule
     body = pair.body
     g = pair.geom
     dt = parameters.dt
     half = wp.float64(0.5)
-    acceleration = velocity_product_acceleration(body, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
     end_a = to_double(
         extrapolate_point(wp.float32(dt), bodies.q[body], bodies.qd[body], acceleration, capsule_states.start[s])
     )
@@ -197,6 +164,7 @@ def rigid_candidate(
     nearest: vec5d,
     t: wp.float64,
     is_static: bool,
+    acceleration: wp.spatial_vector,
     bodies: PlantBodies,
     capsules: Capsules,
     capsule_states: CapsuleStates,
@@ -247,8 +215,8 @@ def rigid_candidate(
         candidate.exists = candidate.gap + deflected + soonest < parameters.static_margin
     if candidate.exists:
         candidate = follow_contact(
-            is_round, parameters, candidate, pair, nearest, t, approach, relative, velocity, bodies, capsule_states, geoms,
-            hulls, geom_states,
+            is_round, parameters, candidate, pair, nearest, t, approach, relative, velocity, acceleration, bodies,
+            capsule_states, geoms, hulls, geom_states,
         )  # fmt: skip
     return candidate
 
@@ -306,12 +274,14 @@ def clear_slots(row: int, count: int, candidates_out: Candidates):
 
 
 @wp.func
-def add_pair(
+def add_pairs(
     is_round: bool,
     row: int,
     count: int,
-    s: int,
-    g: int,
+    pairs: wp.array(dtype=wp.vec2i),
+    first: int,
+    pitch: int,
+    pair_count: int,
     parameters: Parameters,
     capsules: Capsules,
     geoms: Geoms,
@@ -322,47 +292,58 @@ def add_pair(
     geom_states: GeomStates,
     candidates_out: Candidates,
 ):
-    """Add the contacts of capsule ``s`` with geom ``g``, whose boxes overlap, to a row that has ``count`` so far.
+    """Add the contacts of pairs of a capsule and a geom, whose boxes overlap, to a row that has ``count`` so far.
 
-    Returns their number, and whether one is an impact.
+    Pairs are listed ``pitch`` apart from ``first`` on, by capsules. Returns the number of contacts, and whether one is an
+    impact. One call takes all pairs of a tree, since it copies all structs.
     """
     is_impact = bool(False)
-    radius = wp.float64(capsules.radius[s])
-    a = to_double(capsule_states.start[s])
-    b = to_double(capsule_states.end[s])
-    bound = wp.float64(0.5) * wp.length(b - a) + radius
-    center = geom_states.center[g]
-    margin = parameters.margin + (wp.float64(capsule_states.speed[s]) + geom_states.speed[g]) * parameters.dt
-    between = wp.float64(0.5) * (a + b) - center
-    limit = bound + geoms.radius[g] + margin
-    rotation = rigid.xmat[geoms.id[g]]
-    near = wp.dot(between, between) < limit * limit
-    if near and not is_round and geoms.kind[g] != PLANE:
-        to_local = wp.transpose(rotation)  # far cheaper than the distance, and decides half of all pairs
-        near = not is_outside_box(geoms.half[g], to_local * (a - center), to_local * (b - center), radius + margin)
-    if near:
-        nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
-        if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules, bodies.is_cut):
-            ends = contact_ends(is_round, parameters, geoms, hulls, g, rotation, center, a, b, nearest)
-            pair = Pair()
-            pair.capsule = s
-            pair.body = capsules.body[s]
-            pair.geom = g
-            pair.ends = wp.where(ends[0] < ends[1], 2, 1)
-            pair.rotation = rotation
-            for end in range(pair.ends):
-                if pair.ends == 2:
-                    p = a + ends[end] * (b - a)
-                    nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, p, p, FAR)
-                candidate = rigid_candidate(
-                    is_round, parameters, pair, nearest, ends[end], g >= geoms.count[0], bodies, capsules, capsule_states,
-                    geoms, hulls, geom_states,
-                )  # fmt: skip
-                if candidate.exists:
-                    is_impact = is_impact or candidate.is_impact
-                    store_candidate(row, count, 2 * s + end, g, candidate, candidates_out)
-                    count = count + 1
-    return count, is_impact
+    total = int(count)
+    known = int(-1)
+    acceleration = wp.spatial_vector()
+    for i in range(pair_count):
+        s = pairs[first + i * pitch][0]
+        g = pairs[first + i * pitch][1]
+        radius = wp.float64(capsules.radius[s])
+        a = to_double(capsule_states.start[s])
+        b = to_double(capsule_states.end[s])
+        bound = wp.float64(0.5) * wp.length(b - a) + radius
+        center = geom_states.center[g]
+        margin = parameters.margin + (wp.float64(capsule_states.speed[s]) + geom_states.speed[g]) * parameters.dt
+        between = wp.float64(0.5) * (a + b) - center
+        limit = bound + geoms.radius[g] + margin
+        rotation = rigid.xmat[geoms.id[g]]
+        near = wp.dot(between, between) < limit * limit
+        if near and not is_round and geoms.kind[g] != PLANE:
+            to_local = wp.transpose(rotation)  # far cheaper than the distance, and decides half of all pairs
+            near = not is_outside_box(geoms.half[g], to_local * (a - center), to_local * (b - center), radius + margin)
+        if near:
+            nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
+            if nearest[3] - radius < margin and not is_tied(s, geoms.id[g], capsules, bodies.is_cut):
+                ends = contact_ends(is_round, parameters, geoms, hulls, g, rotation, center, a, b, nearest)
+                pair = Pair()
+                pair.capsule = s
+                pair.body = capsules.body[s]
+                pair.geom = g
+                pair.ends = wp.where(ends[0] < ends[1], 2, 1)
+                pair.rotation = rotation
+                acceleration = velocity_product_acceleration(
+                    pair.body, known, acceleration, bodies.parent, bodies.is_cut, bodies.q, bodies.qd
+                )
+                known = pair.body
+                for end in range(pair.ends):
+                    if pair.ends == 2:
+                        p = a + ends[end] * (b - a)
+                        nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, p, p, FAR)
+                    candidate = rigid_candidate(
+                        is_round, parameters, pair, nearest, ends[end], g >= geoms.count[0], acceleration, bodies,
+                        capsules, capsule_states, geoms, hulls, geom_states,
+                    )  # fmt: skip
+                    if candidate.exists:
+                        is_impact = is_impact or candidate.is_impact
+                        store_candidate(row, total, 2 * s + end, g, candidate, candidates_out)
+                        total = total + 1
+    return total, is_impact
 
 
 @wp.func
@@ -440,9 +421,9 @@ def find_rigid_contacts(
         row, tree_boxes.low[tree], tree_boxes.high[tree], trees.is_remote[tree], max_static_geoms, geoms, geom_states,
         static_blocks, candidates_out.near_geoms,
     )  # fmt: skip
-    room = wp.min(geoms.count[0] + max_static_geoms, candidates_out.near_geoms.shape[1])
-    candidates_out.skipped_geoms[row] = wp.max(near_count - room, 0)
-    near_count = wp.min(near_count, room)
+    most = wp.min(geoms.count[0] + max_static_geoms, candidates_out.near_geoms.shape[1])
+    candidates_out.skipped_geoms[row] = wp.max(near_count - most, 0)
+    near_count = wp.min(near_count, most)
     for k in range(passing_out.by_tree.shape[1]):
         bunch = passing_out.by_tree[tree, k]
         if bunch >= 0 and not overlaps_bunch(
@@ -452,6 +433,8 @@ def find_rigid_contacts(
             passing_out.by_tree[tree, k] = -1
     is_impact = bool(False)
     count = int(0)
+    room = candidates_out.near_pairs.shape[0] / candidates_out.count.shape[0]
+    pair_count = int(0)
     last = capsules.tree_start[tree + wp.where(near_count > 0, 1, 0)]
     for s in range(capsules.tree_start[tree], last):
         if is_collidable(capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached):
@@ -461,12 +444,22 @@ def find_rigid_contacts(
                 g = candidates_out.near_geoms[row, k]
                 if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]) and not is_passing(
                     tree, passing_out.of_geom[g], passing_out.by_tree
-                ):  # before the call, which copies all structs
-                    count, hits = add_pair(
-                        False, row, count, s, g, parameters, capsules, geoms, bodies, capsule_states, rigid, hulls, geom_states,
-                        candidates_out,
-                    )  # fmt: skip
-                    is_impact = is_impact or hits
+                ):
+                    candidates_out.near_pairs[row * room + pair_count] = wp.vec2i(s, g)
+                    pair_count = pair_count + 1
+                    if pair_count == room:
+                        count, hits = add_pairs(
+                            False, row, count, candidates_out.near_pairs, row * room, 1, pair_count, parameters,
+                            capsules, geoms, bodies, capsule_states, rigid, hulls, geom_states, candidates_out,
+                        )  # fmt: skip
+                        is_impact = is_impact or hits
+                        pair_count = int(0)
+    if pair_count > 0:
+        count, hits = add_pairs(
+            False, row, count, candidates_out.near_pairs, row * room, 1, pair_count, parameters, capsules, geoms, bodies,
+            capsule_states, rigid, hulls, geom_states, candidates_out,
+        )  # fmt: skip
+        is_impact = is_impact or hits
     candidates_out.is_impact[row] = is_impact
     candidates_out.count[row] = count
     clear_slots(row, count, candidates_out)

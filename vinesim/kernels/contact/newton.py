@@ -8,8 +8,20 @@ bodies (Woodbury). See ``docs/decisions/contact-solver.md``.
 
 import warp as wp
 
-from vinesim.kernels.contact.row_velocity import row_residual, tangential_eigenvalue, update_rigid_velocity
-from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, RigidBodies, Rows, SolverScratch
+from vinesim.kernels.contact.island_system import (
+    EIGHT,
+    IslandSystem,
+    block_pitch,
+    contact_residual,
+    island_dofs,
+    rigid_entry,
+    set_three,
+    solution_entry,
+    three,
+    update_rigid_velocity,
+)
+from vinesim.kernels.contact.islands import padded
+from vinesim.kernels.contact.structs import Islands
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,308 +30,307 @@ SLIDING_SHARE = wp.constant(wp.float64(0.999999))
 
 
 @wp.func_native("""
-    const double* const from = delassus.data + source;
-    double* const to = matrix.data + target;
+    const double* const from = block.data + source;
+    double* const to = system.data + target;
+    for (int i = 3 * count; i < pitch; ++i) to[i] = 0.0;
     for (int m = 0; m < count; ++m) {
-        const double* const entry = from + 3 * (place.data[contact.data[start + m]] - start);
+        const double* const entry = from + 3 * pressed.data[start + m];
         for (int k = 0; k < 3; ++k) to[3 * m + k] = entry[k];
     }
 """)
 def gather_row(
-    delassus: wp.array(dtype=wp.float64),
+    block: wp.array(dtype=wp.float64),
     source: int,
-    contact: wp.array(dtype=wp.int32),
-    place: wp.array(dtype=wp.int32),
+    pressed: wp.array(dtype=wp.int32),
     start: int,
     count: int,
-    matrix: wp.array(dtype=wp.float64),
+    system: wp.array(dtype=wp.float64),
     target: int,
+    pitch: int,
 ):
-    """Copy the entries of ``count`` contacts, listed from ``start`` on, of a row of a block that begins at ``source``."""
+    """Copy the entries of ``count`` contacts, listed from ``start`` on, of a row of a block that begins at ``source``;
+    zeros up to ``pitch``."""
+    ...
+
+
+@wp.func_native(
+    EIGHT
+    + """
+    double* const u = system.data + at;
+    double* const v = u + pitch;
+    for (int i = 0; i < pitch; i += 8) {
+        const Eight along_u = *(const Eight*)(u + i), along_v = *(const Eight*)(v + i);
+        *(Eight*)(u + i) = along_u * uu + along_v * uv;
+        *(Eight*)(v + i) = along_u * uv + along_v * vv;
+    }
+"""
+)
+def combine_rows(
+    system: wp.array(dtype=wp.float64), at: int, pitch: int, uu: wp.float64, uv: wp.float64, vv: wp.float64
+):
+    """Replace the row that begins at ``at`` and the next by combinations of both."""
     ...
 
 
 @wp.func
-def write_sliding_rows(
-    c: int,
-    number: int,
-    at: int,
-    size: int,
-    island: int,
-    geoms: Geoms,
-    rigid: RigidBodies,
-    contacts: Contacts,
-    islands: Islands,
-    rows: Rows,
-    scratch_out: SolverScratch,
-):
-    """Make both friction rows of a sliding contact, of entries of B that begin at ``at`` and ``at + size``.
+def linearise_friction(
+    place: int, block: int, island: int, number: int, at: int, right: int, pitch: int, islands: Islands,
+    matrix: wp.array(dtype=wp.float64), system_out: IslandSystem,
+):  # fmt: skip
+    """Make the friction rows of a sliding contact, which begin at ``at``, of those of a sticking one.
 
     Friction is the projection of f = x_t - r_t / e on the disk of radius mu x_n, where r_t is the residual velocity along
     the tangents and e their eigenvalue. Linearised about the present f, with d = f / |f|, P = 1 - d d^T and
     s = mu x_n / |f|:  x_t - s P (x_t - r_t / e) - mu d x_n = 0 (Alart and Curnier, A mixed formulation for frictional
-    contact problems prone to Newton like solution methods, 1991). ``number``: of the contact among those that press.
+    contact problems prone to Newton like solution methods, 1991). ``number``: of the contact among those that press;
+    ``right``: entries of right-hand sides.
     """
     one = wp.float64(1.0)
-    u = 3 * c + 1
-    eigenvalue = tangential_eigenvalue(c, geoms, rigid, contacts, islands, rows)
-    fu = rows.impulse[u] - row_residual(u, geoms, rigid, contacts, islands, rows) / eigenvalue
-    fv = rows.impulse[u + 1] - row_residual(u + 1, geoms, rigid, contacts, islands, rows) / eigenvalue
-    friction = contacts.friction[c]
-    length = wp.max(wp.sqrt(fu * fu + fv * fv), wp.float64(1.0e-30))
-    share = wp.min(friction * rows.impulse[u - 1] / length, one)
-    du = fu / length
-    dv = fv / length
+    row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+    mass = system_out.mass[place][1]
+    friction = system_out.friction[place]
+    residual = contact_residual(place, block, island, islands, matrix, system_out)
+    fu = system_out.impulse[row + 1] - residual[1] * mass
+    fv = system_out.impulse[row + 2] - residual[2] * mass
+    scale = one / wp.max(wp.sqrt(fu * fu + fv * fv), wp.float64(1.0e-30))
+    share = wp.min(friction * system_out.impulse[row] * scale, one)
+    du = fu * scale
+    dv = fv * scale
     uu = share * (one - du * du)
     uv = -share * du * dv
     vv = share * (one - dv * dv)
-    for k in range(size):
-        along_u = scratch_out.matrix[at + k] / eigenvalue
-        along_v = scratch_out.matrix[at + size + k] / eigenvalue
-        scratch_out.matrix[at + k] = uu * along_u + uv * along_v
-        scratch_out.matrix[at + size + k] = uv * along_u + vv * along_v
-    softer = one - contacts.compliance[c] / eigenvalue
-    n = at + 3 * number
-    scratch_out.matrix[n] = scratch_out.matrix[n] - friction * du
-    scratch_out.matrix[n + 1] = scratch_out.matrix[n + 1] + one - softer * uu
-    scratch_out.matrix[n + 2] = scratch_out.matrix[n + 2] - softer * uv
-    n = n + size
-    scratch_out.matrix[n] = scratch_out.matrix[n] - friction * dv
-    scratch_out.matrix[n + 1] = scratch_out.matrix[n + 1] - softer * uv
-    scratch_out.matrix[n + 2] = scratch_out.matrix[n + 2] + one - softer * vv
-    along_u = -(rows.velocity_free[u] + rows.bias[u]) / eigenvalue
-    along_v = -(rows.velocity_free[u + 1] + rows.bias[u + 1]) / eigenvalue
-    scratch_out.columns[u, 0] = uu * along_u + uv * along_v
-    scratch_out.columns[u + 1, 0] = uv * along_u + vv * along_v
-    for k in range(islands.first_dof[island + 1] - islands.first_dof[island]):
-        dof = islands.dof[islands.first_dof[island] + k]
-        along_u = -rows.rigid_jacobian[u, dof] / eigenvalue
-        along_v = -rows.rigid_jacobian[u + 1, dof] / eigenvalue
-        scratch_out.columns[u, 1 + k] = uu * along_u + uv * along_v
-        scratch_out.columns[u + 1, 1 + k] = uv * along_u + vv * along_v
+    combine_rows(system_out.matrix, at, pitch, uu * mass, uv * mass, vv * mass)
+    n = at + right + 3 * number
+    system_out.matrix[n] = system_out.matrix[n] - friction * du
+    system_out.matrix[n + 1] = system_out.matrix[n + 1] + one - uu
+    system_out.matrix[n + 2] = system_out.matrix[n + 2] - uv
+    n = n + pitch
+    system_out.matrix[n] = system_out.matrix[n] - friction * dv
+    system_out.matrix[n + 1] = system_out.matrix[n + 1] - uv
+    system_out.matrix[n + 2] = system_out.matrix[n + 2] + one - vv
 
 
 @wp.func
-def list_pressed(block: int, columns: int, islands: Islands, rows: Rows, scratch_out: SolverScratch):
-    """List the contacts of a block that press, and let the others stay at 0; returns their number."""
+def list_pressed(block: int, islands: Islands, system_out: IslandSystem):
+    """List the contacts of a block that press; returns their number."""
     start = islands.block_start[block]
     count = int(0)
-    for place in range(start, islands.block_start[block + 1]):
-        c = islands.contact[place]
-        if rows.impulse[3 * c] > wp.float64(0.0):
-            scratch_out.pressed[start + count] = c
+    for k in range(islands.block_start[block + 1] - start):
+        if system_out.impulse[islands.row_start[block] + 3 * k] > wp.float64(0.0):
+            system_out.pressed[start + count] = k
             count = count + 1
-        else:
-            for row in range(3 * c, 3 * c + 3):
-                for k in range(columns):
-                    scratch_out.columns[row, k] = wp.float64(0.0)
     return count
 
 
 @wp.func
 def write_block(
     block: int,
-    count: int,
     island: int,
-    geoms: Geoms,
-    rigid: RigidBodies,
-    contacts: Contacts,
+    count: int,
+    right: int,
+    pitch: int,
     islands: Islands,
-    rows: Rows,
-    scratch_out: SolverScratch,
+    matrix: wp.array(dtype=wp.float64),
+    system_out: IslandSystem,
 ):
-    """Write the linear system of the ``count`` contacts of a block that press: its matrix, and right-hand sides for w = 0
-    and for each entry of w.
+    """Write the linear system of the ``count`` contacts of a block that press: right-hand sides for w = 0 and for each
+    entry of w, then its matrix.
 
-    Sticking rows: (B + compliance) x = -velocity - bias - J_r w. Friction of sliding contacts: see
-    :func:`write_sliding_rows`.
+    Sticking rows: (B + compliance) x = -free - J_r w. Friction of sliding contacts: see :func:`linearise_friction`.
     """
     start = islands.block_start[block]
-    full = 3 * (islands.block_start[block + 1] - start)
-    size = 3 * count
-    dofs = islands.first_dof[island + 1] - islands.first_dof[island]
+    source_pitch = block_pitch(block, islands)
+    dofs = island_dofs(island, islands)
     for p in range(count):
-        c = scratch_out.pressed[start + p]
-        n = 3 * c
-        limit = contacts.friction[c] * rows.impulse[n]
-        tangential = wp.sqrt(rows.impulse[n + 1] * rows.impulse[n + 1] + rows.impulse[n + 2] * rows.impulse[n + 2])
-        slides = tangential >= limit * SLIDING_SHARE
-        source = islands.matrix_start[block] + 3 * (contacts.place[c] - start) * full
-        at = islands.matrix_start[block] + 3 * p * size
+        k = 3 * system_out.pressed[start + p]
+        place = start + system_out.pressed[start + p]
+        row = islands.row_start[block] + k
+        at = islands.system_start[island] + 3 * p * pitch
+        rigid = rigid_entry(place, island, islands)
         for axis in range(3):
+            entry = at + axis * pitch
             gather_row(
-                rows.delassus, source + axis * full, scratch_out.pressed, contacts.place, start, count,
-                scratch_out.matrix, at + axis * size,
+                matrix, islands.matrix_start[block] + (k + axis) * source_pitch, system_out.pressed, start, count,
+                system_out.matrix, entry + right, pitch - right,
             )  # fmt: skip
-            if axis == 0 or not slides:
-                row = n + axis
-                entry = at + axis * size + 3 * p + axis
-                scratch_out.matrix[entry] = scratch_out.matrix[entry] + contacts.compliance[c]
-                scratch_out.columns[row, 0] = -rows.velocity_free[row] - rows.bias[row]
-                for k in range(dofs):
-                    dof = islands.dof[islands.first_dof[island] + k]
-                    scratch_out.columns[row, 1 + k] = -rows.rigid_jacobian[row, dof]
-        if slides:
-            write_sliding_rows(
-                c, p, at + size, size, island, geoms, rigid, contacts, islands, rows, scratch_out
+            diagonal = entry + right + 3 * p + axis
+            system_out.matrix[diagonal] = system_out.matrix[diagonal] + system_out.compliance[place]
+            system_out.matrix[entry] = -system_out.free[row + axis]
+            for i in range(dofs):
+                system_out.matrix[entry + 1 + i] = -system_out.jacobian[rigid + i][axis]
+            for i in range(1 + dofs, right):
+                system_out.matrix[entry + i] = wp.float64(0.0)
+        x = three(row, system_out.impulse)
+        if wp.sqrt(x[1] * x[1] + x[2] * x[2]) >= system_out.friction[place] * x[0] * SLIDING_SHARE:
+            linearise_friction(
+                place, block, island, p, at + pitch, right, pitch, islands, matrix, system_out
             )  # fmt: skip
 
 
-@wp.func_native("""
-    double* const a = matrix.data + at;
-    const int pitch = columns.strides[0] / (int)sizeof(double);
-    const auto right_side = [&](int k) { return columns.data + (3 * contact.data[start + k / 3] + k % 3) * pitch; };
-    for (int k = 0; k < size; ++k) {
-        const double* const __restrict__ pivot = a + k * size;
-        const double* const __restrict__ pivot_right = right_side(k);
-        const double scale = 1.0 / pivot[k];
-        for (int m = k + 1; m < size; ++m) {
-            double* const __restrict__ row = a + m * size;
-            const double factor = row[k] * scale;
-            if (factor == 0.0) continue;
-            for (int i = k + 1; i < size; ++i) row[i] -= factor * pivot[i];
-            double* const __restrict__ right = right_side(m);
-            for (int i = 0; i < count; ++i) right[i] -= factor * pivot_right[i];
+@wp.func_native(
+    EIGHT
+    + """
+    using Matrix = wp::mat_t<3, 3, double>;
+    const auto subtract = [pitch](double* row, const double* rows, const wp::vec3d& f, int from, int to) {
+        for (int i = from; i < to; i += 8) {
+            const double* const p = rows + i;
+            const Eight first = *(const Eight*)p * f[0], second = *(const Eight*)(p + pitch) * f[1];
+            *(Eight*)(row + i) = *(const Eight*)(row + i) - first - second - *(const Eight*)(p + 2 * pitch) * f[2];
+        }
+    };
+    for (int k = 0; k < size; k += 3) {
+        double* const pivot = system.data + at + k * pitch;
+        double *const p = pivot + right + k, *const q = p + pitch, *const r = q + pitch;
+        const Matrix inverse = wp::inverse(Matrix(p[0], p[1], p[2], q[0], q[1], q[2], r[0], r[1], r[2]));
+        for (int m = k + 3; m < size; ++m) {
+            double* const row = system.data + at + m * pitch;
+            const double* const entry = row + right + k;
+            const wp::vec3d factor = wp::mul(wp::vec3d(entry[0], entry[1], entry[2]), inverse);
+            subtract(row, pivot, factor, 0, right);
+            subtract(row, pivot, factor, right + (k + 3) / 8 * 8, pitch);
+        }
+        for (int i = 0; i < 3; ++i) p[i] = inverse.data[0][i], q[i] = inverse.data[1][i], r[i] = inverse.data[2][i];
+    }
+    for (int k = size - 3; k >= 0; k -= 3) {
+        double* const pivot = system.data + at + k * pitch;
+        const double *const p = pivot + right + k, *const q = p + pitch, *const r = q + pitch;
+        for (int i = 0; i < right; i += 8) {
+            const Eight n = *(Eight*)(pivot + i), u = *(Eight*)(pivot + pitch + i), v = *(Eight*)(pivot + 2 * pitch + i);
+            *(Eight*)(pivot + i) = n * p[0] + u * p[1] + v * p[2];
+            *(Eight*)(pivot + pitch + i) = n * q[0] + u * q[1] + v * q[2];
+            *(Eight*)(pivot + 2 * pitch + i) = n * r[0] + u * r[1] + v * r[2];
+        }
+        for (int m = 0; m < k; ++m) {
+            double* const row = system.data + at + m * pitch;
+            const double* const entry = row + right + k;
+            subtract(row, pivot, wp::vec3d(entry[0], entry[1], entry[2]), 0, right);
         }
     }
-    for (int k = size - 1; k >= 0; --k) {
-        const double* const row = a + k * size;
-        double* const __restrict__ right = right_side(k);
-        for (int m = k + 1; m < size; ++m) {
-            const double* const __restrict__ below = right_side(m);
-            for (int i = 0; i < count; ++i) right[i] -= row[m] * below[i];
-        }
-        const double scale = 1.0 / row[k];
-        for (int i = 0; i < count; ++i) right[i] *= scale;
-    }
-""")
-def eliminate(
-    matrix: wp.array(dtype=wp.float64),
-    at: int,
-    size: int,
-    contact: wp.array(dtype=wp.int32),
-    start: int,
-    columns: wp.array2d(dtype=wp.float64),
-    count: int,
-):
-    """Gaussian elimination without pivoting of the matrix that begins at ``at``; its solutions replace ``columns``.
-
-    Row k of the matrix is row 3 * contact[start + k / 3] + k % 3 of the columns. B is positive definite, and sliding rows
-    change that little. Native, as Warp's loops over arrays in structs are not vectorised, and a call copies its structs.
-    """
-    ...
-
-
-@wp.func_native("""
-    double* to = a.data + target * (a.strides[0] / (int)sizeof(double));
-    const int pitch = columns.strides[1] / (int)sizeof(double);
-    const double* from = columns.data + source * (columns.strides[0] / (int)sizeof(double));
-    for (int i = 1; i <= count; ++i) to[i] -= factor * from[i * pitch];
-""")
-def subtract_columns(
-    a: wp.array2d(dtype=wp.float64), target: int, columns: wp.array2d(dtype=wp.float64), source: int, count: int,
-    factor: wp.float64,
-):  # fmt: skip
-    """Subtract from a row, its first number left out, ``factor`` times ``count`` numbers of a row of ``columns``."""
+"""
+)
+def eliminate(system: wp.array(dtype=wp.float64), at: int, size: int, right: int, pitch: int):
+    """Gaussian elimination of ``size`` rows that begin at ``at``, by contacts; solutions replace the first ``right``
+    entries of each row. Without pivoting: B is positive definite, and sliding rows change that little."""
     ...
 
 
 @wp.func
-def solve_rigid(island: int, contacts: Contacts, islands: Islands, rows: Rows, scratch_out: SolverScratch):
+def keep_solution(
+    block: int, island: int, count: int, pitch: int, islands: Islands, system_out: IslandSystem
+):  # fmt: skip
+    """Keep the solution of a block for all of its contacts: 0 for those that do not press."""
+    start = islands.block_start[block]
+    columns = 1 + island_dofs(island, islands)
+    p = int(0)
+    for place in range(start, islands.block_start[block + 1]):
+        to = solution_entry(place, island, islands)
+        presses = p < count and start + system_out.pressed[start + wp.min(p, count - 1)] == place
+        entry = islands.system_start[island] + 3 * p * pitch
+        for i in range(columns):
+            value = wp.vec3d()
+            if presses:
+                value = wp.vec3d(
+                    system_out.matrix[entry + i], system_out.matrix[entry + pitch + i],
+                    system_out.matrix[entry + 2 * pitch + i],
+                )  # fmt: skip
+            system_out.solution[to + i] = value
+        if presses:
+            p = p + 1
+
+
+@wp.func_native("""
+    for (int i = 0; i < count; ++i) row.data[at + i] -= dot(response, solution.data[entry + i]);
+""")
+def subtract_products(
+    row: wp.array(dtype=wp.float64), at: int, response: wp.vec3d, solution: wp.array(dtype=wp.vec3d), entry: int,
+    count: int,
+):  # fmt: skip
+    """Subtract from ``count`` numbers the products of ``response`` with as many vectors."""
+    ...
+
+
+@wp.func
+def solve_rigid(island: int, islands: Islands, system_out: IslandSystem):
     """Solve (1 - G X) w = G y for the rigid velocities, where x = y + X w and G = H^-1 J_r^T; w replaces column 0.
 
     With partial pivoting: velocities and angular velocities are mixed.
     """
     zero = wp.float64(0.0)
     first = islands.first_dof[island]
-    dofs = islands.first_dof[island + 1] - first
+    dofs = island_dofs(island, islands)
     for i in range(dofs):
         for k in range(1 + dofs):
-            scratch_out.rigid_system[first + i, k] = zero
-        scratch_out.rigid_system[first + i, 1 + i] = wp.float64(1.0)
-    for m in range(islands.start[island], islands.start[island + 1]):
-        c = islands.contact[m]
-        if contacts.other[c] >= 0:
-            for row in range(3 * c, 3 * c + 3):
-                for i in range(dofs):
-                    response = rows.rigid_response[row, islands.dof[first + i]]
-                    if response != zero:
-                        value = scratch_out.rigid_system[first + i, 0] + response * scratch_out.columns[row, 0]
-                        scratch_out.rigid_system[first + i, 0] = value
-                        subtract_columns(scratch_out.rigid_system, first + i, scratch_out.columns, row, dofs, response)
+            system_out.rigid_matrix[first + i, k] = zero
+        system_out.rigid_matrix[first + i, 1 + i] = wp.float64(1.0)
+    for place in range(islands.start[island], islands.start[island + 1]):
+        at = rigid_entry(place, island, islands)
+        solution = solution_entry(place, island, islands)
+        y = system_out.solution[solution]
+        for i in range(dofs):
+            response = system_out.response[at + i]
+            if response[0] != zero or response[1] != zero or response[2] != zero:
+                value = system_out.rigid_matrix[first + i, 0] + wp.dot(response, y)
+                system_out.rigid_matrix[first + i, 0] = value
+                subtract_products(
+                    system_out.rigid_matrix[first + i], 1, response, system_out.solution, solution + 1, dofs
+                )  # fmt: skip
     for k in range(dofs):
         best = int(k)
         for i in range(k + 1, dofs):
-            if wp.abs(scratch_out.rigid_system[first + i, 1 + k]) > wp.abs(
-                scratch_out.rigid_system[first + best, 1 + k]
-            ):
+            if wp.abs(system_out.rigid_matrix[first + i, 1 + k]) > wp.abs(system_out.rigid_matrix[first + best, 1 + k]):
                 best = i
         if best != k:
             for c in range(1 + dofs):
-                swap = scratch_out.rigid_system[first + k, c]
-                scratch_out.rigid_system[first + k, c] = scratch_out.rigid_system[first + best, c]
-                scratch_out.rigid_system[first + best, c] = swap
-        scale = wp.float64(1.0) / scratch_out.rigid_system[first + k, 1 + k]
+                swap = system_out.rigid_matrix[first + k, c]
+                system_out.rigid_matrix[first + k, c] = system_out.rigid_matrix[first + best, c]
+                system_out.rigid_matrix[first + best, c] = swap
+        scale = wp.float64(1.0) / system_out.rigid_matrix[first + k, 1 + k]
         for i in range(k + 1, dofs):
-            factor = scratch_out.rigid_system[first + i, 1 + k] * scale
+            factor = system_out.rigid_matrix[first + i, 1 + k] * scale
             if factor != zero:
                 for c in range(1 + dofs):
-                    scratch_out.rigid_system[first + i, c] = (
-                        scratch_out.rigid_system[first + i, c] - factor * scratch_out.rigid_system[first + k, c]
+                    system_out.rigid_matrix[first + i, c] = (
+                        system_out.rigid_matrix[first + i, c] - factor * system_out.rigid_matrix[first + k, c]
                     )
     for back in range(dofs):
         k = dofs - 1 - back
-        value = scratch_out.rigid_system[first + k, 0]
+        value = system_out.rigid_matrix[first + k, 0]
         for i in range(k + 1, dofs):
-            value = value - scratch_out.rigid_system[first + k, 1 + i] * scratch_out.rigid_system[first + i, 0]
-        scratch_out.rigid_system[first + k, 0] = value / scratch_out.rigid_system[first + k, 1 + k]
+            value = value - system_out.rigid_matrix[first + k, 1 + i] * system_out.rigid_matrix[first + i, 0]
+        system_out.rigid_matrix[first + k, 0] = value / system_out.rigid_matrix[first + k, 1 + k]
 
 
 @wp.func
-def project_into_cones(island: int, contacts: Contacts, islands: Islands, rows_out: Rows):
-    """Put the impulses of one island back into their friction cones, where the guess about a contact was wrong."""
+def project_into_cone(x: wp.vec3d, friction: wp.float64):
+    """An impulse put back into its friction cone, where the guess about its contact was wrong."""
     zero = wp.float64(0.0)
-    for m in range(islands.start[island], islands.start[island + 1]):
-        c = islands.contact[m]
-        n = 3 * c
-        normal = wp.max(rows_out.impulse[n], zero)
-        tangential = wp.sqrt(
-            rows_out.impulse[n + 1] * rows_out.impulse[n + 1] + rows_out.impulse[n + 2] * rows_out.impulse[n + 2]
-        )
-        share = wp.float64(1.0)
-        if tangential > contacts.friction[c] * normal:
-            share = contacts.friction[c] * normal / tangential
-        rows_out.impulse[n] = normal
-        rows_out.impulse[n + 1] = share * rows_out.impulse[n + 1]
-        rows_out.impulse[n + 2] = share * rows_out.impulse[n + 2]
+    normal = wp.max(x[0], zero)
+    tangential = wp.sqrt(x[1] * x[1] + x[2] * x[2])
+    share = wp.float64(1.0)
+    if tangential > friction * normal:
+        share = friction * normal / tangential
+    return wp.vec3d(normal, share * x[1], share * x[2])
 
 
 @wp.func
-def newton_step(
-    island: int,
-    geoms: Geoms,
-    rigid: RigidBodies,
-    contacts: Contacts,
-    islands: Islands,
-    scratch_out: SolverScratch,
-    rows_out: Rows,
-):
+def newton_step(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
     """Impulses that fit the present states of all contacts of one island, put back into their friction cones."""
     first = islands.first_dof[island]
-    dofs = islands.first_dof[island + 1] - first
+    dofs = island_dofs(island, islands)
+    right = padded(1 + dofs)
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
-        count = list_pressed(block, 1 + dofs, islands, rows_out, scratch_out)
-        write_block(block, count, island, geoms, rigid, contacts, islands, rows_out, scratch_out)
-        eliminate(
-            scratch_out.matrix, islands.matrix_start[block], 3 * count, scratch_out.pressed,
-            islands.block_start[block], scratch_out.columns, 1 + dofs,
-        )  # fmt: skip
-    solve_rigid(island, contacts, islands, rows_out, scratch_out)
-    for m in range(islands.start[island], islands.start[island + 1]):
-        for row in range(3 * islands.contact[m], 3 * islands.contact[m] + 3):
-            value = scratch_out.columns[row, 0]
-            for k in range(dofs):
-                value = value + scratch_out.columns[row, 1 + k] * scratch_out.rigid_system[first + k, 0]
-            rows_out.impulse[row] = value
-    project_into_cones(island, contacts, islands, rows_out)
-    update_rigid_velocity(island, contacts, islands, rows_out)
+        count = list_pressed(block, islands, system_out)
+        pitch = right + padded(3 * count)
+        write_block(block, island, count, right, pitch, islands, matrix, system_out)
+        eliminate(system_out.matrix, islands.system_start[island], 3 * count, right, pitch)
+        keep_solution(block, island, count, pitch, islands, system_out)
+    solve_rigid(island, islands, system_out)
+    for block in range(islands.first_block[island], islands.first_block[island + 1]):
+        for place in range(islands.block_start[block], islands.block_start[block + 1]):
+            at = solution_entry(place, island, islands)
+            x = system_out.solution[at]
+            for i in range(dofs):
+                x = x + system_out.solution[at + 1 + i] * system_out.rigid_matrix[first + i, 0]
+            row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+            set_three(row, project_into_cone(x, system_out.friction[place]), system_out.impulse)
+    update_rigid_velocity(island, islands, system_out)

@@ -8,15 +8,19 @@ import warp as wp
 
 from vinesim.kernels.compiler_flags import INLINE_ALL
 from vinesim.kernels.contact.conjugate_gradient import follow_conjugate_direction
-from vinesim.kernels.contact.newton import newton_step
-from vinesim.kernels.contact.row_velocity import (
-    add_impulse,
-    delassus_entry,
-    row_residual,
-    tangential_eigenvalue,
+from vinesim.kernels.contact.island_system import (
+    IslandSystem,
+    contact_residual,
+    gather_island,
+    push_rigid_bodies,
+    rigid_entry,
+    scatter_impulses,
+    set_three,
+    three,
     update_rigid_velocity,
 )
-from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, RigidBodies, Rows, SolverScratch
+from vinesim.kernels.contact.newton import newton_step
+from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Parameters, Rows
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
@@ -29,39 +33,51 @@ NEWTON_PERIOD = wp.constant(10)
 
 @wp.func
 def relax_contact(
-    c: int, island: int, geoms: Geoms, rigid: RigidBodies, contacts: Contacts, islands: Islands, rows_out: Rows
+    place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem
 ):
     """One Gauss-Seidel step of a contact, normal and then friction; returns the largest change of an impulse [N s]."""
     zero = wp.float64(0.0)
-    compliance = contacts.compliance[c]
-    n = 3 * c
-    r = row_residual(n, geoms, rigid, contacts, islands, rows_out)
-    before = rows_out.impulse[n]
-    normal = wp.max(zero, before - r / (delassus_entry(n, 0, geoms, rigid, contacts, islands, rows_out) + compliance))
-    if normal != before:
-        add_impulse(n, normal - before, island, contacts, islands, rows_out)
-        rows_out.impulse[n] = normal
+    row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+    before = three(row, system_out.impulse)
+    residual = contact_residual(place, block, island, islands, matrix, system_out)
+    mass = system_out.mass[place]
+    normal = wp.max(zero, before[0] - residual[0] * mass[0])
+    pressed = normal - before[0]
+    fu = zero
+    fv = zero
+    if normal != zero or before[1] != zero or before[2] != zero:
+        own = system_out.own[place]
+        fu = before[1] - (residual[1] + own[1, 0] * pressed) * mass[1]
+        fv = before[2] - (residual[2] + own[2, 0] * pressed) * mass[1]
+        tangential = wp.sqrt(fu * fu + fv * fv)
+        limit = system_out.friction[place] * normal
+        if tangential > limit:
+            share = limit / wp.max(tangential, wp.float64(1.0e-30))
+            fu = fu * share
+            fv = fv * share
+    change = wp.vec3d(pressed, fu - before[1], fv - before[2])
+    if change[0] != zero or change[1] != zero or change[2] != zero:
+        set_three(row, wp.vec3d(normal, fu, fv), system_out.impulse)
+        first = islands.first_dof[island]
+        push_rigid_bodies(
+            change, system_out.response, rigid_entry(place, island, islands), system_out.velocity, first,
+            islands.first_dof[island + 1] - first,
+        )  # fmt: skip
+    return wp.max(wp.abs(change[0]), wp.abs(change[1]) + wp.abs(change[2]))
 
-    u = n + 1
-    v = n + 2
-    if normal == zero and rows_out.impulse[u] == zero and rows_out.impulse[v] == zero:
-        return wp.abs(normal - before)
-    ru = row_residual(u, geoms, rigid, contacts, islands, rows_out)
-    rv = row_residual(v, geoms, rigid, contacts, islands, rows_out)
-    eigenvalue = tangential_eigenvalue(c, geoms, rigid, contacts, islands, rows_out)
-    fu = rows_out.impulse[u] - ru / eigenvalue
-    fv = rows_out.impulse[v] - rv / eigenvalue
-    tangential = wp.sqrt(fu * fu + fv * fv)
-    limit = contacts.friction[c] * normal
-    if tangential > limit:
-        fu = fu * limit / wp.max(tangential, wp.float64(1.0e-30))
-        fv = fv * limit / wp.max(tangential, wp.float64(1.0e-30))
-    change_u = fu - rows_out.impulse[u]
-    change_v = fv - rows_out.impulse[v]
-    if change_u != zero or change_v != zero:
-        add_impulse(u, change_u, island, contacts, islands, rows_out)
-        add_impulse(v, change_v, island, contacts, islands, rows_out)
-    return wp.max(wp.abs(normal - before), wp.abs(change_u) + wp.abs(change_v))
+
+@wp.func
+def sweep(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
+    """One Gauss-Seidel step of each contact in turn; returns the largest change of an impulse and the largest normal
+    impulse [N s]."""
+    change = wp.float64(0.0)
+    largest = wp.float64(MIN_IMPULSE_SCALE)
+    for block in range(islands.first_block[island], islands.first_block[island + 1]):
+        for place in range(islands.block_start[block], islands.block_start[block + 1]):
+            change = wp.max(change, relax_contact(place, block, island, islands, matrix, system_out))
+            row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+            largest = wp.max(largest, system_out.impulse[row])
+    return change, largest
 
 
 @wp.func
@@ -73,14 +89,12 @@ def largest_block(island: int, islands: Islands):
     return largest
 
 
-@wp.func
-def copy_impulses(
-    island: int, islands: Islands, impulse: wp.array(dtype=wp.float64), impulse_out: wp.array(dtype=wp.float64)
-):
-    """Copy the impulses of one island."""
-    for m in range(islands.start[island], islands.start[island + 1]):
-        for row in range(3 * islands.contact[m], 3 * islands.contact[m] + 3):
-            impulse_out[row] = impulse[row]
+@wp.func_native("""
+    for (int i = first; i < last; ++i) target.data[i] = source.data[i];
+""")
+def copy_rows(first: int, last: int, source: wp.array(dtype=wp.float64), target: wp.array(dtype=wp.float64)):
+    """Copy the numbers of some rows."""
+    ...
 
 
 @wp.func
@@ -90,12 +104,9 @@ def solve_island(
     max_newton_steps: int,
     max_newton_contacts: int,
     tolerance: wp.float64,
-    geoms: Geoms,
-    rigid: RigidBodies,
-    contacts: Contacts,
     islands_out: Islands,
-    scratch_out: SolverScratch,
-    rows_out: Rows,
+    matrix: wp.array(dtype=wp.float64),
+    system_out: IslandSystem,
 ):
     """Solve an island from the guess in ``impulse`` on.
 
@@ -104,43 +115,37 @@ def solve_island(
     after every sweep, at first. If these do not settle, sweeps go on from where they began, with conjugate
     gradients, as they do from the first one on in islands with a large block.
     """
-    first = islands_out.start[island]
-    last = islands_out.start[island + 1]
+    first = islands_out.row_start[islands_out.first_block[island]]
+    last = islands_out.row_start[islands_out.first_block[island + 1]]
     newton_end = max_newton_steps
     if largest_block(island, islands_out) > max_newton_contacts:
         newton_end = 0
-    update_rigid_velocity(island, contacts, islands_out, rows_out)
     sweeps = int(0)
     gradient = wp.float64(0.0)
     busy = bool(True)
     while busy and sweeps < max_sweeps:
-        copy_impulses(island, islands_out, rows_out.impulse, scratch_out.impulse_before)
-        change = wp.float64(0.0)
-        largest = wp.float64(MIN_IMPULSE_SCALE)
-        for m in range(first, last):
-            c = islands_out.contact[m]
-            moved = relax_contact(c, island, geoms, rigid, contacts, islands_out, rows_out)
-            change = wp.max(change, moved)
-            largest = wp.max(largest, rows_out.impulse[3 * c])
+        copy_rows(first, last, system_out.impulse, system_out.impulse_before)
+        change, largest = sweep(island, islands_out, matrix, system_out)
         sweeps = sweeps + 1
         busy = change > tolerance * largest
         if busy and sweeps < max_sweeps:
             if sweeps == newton_end + 1 and newton_end > 0:
-                copy_impulses(island, islands_out, scratch_out.impulse_first, rows_out.impulse)
-                update_rigid_velocity(island, contacts, islands_out, rows_out)
+                copy_rows(first, last, system_out.impulse_first, system_out.impulse)
+                update_rigid_velocity(island, islands_out, system_out)
             elif sweeps > newton_end and (newton_end == 0 or sweeps % NEWTON_PERIOD != 0):
-                gradient = follow_conjugate_direction(island, gradient, contacts, islands_out, scratch_out, rows_out)
+                gradient = follow_conjugate_direction(island, first, last, gradient, islands_out, system_out)
             else:
                 if sweeps == 1:
-                    copy_impulses(island, islands_out, rows_out.impulse, scratch_out.impulse_first)
+                    copy_rows(first, last, system_out.impulse, system_out.impulse_first)
                 gradient = wp.float64(0.0)
-                newton_step(island, geoms, rigid, contacts, islands_out, scratch_out, rows_out)
+                newton_step(island, islands_out, matrix, system_out)
     islands_out.sweeps[island] = sweeps
 
 
 @wp.kernel
 def solve_islands(
     # model
+    parameters: Parameters,
     max_sweeps: int,
     max_newton_steps: int,
     max_newton_contacts: int,
@@ -148,15 +153,16 @@ def solve_islands(
     geoms: Geoms,
     # in
     items: wp.array(dtype=wp.int32),
-    rigid: RigidBodies,
     contacts: Contacts,
     # out
     islands_out: Islands,
-    scratch_out: SolverScratch,
+    system_out: IslandSystem,
     rows_out: Rows,
 ):
     """One thread per island: see :func:`solve_island`."""
+    island = items[wp.tid()]
+    gather_island(island, geoms, contacts, islands_out, rows_out, system_out)
     solve_island(
-        items[wp.tid()], max_sweeps, max_newton_steps, max_newton_contacts, tolerance, geoms, rigid, contacts,
-        islands_out, scratch_out, rows_out,
-    )  # fmt: skip
+        island, max_sweeps, max_newton_steps, max_newton_contacts, tolerance, islands_out, rows_out.delassus, system_out
+    )
+    scatter_impulses(island, parameters.dt, islands_out, system_out, rows_out)

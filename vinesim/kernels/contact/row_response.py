@@ -1,96 +1,175 @@
-"""Response of plants to the rows of contacts: velocities of all bodies in contact by unit impulses along three rows.
+"""Response of plants to the rows of contacts: velocities of the bodies in contact by unit impulses along them.
 
-The articulated-body algorithm with impulses only (Featherstone 2008, section 7.3): impulses travel inward along the path
+The articulated-body algorithm with impulses only (Featherstone 2008, section 7.3): impulses travel inward along the paths
 to the root, the velocities that they cause travel outward. A contact of two plant bodies has two *sides*, number
-2 * contact and 2 * contact + 1; of one with a rigid geom the second is empty.
+2 * contact and 2 * contact + 1; of one with a rigid geom the second is empty. The sides on one tree travel together, in
+groups of ten: three rows of each are thirty columns, and eight columns are computed at once.
 """
 
 import warp as wp
 
 from vinesim.kernels.articulation.structs import ArticulationModel, Factors
-from vinesim.kernels.contact.jacobians import row_columns
+from vinesim.kernels.contact.structs import SideGroups
 
 wp.set_module_options({"enable_backward": False})
 
+COLUMNS = wp.constant(32)
+"""Room for the columns of a group in the working memory of a body."""
+BODY_NUMBERS = wp.constant(192)
+"""Working memory of a body: force and moment, then linear and angular velocity, of all columns."""
 
-@wp.struct
-class SideRows:
-    """Unit impulses along the rows of each side of a contact [side], a column for each row, and what they cause."""
 
-    force: wp.array(dtype=wp.mat33)
-    """[1] at the origin of the body."""
-    moment: wp.array(dtype=wp.mat33)
-    """[m]"""
-    linear: wp.array2d(dtype=wp.mat33)
-    """[side, k] velocity [1/kg] of the k-th listed body of the tree, up to the side's own body."""
-    angular: wp.array2d(dtype=wp.mat33)
-    """[side, k] 1/(kg m)"""
+EIGHT = """
+#if defined(__CUDACC__)
+    using Eight = wp::vec_t<8, float>;
+#else
+    typedef float Eight __attribute__((vector_size(32), aligned(4)));
+#endif
+"""
+"""Native code: eight columns."""
 
 
 @wp.struct
 class ResponseScratch:
-    """Velocities of all bodies of the tree [row * stride + body of the tree]; one row serves all sides in turn on a CPU,
-    where it stays in the cache, and each side has its own on a GPU."""
+    """Working memory of one group at a time [row of scratch, body of the tree]."""
 
-    a: wp.array(dtype=wp.mat33)
-    alpha: wp.array(dtype=wp.mat33)
+    is_on_path: wp.array(dtype=wp.bool)
+    """whether the body carries another one that is in contact, or is itself."""
+    values: wp.array(dtype=float)
+    """[body, component, column] impulses, then velocities."""
 
 
-@wp.func
+@wp.func_native("""
+    for (int i = 0; i < count; ++i) values.data[at + i] = 0.0f;
+""")
+def clear_numbers(values: wp.array(dtype=float), at: int, count: int):
+    """Clear ``count`` numbers from ``at`` on."""
+    ...
+
+
+@wp.func_native("""
+    const int pitch = jacobian.strides[0] / (int)sizeof(double);
+    for (int r = 0; r < 3; ++r) {
+        const double* const row = jacobian.data + (3 * (side / 2) + r) * pitch + 6 * (side % 2);
+        for (int k = 0; k < 6; ++k) values.data[at + 32 * k + 3 * number + r] += (float)row[k];
+    }
+""")
+def add_side(side: int, number: int, jacobian: wp.array2d(dtype=wp.float64), values: wp.array(dtype=float), at: int):
+    """Add unit impulses along the rows of a side to its body, in the columns of its number in the group."""
+    ...
+
+
+@wp.func_native(
+    EIGHT
+    + """
+    float* const own = values.data + at;
+    float* const parent = values.data + to;
+    for (int c = 0; c < width; c += 8) {
+        Eight f[3], m[3], left[3];
+        for (int r = 0; r < 3; ++r) {
+            f[r] = *(const Eight*)(own + 32 * r + c);
+            m[r] = *(const Eight*)(own + 96 + 32 * r + c);
+        }
+        for (int r = 0; r < 3; ++r) {
+            *(Eight*)(own + 96 + 32 * r + c) = D.data[r][0] * m[0] + D.data[r][1] * m[1] + D.data[r][2] * m[2];
+            f[r] = f[r] - (DH.data[0][r] * m[0] + DH.data[1][r] * m[1] + DH.data[2][r] * m[2]);
+        }
+        for (int r = 0; r < 3; ++r) {
+            const int s = (r + 1) % 3, t = (r + 2) % 3;
+            left[r] = m[r] - (DJ.data[0][r] * m[0] + DJ.data[1][r] * m[1] + DJ.data[2][r] * m[2]);
+            left[r] = left[r] + lever[s] * f[t] - lever[t] * f[s];
+        }
+        for (int r = 0; r < 3; ++r) {
+            Eight* const force = (Eight*)(parent + 32 * r + c);
+            Eight* const moment = (Eight*)(parent + 96 + 32 * r + c);
+            if (to >= 0) *force = *force + f[r], *moment = *moment + left[r];
+            else *(Eight*)(own + 32 * r + c) = root.data[r][0] * f[0] + root.data[r][1] * f[1] + root.data[r][2] * f[2];
+        }
+    }
+"""
+)
 def carry_inward(
-    body: int, first: int, shift: int, force: wp.mat33, moment: wp.mat33, model: ArticulationModel, factors: Factors,
-    scratch_out: ResponseScratch,
+    values: wp.array(dtype=float), at: int, to: int, width: int, D: wp.mat33, DJ: wp.mat33, DH: wp.mat33,
+    lever: wp.vec3, root: wp.mat33,
 ):  # fmt: skip
-    """Carry impulses at a body along its path to the root; ``alpha``: what each joint takes of them, 0 beside the path.
+    """Carry the impulses at a body to its parent, whose memory begins at ``to``; what its joint takes of them stays.
 
-    Returns the root, and how fast it moves if it floats.
+    Without a parent (``to`` < 0) they move it: ``root`` is its inverse mass.
     """
-    path = int(body)
-    root = int(body)
-    a = wp.mat33()
-    for i in range((body - first) / model.pitch + 1):
-        k = body - i * model.pitch
-        taken = wp.mat33()
-        if k == path:
-            taken = factors.D[k] * moment
-            force = force - wp.transpose(factors.DH[k]) * moment
-            moment = moment - wp.transpose(factors.DJ[k]) * moment + wp.skew(factors.lever[k]) * force
-            path = model.body_parent[k]
-            if path < 0:
-                root = k
-                a = factors.root_inverse_mass[k] * force
-        scratch_out.alpha[shift + (k - first) / model.pitch] = taken
-    return root, a
+    ...
+
+
+@wp.func_native(
+    EIGHT
+    + """
+    float* const own = values.data + at;
+    const float* const parent = values.data + from_parent;
+    for (int c = 0; c < width; c += 8) {
+        Eight a[3], alpha[3] = {};
+        for (int r = 0; r < 3; ++r) {
+            a[r] = *(const Eight*)((from_parent >= 0 ? parent : own) + 32 * r + c);
+            if (from_parent >= 0) alpha[r] = *(const Eight*)(parent + 96 + 32 * r + c);
+        }
+        for (int r = 0; r < 3; ++r) {
+            const int s = (r + 1) % 3, t = (r + 2) % 3;
+            a[r] = a[r] - lever[s] * alpha[t] + lever[t] * alpha[s];
+            *(Eight*)(own + 32 * r + c) = a[r];
+        }
+        for (int r = 0; r < 3; ++r) {
+            Eight* const turned = (Eight*)(own + 96 + 32 * r + c);
+            *turned = *turned + alpha[r]
+                - (DJ.data[r][0] * alpha[0] + DJ.data[r][1] * alpha[1] + DJ.data[r][2] * alpha[2])
+                - (DH.data[r][0] * a[0] + DH.data[r][1] * a[1] + DH.data[r][2] * a[2]);
+        }
+    }
+"""
+)
+def carry_outward(
+    values: wp.array(dtype=float), at: int, from_parent: int, width: int, DJ: wp.mat33, DH: wp.mat33, lever: wp.vec3
+):
+    """From what a joint takes of impulses, and the velocities of its parent, to those of its body."""
+    ...
+
+
+@wp.func_native("""
+    for (int k = 0; k < 6; ++k)
+        for (int i = 0; i < width; ++i) response.data[to + width * k + i] = values.data[at + 32 * k + i];
+""")
+def keep_velocities(values: wp.array(dtype=float), at: int, width: int, response: wp.array(dtype=float), to: int):
+    """Copy the velocities of a body."""
+    ...
 
 
 @wp.func
-def carry_outward(
-    body: int, first: int, shift: int, root: int, root_a: wp.mat33, model: ArticulationModel, factors: Factors,
-    scratch_out: ResponseScratch,
+def mark_paths(
+    first: int, bodies: int, row: int, start: int, end: int, place: wp.array(dtype=wp.int32),
+    touched: wp.array(dtype=wp.int32), model: ArticulationModel, scratch_out: ResponseScratch,
 ):  # fmt: skip
-    """From what joints take of impulses to the velocities of all bodies up to ``body``."""
-    a = wp.mat33()
-    alpha = wp.mat33()
-    for i in range((body - first) / model.pitch + 1):
-        k = first + i * model.pitch
-        parent = model.body_parent[k]
-        if parent < 0:
-            a = wp.mat33()
-            alpha = wp.mat33()
-            if k == root:
-                a = root_a
-        else:
-            if parent != k - model.pitch:
-                a = scratch_out.a[shift + (parent - first) / model.pitch]
-                alpha = scratch_out.alpha[shift + (parent - first) / model.pitch]
-            a = a - wp.skew(factors.lever[k]) * alpha
-        alpha = alpha + scratch_out.alpha[shift + i] - factors.DJ[k] * alpha - factors.DH[k] * a
-        scratch_out.a[shift + i] = a
-        scratch_out.alpha[shift + i] = alpha
+    """Mark the touched bodies of a tree, in slots ``start`` to ``end``, and all that carry them; clear their memory."""
+    for k in range(bodies):
+        scratch_out.is_on_path[row + k] = False
+    for slot in range(start, end):
+        body = int(place[touched[slot]])
+        while body >= 0:
+            at = row + (body - first) / model.pitch
+            known = bool(scratch_out.is_on_path[at])  # as it was before it is written
+            if not known:
+                scratch_out.is_on_path[at] = True
+                clear_numbers(scratch_out.values, at * BODY_NUMBERS, BODY_NUMBERS)
+            body = wp.where(known, -1, model.body_parent[body])
+
+
+@wp.func
+def memory_of(body: int, first: int, row: int, pitch: int):
+    """Where the working memory of a body begins, negative for none."""
+    at = int(-1)
+    if body >= 0:
+        at = (row + (body - first) / pitch) * BODY_NUMBERS
+    return at
 
 
 @wp.kernel
-def respond_to_sides(
+def respond_to_groups(
     # model
     model: ArticulationModel,
     stride: int,
@@ -99,40 +178,56 @@ def respond_to_sides(
     # in
     items: wp.array(dtype=wp.int32),
     touched: wp.array(dtype=wp.int32),
-    tree_start: wp.array(dtype=wp.int32),
+    tree_end: wp.array(dtype=wp.int32),
     body_slot: wp.array(dtype=wp.int32),
     other_slot: wp.array(dtype=wp.int32),
     jacobian: wp.array2d(dtype=wp.float64),
+    groups: SideGroups,
     factors: Factors,
     # out
     scratch_out: ResponseScratch,
-    sides_out: SideRows,
+    response_out: wp.array(dtype=float),
 ):
-    """One thread per side of a contact: velocities of the listed bodies of its tree, up to its own.
+    """One thread per group: velocities of the touched bodies of its tree by unit impulses along the rows of its sides.
 
-    touched: [slot] bodies in contact, sorted; those after the side's own follow by symmetry. place: [body] where kernels
-    find it. tree_start: [slot] first slot of the same tree. body_slot, other_slot: [contact] of its sides, -1 for none.
-    jacobian: [row, 12] of both sides. stride: bodies of the largest tree; scratch_rows: rows of
-    ``scratch_out``.
+    touched: [slot] bodies in contact, sorted; tree_end: [slot] slot after the last of the same tree. body_slot,
+    other_slot: [contact] of its sides. place: [body] where kernels find it. stride: bodies of the largest tree;
+    scratch_rows: groups that ``scratch_out`` has room for at once.
     """
-    side = items[wp.tid()]
-    c = side / 2
-    slot = body_slot[c]
-    if side % 2 == 1:
-        slot = other_slot[c]
-    if slot < 0:
-        return
-    body = place[touched[slot]]
-    first = model.tree_first[model.body_tree[body]]
-    shift = side % scratch_rows * stride
-    force = row_columns(c, 6 * (side % 2), jacobian)
-    moment = row_columns(c, 6 * (side % 2) + 3, jacobian)
-    sides_out.force[side] = force
-    sides_out.moment[side] = moment
-    root, root_a = carry_inward(body, first, shift, force, moment, model, factors, scratch_out)
-    carry_outward(body, first, shift, root, root_a, model, factors, scratch_out)
-    start = tree_start[slot]
-    for other in range(start, slot + 1):
-        at = shift + (place[touched[other]] - first) / model.pitch
-        sides_out.linear[side, other - start] = scratch_out.a[at]
-        sides_out.angular[side, other - start] = scratch_out.alpha[at]
+    group = items[wp.tid()]
+    start = groups.tree[group]
+    end = tree_end[start]
+    last = place[touched[end - 1]]
+    first = model.tree_first[model.body_tree[last]]
+    bodies = (last - first) / model.pitch + 1
+    row = group % scratch_rows * stride
+    sides = groups.start[group + 1] - groups.start[group]
+    width = (3 * sides + 7) / 8 * 8
+    mark_paths(first, bodies, row, start, end, place, touched, model, scratch_out)
+    for number in range(sides):
+        side = groups.side[groups.start[group] + number]
+        slot = body_slot[side / 2]
+        if side % 2 == 1:
+            slot = other_slot[side / 2]
+        add_side(side, number, jacobian, scratch_out.values, memory_of(place[touched[slot]], first, row, model.pitch))
+    for i in range(bodies):
+        k = last - i * model.pitch
+        if scratch_out.is_on_path[row + bodies - 1 - i]:
+            carry_inward(
+                scratch_out.values, memory_of(k, first, row, model.pitch),
+                memory_of(model.body_parent[k], first, row, model.pitch), width, factors.D[k], factors.DJ[k],
+                factors.DH[k], factors.lever[k], factors.root_inverse_mass[k],
+            )  # fmt: skip
+    for i in range(bodies):
+        k = first + i * model.pitch
+        if scratch_out.is_on_path[row + i]:
+            carry_outward(
+                scratch_out.values, memory_of(k, first, row, model.pitch),
+                memory_of(model.body_parent[k], first, row, model.pitch), width, factors.DJ[k], factors.DH[k],
+                factors.lever[k],
+            )  # fmt: skip
+    for slot in range(start, end):
+        at = memory_of(place[touched[slot]], first, row, model.pitch)
+        keep_velocities(
+            scratch_out.values, at, width, response_out, groups.response[group] + (slot - start) * 6 * width
+        )  # fmt: skip

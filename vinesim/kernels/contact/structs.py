@@ -23,10 +23,14 @@ SORT_AXIS = wp.constant(5)
 ISLANDS = wp.constant(6)
 BLOCKS = wp.constant(8)
 MATRIX_ENTRIES = wp.constant(9)
-"""Entries of the matrices of all blocks."""
+"""Entries of the matrices of all blocks, or of those of the Newton steps of all islands, whichever are more."""
 SKIPPED_GEOMS = wp.constant(7)
 """Static geoms beyond what one tree can be near to."""
-COUNTERS = 10
+GROUPS = wp.constant(10)
+"""Groups of sides of contacts."""
+RESPONSE_NUMBERS = wp.constant(11)
+"""Numbers of the responses to all groups."""
+COUNTERS = 12
 
 AABB_BLOCK = wp.constant(32)
 """So many static boxes share one box around them, and are skipped by one comparison."""
@@ -319,6 +323,8 @@ class Candidates:
     """[awake tree] whether one of them is an impact."""
     near_geoms: wp.array2d(dtype=wp.int32)
     """[awake tree, k] scratch: geoms whose box overlaps that of the tree."""
+    near_pairs: wp.array(dtype=wp.vec2i)
+    """[awake tree * room + k] scratch: capsules and geoms whose boxes overlap."""
     skipped_geoms: wp.array(dtype=wp.int32)
     """[awake tree] static geoms whose box overlaps it as well, for which ``near_geoms`` has no room."""
     feature: wp.array2d(dtype=wp.int32)
@@ -388,6 +394,24 @@ class TouchedBodies:
 
 
 @wp.struct
+class SideGroups:
+    """Sides of contacts on plants, in groups of at most ten on one tree: see :mod:`vinesim.kernels.contact.row_response`."""
+
+    side: wp.array(dtype=wp.int32)
+    """[place] 2 * contact, and 1 more for the other plant body, by trees; in the order of the list of islands."""
+    start: wp.array(dtype=wp.int32)
+    """[group + 1] first place of each in ``side``."""
+    tree: wp.array(dtype=wp.int32)
+    """[group + 1] slot of the first touched body of its tree; -1 after the last group."""
+    response: wp.array(dtype=wp.int32)
+    """[group] first number of its response: by touched bodies of the tree, linear and angular velocity, columns."""
+    first: wp.array(dtype=wp.int32)
+    """[slot] first group of the tree whose touched bodies begin there."""
+    listed: wp.array(dtype=wp.int32)
+    """[slot] scratch: where the next side of that tree is listed."""
+
+
+@wp.struct
 class Islands:
     """Islands: sets of contacts that do not affect each other within the step. Each consists of blocks.
 
@@ -400,8 +424,14 @@ class Islands:
     """[island + 1]"""
     block_start: wp.array(dtype=wp.int32)
     """[block + 1] first place of each in ``contact``."""
+    row_start: wp.array(dtype=wp.int32)
+    """[block + 1] first row of each in :class:`vinesim.kernels.contact.island_system.IslandSystem`: a multiple of eight."""
     matrix_start: wp.array(dtype=wp.int32)
     """[block + 1] first entry of its matrix in ``Rows.delassus``."""
+    rigid_start: wp.array(dtype=wp.int32)
+    """[island + 1] first entry of its rigid Jacobian in the same system."""
+    system_start: wp.array(dtype=wp.int32)
+    """[island + 1] first entry of its Newton steps in the same system."""
     contact: wp.array(dtype=wp.int32)
     """[place] contacts, island by island and block by block."""
     label: wp.array(dtype=wp.int32)
@@ -424,40 +454,19 @@ class Rows:
 
     plant_jacobian: wp.array2d(dtype=wp.float64)
     """[row, 12] of the body and of the other plant body, each linear and angular."""
-    rigid_jacobian: wp.array2d(dtype=wp.float64)
-    """[row, dof]"""
-    rigid_response: wp.array2d(dtype=wp.float64)
-    """[row, dof] M^-1 J^T: change of velocity of the rigid world for a unit impulse along the row."""
+    rigid_jacobian: wp.array2d(dtype=wp.vec3d)
+    """[contact, dof] of its three rows"""
+    rigid_response: wp.array2d(dtype=wp.vec3d)
+    """[contact, dof] M^-1 J^T: change of velocity of the rigid world for unit impulses along them."""
     delassus: wp.array(dtype=wp.float64)
-    """J M^-1 J^T of the plants [entry], a matrix of rows for each block."""
+    """J M^-1 J^T of the plants [entry], a matrix for each block, whose rows are filled up with zeros to a multiple of
+    eight."""
     velocity_free: wp.array(dtype=wp.float64)
     """[row] m/s along the row at the end of the step without contacts."""
     bias: wp.array(dtype=wp.float64)
     """[row] m/s"""
     impulse: wp.array(dtype=wp.float64)
     """[row] N s"""
-    rigid_velocity: wp.array(dtype=wp.float64)
-    """[dof] by which the impulses change the velocities of the rigid world."""
-
-
-@wp.struct
-class SolverScratch:
-    """What the solver of an island works with."""
-
-    matrix: wp.array(dtype=wp.float64)
-    """[entry] the linear system of a Newton step, block by block as ``Rows.delassus``, of its pressed contacts alone."""
-    pressed: wp.array(dtype=wp.int32)
-    """[contact] those of each block that press, from the block's first place in the list on."""
-    columns: wp.array2d(dtype=wp.float64)
-    """[row, 1 + dof of the island] its right-hand sides: velocities without impulses, and Jacobians of the dofs."""
-    rigid_system: wp.array2d(dtype=wp.float64)
-    """[dof, 1 + dof of the island] what is left of it for the rigid velocities, right-hand side first."""
-    impulse_first: wp.array(dtype=wp.float64)
-    """[row] N s before the first Newton step."""
-    impulse_before: wp.array(dtype=wp.float64)
-    """[row] N s before the last sweep."""
-    direction: wp.array(dtype=wp.float64)
-    """[row] N s, direction of search."""
 
 
 @wp.struct

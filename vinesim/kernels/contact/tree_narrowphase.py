@@ -8,7 +8,7 @@ contact in its tree follows from the pairs before its own, so that it is the sam
 import warp as wp
 
 from vinesim.kernels.contact.broadphase import aabbs_disjoint, sweep_capsule
-from vinesim.kernels.contact.narrowphase_rigid import add_pair
+from vinesim.kernels.contact.narrowphase_rigid import add_pairs
 from vinesim.kernels.contact.structs import (
     AABB_BLOCK,
     Aabbs,
@@ -32,8 +32,10 @@ class TreeContacts:
 
     count: wp.array(dtype=wp.int32)
     """of this step."""
-    near: wp.array(dtype=wp.vec3i)
-    """[k] scratch: capsules and geoms whose boxes overlap, in any order, and which pair of its tree each is."""
+    near: wp.array(dtype=wp.vec2i)
+    """[k] scratch: capsules and geoms whose boxes overlap, those of all trees in any order."""
+    near_place: wp.array(dtype=wp.int32)
+    """[k] which pair of its tree each is."""
     near_total: wp.array(dtype=wp.int32)
     """[1] number of these pairs."""
     near_count: wp.array(dtype=wp.int32)
@@ -76,7 +78,8 @@ def list_near_geoms(
                 if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
                     if near_count < room:
                         k = wp.atomic_add(tree_contacts_out.near_total, 0, 1)
-                        tree_contacts_out.near[k] = wp.vec3i(s, g, near_count)
+                        tree_contacts_out.near[k] = wp.vec2i(s, g)
+                        tree_contacts_out.near_place[k] = near_count
                     near_count = near_count + 1
     return near_count
 
@@ -146,12 +149,11 @@ def find_contacts_of_pairs(
 ):
     """Contacts of every so-manieth near pair: those of pair i of a tree are its candidates 2 i and 2 i + 1."""
     for k in range(thread, tree_contacts_out.near_total[0], threads):
-        pair = tree_contacts_out.near[k]
-        tree = pair[0] % trees
-        i = pair[2]
-        end, is_impact = add_pair(
-            is_round, tree, 2 * i, pair[0], pair[1], parameters, capsules, geoms, bodies, capsule_states, rigid, hulls,
-            geom_states, candidates_out,
+        tree = tree_contacts_out.near[k][0] % trees
+        i = tree_contacts_out.near_place[k]
+        end, is_impact = add_pairs(
+            is_round, tree, 2 * i, tree_contacts_out.near, k, 1, 1, parameters, capsules, geoms, bodies, capsule_states,
+            rigid, hulls, geom_states, candidates_out,
         )  # fmt: skip
         tree_contacts_out.found[i * trees + tree] = end - 2 * i
         if is_impact:

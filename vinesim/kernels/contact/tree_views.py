@@ -108,7 +108,6 @@ def view_rows(s: Rows, tree: int, trees: int):
         view_double(s.velocity_free, tree, trees),
         view_double(s.bias, tree, trees),
         view_double(s.impulse, tree, trees),
-        s.rigid_velocity,
     )
 
 

@@ -32,6 +32,8 @@ TREES_PER_CHUNK = {"boxes": 8, "rigid": 2, "plants": 4}
 """Trees that a thread takes at a time: work of 3 to 8 us. DERIVED from the times of one tree of 17 bodies."""
 MAX_PASSING_BUNCHES = 4
 """Picked bunches that can pass through one tree at once; a further one touches it at once."""
+PAIRS_AT_ONCE = 64
+"""Pairs of capsules and geoms of one tree that are looked at in one go."""
 MIN_TREE_ROOM = 64
 """Rows of the candidates that are allocated at least; more when more trees are awake."""
 
@@ -88,6 +90,7 @@ class ContactDetection:
         self.candidates = SharedArrays.zeros(
             structs.Candidates, trees, slots, count=np.zeros(trees, np.int32), is_impact=np.zeros(trees, np.bool_),
             near_geoms=np.zeros((trees, near), np.int32), skipped_geoms=np.zeros(trees, np.int32),
+            near_pairs=np.zeros((trees * PAIRS_AT_ONCE, 2), np.int32),
         )  # fmt: skip
         self._bind_launches()
 

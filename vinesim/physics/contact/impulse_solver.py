@@ -13,6 +13,7 @@ import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
+from vinesim.kernels.contact.island_system import IslandSystem
 from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
 from vinesim.physics.contact.deflected_wires import DeflectedWires, WireContacts
@@ -55,12 +56,12 @@ class ImpulseSolver:
         slots = {"body_slot": response.body_slot, "other_slot": response.other_slot}
         self.contacts = SharedArrays.zeros(structs.Contacts, n, **slots)
         self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
-        listed = {"body": response.body, "tree_start": response.tree_start}
+        listed = {"body": response.body, "tree_end": response.tree_end}
         self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1, **listed)
         self._island_arrays = {
             name: np.zeros(n + 1, np.int32)
-            for name in ("start", "first_block", "block_start", "matrix_start", "contact", "label", "block_label",
-                         "first_dof", "sweeps")
+            for name in ("start", "first_block", "block_start", "row_start", "matrix_start", "rigid_start",
+                         "system_start", "contact", "label", "block_label", "first_dof", "sweeps")
         }  # fmt: skip
         self._items = np.arange(3 * n, dtype=np.int32)
         self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
@@ -70,11 +71,15 @@ class ImpulseSolver:
             "bias": np.zeros(3 * n),
             "impulse": np.zeros(3 * n),
         }
-        self._rigid_spans, self._most_rows, self._columns = np.zeros((n, 2), np.int32), 0, 0
+        self._place_arrays = {
+            "friction": np.zeros(n), "compliance": np.zeros(n), "own": np.zeros((n, 3, 3)), "mass": np.zeros((n, 2)),
+            "pressed": np.zeros(n, np.int32),
+        }  # fmt: skip
+        for name in ("free", "impulse", "impulse_first", "impulse_before", "direction"):
+            self._place_arrays[name] = np.zeros(10 * n)  # a block of one contact has eight rows
+        self._rigid_spans, self._most_contacts, self._columns = np.zeros((n, 2), np.int32), 0, 0
         """[contact, 2] From which degree of freedom to which its rows of rigid bodies may be other than 0; the most
-        rows of one solve, and how long they are."""
-        self._dofs = slice(0, 0)
-        """From the first degree of freedom in contact to the last."""
+        contacts of one solve, and how long their rows are."""
         self._memory: dict[str, np.ndarray] = {}
         """See :meth:`_kept`."""
         self._wrench = np.zeros((2 * n, 6))
@@ -86,6 +91,8 @@ class ImpulseSolver:
         """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
         self.island_count = 0
         """Islands of the last solve."""
+        self._padded_rows = 0
+        """Rows of all blocks of the last solve, those that fill them up included."""
         self.unfinished = 0
         """How often an island of a solve ended at the largest number of sweeps, perhaps not within its tolerance."""
 
@@ -116,27 +123,29 @@ class ImpulseSolver:
         The large ones lie in memory that is kept: new pages took 4 ms when an actor joined. Every solve overwrites what
         it reads of them; rows of rigid bodies are 0 outside of their spans.
         """
-        world, rows = self.rigid.mj_model, 3 * self.capacity
+        world = self.rigid.mj_model
         for name in ("rigid_jacobian", "rigid_response"):
             if name in self._memory:
-                self._memory[name][: self._most_rows * self._columns] = 0.0
-        self._rigid_spans[:] = self._most_rows = 0
+                self._memory[name][: 3 * self._most_contacts * self._columns] = 0.0
+        self._rigid_spans[:] = self._most_contacts = 0
         self._columns = world.nv
         self.rows = SharedArrays(
             structs.Rows,
-            rigid_jacobian=self._kept("rigid_jacobian", (rows, world.nv)),
-            rigid_response=self._kept("rigid_response", (rows, world.nv)),
-            rigid_velocity=np.zeros(world.nv),
+            rigid_jacobian=self._kept("rigid_jacobian", (self.capacity, world.nv, 3)),
+            rigid_response=self._kept("rigid_response", (self.capacity, world.nv, 3)),
             delassus=self._matrix,
             **self._row_arrays,
         )
-        self.scratch = SharedArrays(
-            structs.SolverScratch,
+        self.system = SharedArrays(
+            IslandSystem,
+            **self._place_arrays,
+            jacobian=self._kept("jacobian", (self.capacity * world.nv, 3)),
+            response=self._kept("response", (self.capacity * world.nv, 3)),
+            velocity=np.zeros(world.nv),
+            rigid_force=np.zeros(world.nv),
             matrix=self._kept("matrix", self._matrix.shape),
-            pressed=np.zeros(self.capacity, np.int32),
-            columns=self._kept("columns", (rows, 1 + world.nv)),
-            rigid_system=np.zeros((world.nv, 1 + world.nv)),
-            **{name: self._kept(name, (rows,)) for name in ("impulse_first", "impulse_before", "direction")},
+            solution=self._kept("solution", (self.capacity * (1 + world.nv), 3)),
+            rigid_matrix=np.zeros((world.nv, 1 + world.nv)),
         )
         labels = np.zeros(2 * world.ntree, np.int32)  # see EffectiveMass.island_labels
         dofs = np.zeros(world.nv, np.int32)
@@ -163,34 +172,30 @@ class ImpulseSolver:
 
     def solve(self, count: int, counters: np.ndarray) -> None:
         """Find the impulses of the first ``count`` contacts, and what they do to either side."""
-        n, row_count = count, 3 * count
+        n = count
         self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
         self._build_islands(1)
-        if counters[structs.MATRIX_ENTRIES] > len(self._matrix):
-            self._matrix = np.zeros(2 * int(counters[structs.MATRIX_ENTRIES]))
-            self._allocate()
-            self.bind_launches(self._detection)
+        if self._make_room(counters):
             self._build_islands(1)
-        rows, touched, island_count = self.rows, int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
+        touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
+        self._padded_rows = int(self.islands.row_start[counters[structs.BLOCKS]])
         self.bodies = self.touched.body[:touched].copy()
-        self._most_rows = max(self._most_rows, row_count)
+        self._most_contacts = max(self._most_contacts, n)
         if self._wires is not None:
             self._end_at_wires(n, self._wires)
         self._write_contact_rows(n)
 
-        self.response.compute(n)
+        self.response.compute(int(counters[structs.GROUPS]))
         is_constrained = bool(self.rigid.mj_data.nefc) and self.rigid.is_constrained(self._touched_rigid_bodies(n))
         if is_constrained:
             self._rigid_spans[:n] = 0, self.rigid.mj_model.nv
-            response = self.rigid.impulse_response(rows.rigid_jacobian[:row_count])
-            rows.rigid_response[:row_count] = response.T
+            self._respond_constrained(by_rows(self.rows.rigid_jacobian[:n]))
         else:
             self._respond_rigidly(n)
         self._assemble_delassus(n)
+        self.rigid_force = self.system.rigid_force
+        self.rigid_force.fill(0.0)
         self._solve_islands(island_count)
-        used = self.islands.dof[: self.islands.first_dof[island_count]]
-        self._dofs = slice(int(used.min()), int(used.max()) + 1) if len(used) else slice(0, 0)
-        self._set_rigid_force(row_count)
         if is_constrained:
             self._follow_constraints(n, island_count)
         self.island_count = island_count
@@ -201,14 +206,24 @@ class ImpulseSolver:
         self._accumulate_wrenches(1)
         self.wrenches = self._wrench[:touched].copy()
 
+    def _make_room(self, counters: np.ndarray) -> bool:
+        """Make room for the matrices and responses of the listed contacts; whether they must be listed again."""
+        larger = int(counters[structs.MATRIX_ENTRIES]) > len(self._matrix)
+        if larger:
+            self._matrix = np.zeros(2 * int(counters[structs.MATRIX_ENTRIES]))
+            self._allocate()
+        if self.response.make_room(int(counters[structs.RESPONSE_NUMBERS])) or larger:
+            self.bind_launches(self._detection)
+        return larger
+
     def _end_at_wires(self, count: int, wires: WireContacts) -> None:
         """Find the springs of the wires that are in contact."""
         contacts, candidates = self.contacts, self._detection.candidates
         piece = self.rigid_arrays.wire_of_geom[np.maximum(contacts.other[:count], -1)]
-        at = self._at_wires = np.flatnonzero(piece >= 0)
         contacts.wire_stiffness[:count] = contacts.wire_shift[:count] = 0.0
-        if len(at) == 0:
+        if piece.max() < 0:
             return
+        at = self._at_wires = np.flatnonzero(piece >= 0)
         row, slot = np.divmod(contacts.source[at], candidates.feature.shape[1])
         body, point, normal = contacts.body[at], candidates.point[row, slot], candidates.normal[row, slot]
         free, arm = self.plants.velocity_free[body], point - self.plants.state.body_q[body, :3]
@@ -227,11 +242,11 @@ class ImpulseSolver:
             share = contacts.stiffness[at] * dt + contacts.damping[at]
             wires.add_presses(force, -(force / share + self.rows.bias[3 * at]))
 
-    def _set_rigid_force(self, row_count: int) -> None:
-        rows, dofs = self.rows, self._dofs
-        self.rigid_force = force = np.zeros(self.rigid.mj_model.nv)
-        impulse = rows.impulse[:row_count] @ rows.rigid_jacobian[:row_count, dofs]
-        force[dofs] = impulse / -self.parameters.dt
+    def _respond_constrained(self, jacobian: np.ndarray) -> np.ndarray:
+        """Take over the response of rigid bodies that MuJoCo's constraints bind, and return it [row, dof]."""
+        response = self.rigid.impulse_response(jacobian).T
+        self.rows.rigid_response[: len(response) // 3] = response.reshape(-1, 3, response.shape[1]).transpose(0, 2, 1)
+        return response
 
     def _follow_constraints(self, count: int, island_count: int) -> None:
         """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve took them to.
@@ -241,10 +256,11 @@ class ImpulseSolver:
         with the tangent stiffness of the constraints under them. The impulses of the round with the least error are
         kept.
         """
-        rows, row_count, p = self.rows, 3 * count, self.parameters
-        jacobian, response = rows.rigid_jacobian[:row_count], rows.rigid_response[:row_count]
+        rows, system, row_count, p = self.rows, self.system, 3 * count, self.parameters
+        jacobian, response = by_rows(rows.rigid_jacobian[:count]), by_rows(rows.rigid_response[:count])
         impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
-        kept = (impulse, velocity_free, response, rows.rigid_velocity)
+        of_islands = system.impulse[: self._padded_rows]
+        kept = (impulse, velocity_free, of_islands, system.velocity, system.rigid_force)
         free, best, best_error, error = self.rigid.velocity_free, (), np.inf, np.inf
         for round_number in range(p.solver_constraint_steps + 1):
             assert self.rigid_force is not None
@@ -257,16 +273,13 @@ class ImpulseSolver:
                 best, best_error = tuple(values.copy() for values in kept), error
             if round_number == p.solver_constraint_steps:
                 break
-            response[:] = self.rigid.impulse_response(jacobian).T
+            response = self._respond_constrained(jacobian)
             free_before, free = free, velocity + impulse @ response
             velocity_free -= jacobian @ (free - free_before)
-            self._assemble_delassus(count)
             self._solve_islands(island_count)
-            self._set_rigid_force(row_count)
         if error > best_error:
             for values, those in zip(kept, best, strict=True):
                 values[:] = those
-            self._set_rigid_force(row_count)
 
     def _touched_rigid_bodies(self, count: int) -> np.ndarray:
         """MuJoCo's bodies [k] on the other side of the first ``count`` contacts, once for each."""
@@ -280,7 +293,9 @@ class ImpulseSolver:
         capsules, bodies = self.arrays.capsules.struct, self.arrays.bodies.struct
         geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
         candidates, contacts = detection.candidates.struct, self.contacts.struct
-        groups, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
+        island_lists, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
+        system, side_groups = self.system.struct, self.response.groups.struct
+        response = share(self.response.numbers, wp.float32)
         counters, touched = share(detection.counters, wp.int32), self.touched.struct
         self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
         items = share(self._items, wp.int32)
@@ -294,7 +309,7 @@ class ImpulseSolver:
         self._build_islands = bind_launch(
             islands.build_islands,
             [capsules, geoms, bodies, rigid_bodies, candidates],
-            [counters, touched, contacts, groups],
+            [counters, touched, contacts, island_lists, side_groups],
         )
         self._write_contact_rows = bind_shared(
             jacobians.write_contact_rows,
@@ -306,17 +321,22 @@ class ImpulseSolver:
             delassus.respond_rigidly, [geoms], [rigid_bodies, rigid.factors.struct, contacts], [rows]
         )
         self._assemble_delassus = bind_shared(
-            delassus.assemble_delassus, [], [contacts, touched, groups, self.response.sides], [rows]
+            delassus.assemble_delassus, [], [contacts, touched, island_lists, side_groups, response], [rows]
         )
         self._solve_islands = bind_shared(
             projected_gauss_seidel.solve_islands,
-            [p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
-            [rigid_bodies, contacts],
-            [groups, self.scratch.struct, rows],
+            [parameters, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
+            [contacts],
+            [island_lists, system, rows],
         )
         self._store_warm_start = bind_shared(
-            forces.store_warm_start, [parameters, geoms], [rigid_bodies, groups, rows], [contacts, warm_start]
+            forces.store_warm_start, [parameters], [island_lists, system, rows], [contacts, warm_start]
         )
         self._accumulate_wrenches = bind_launch(
             forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
         )
+
+
+def by_rows(jacobian: np.ndarray) -> np.ndarray:
+    """A rigid Jacobian [contact, dof, 3] as rows [row, dof]."""
+    return jacobian.transpose(0, 2, 1).reshape(-1, jacobian.shape[1])

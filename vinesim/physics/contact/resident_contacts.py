@@ -210,7 +210,7 @@ class ResidentContacts:
         self._warm_start = self._allocated(structs.WarmStart, of_all, {})
         of_trees = dict.fromkeys(tree_narrowphase.TreeContacts.vars, trees)
         of_trees |= dict.fromkeys(("near_total", "busy_count"), 1) | {"loaded": trees * slots}
-        of_trees |= dict.fromkeys(("near", "found"), trees * pairs)
+        of_trees |= dict.fromkeys(("near", "near_place", "found"), trees * pairs)
         self._tree_contacts = self._allocated(tree_narrowphase.TreeContacts, of_trees, {})
         self._response = self._allocated(tree_delassus.ResponseRows, dict.fromkeys(("a", "alpha"), trees * slots), {})
         self._was_in_contact = self._zeros(wp.bool, trees)

@@ -7,56 +7,79 @@ import warp as wp
 
 from vinesim.kernels.articulation.structs import ArticulationModel, Factors
 from vinesim.kernels.contact import row_response
+from vinesim.kernels.contact.structs import SideGroups
 from vinesim.kernels.launch import BoundLaunch, join_partitions
-from vinesim.physics.contact.warp_arrays import share, zeros
+from vinesim.physics.contact.warp_arrays import SharedArrays
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
-SIDES_PER_CHUNK = 16
-"""Sides of contacts that a thread takes at a time: work of 5 us."""
+NUMBERS_PER_CONTACT = 256
+"""Room for responses is made for so many numbers a contact, and more when there are more."""
+GROUPS_PER_CHUNK = 2
+"""Groups of sides that a thread takes at a time: work of 4 us."""
+ROWS_ON_A_GPU = 256
+"""Groups that a GPU works on at once."""
 
 
 class RowResponse:
     """Response of the plants to unit impulses along the rows of up to so many contacts.
 
-    The device of the plants reaches ``jacobian`` [row, 12], the lists ``body`` and ``tree_start`` [slot] of the plant
-    bodies in contact, and ``body_slot`` and ``other_slot`` [contact], which the contact kernels fill.
+    The device of the plants reaches ``jacobian`` [row, 12], the lists ``body`` and ``tree_end`` [slot] of the plant
+    bodies in contact, ``body_slot`` and ``other_slot`` [contact], and ``groups`` of sides, all of which the contact
+    kernels fill.
     """
 
     def __init__(self, plants: ArticulationSolver, contacts: int) -> None:
         self.plants, buffers = plants, plants.buffers
         self.jacobian = buffers.pinned(np.zeros((3 * contacts, 12)))
-        self.body, self.tree_start = (buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for _ in range(2))
+        self.body, self.tree_end = (buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for _ in range(2))
         self.body_slot, self.other_slot = (buffers.pinned(np.zeros(contacts, np.int32)) for _ in range(2))
-        self.sides = row_response.SideRows()
-        """See :class:`vinesim.kernels.contact.row_response.SideRows`; for kernels on the CPU."""
-        there = row_response.SideRows()
-        size, matrix = buffers.max_tree_size, wp.mat33
-        for name, shape in {"force": (), "moment": (), "linear": (size,), "angular": (size,)}.items():
-            data = buffers.pinned(zeros(matrix, (2 * contacts, *shape)))
-            setattr(self.sides, name, share(data, matrix))
-            setattr(there, name, buffers.reach(data, matrix, name))
-        lists = (self.body, self.tree_start, self.body_slot, self.other_slot)
-        arrays = (
-            wp.array(np.arange(2 * contacts), dtype=wp.int32, device=buffers.device),
-            *(buffers.reach(data, wp.int32, "list of responses") for data in lists),
-            buffers.reach(self.jacobian, wp.float64, "jacobian"),
-            plants.launches.fill(Factors),
-        )
-        slots, pool = wp.array(buffers.slots, dtype=wp.int32, device=buffers.device), plants.launch_pool
+        lists = {name: buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for name in SideGroups.vars}
+        self.groups = SharedArrays(SideGroups, **lists)
+        self._contacts, self._there = contacts, SideGroups()
+        for name, data in lists.items():
+            setattr(self._there, name, buffers.reach(data, wp.int32, name))
+        self.numbers = np.zeros(0, np.float32)
+        """Response of each group, see :class:`vinesim.kernels.contact.structs.SideGroups`."""
+        self.make_room(NUMBERS_PER_CONTACT * contacts)
 
-        def bind(scratch_rows: int) -> BoundLaunch:
+    def make_room(self, numbers: int) -> bool:
+        """Whether ``numbers`` had to be made anew, for so many of them."""
+        if numbers <= len(self.numbers):
+            return False
+        self.numbers = self.plants.buffers.pinned(np.zeros(2 * numbers, np.float32))
+        self._bind()
+        return True
+
+    def _bind(self) -> None:
+        plants, buffers = self.plants, self.plants.buffers
+        given = [buffers.reach(data, wp.int32, "list of responses")
+                 for data in (self.body, self.tree_end, self.body_slot, self.other_slot)]  # fmt: skip
+        items = wp.array(np.arange(2 * self._contacts), dtype=wp.int32, device=buffers.device)
+        slots, size = wp.array(buffers.slots, dtype=wp.int32, device=buffers.device), buffers.max_tree_size
+        jacobian = buffers.reach(self.jacobian, wp.float64, "jacobian")
+        numbers = buffers.reach(self.numbers, wp.float32, "response")
+        self._rows = 1 if buffers.device.is_cpu else ROWS_ON_A_GPU
+
+        def bind() -> BoundLaunch:
             scratch = row_response.ResponseScratch()
-            for name in row_response.ResponseScratch.vars:
-                setattr(scratch, name, wp.empty(scratch_rows * size, dtype=matrix, device=buffers.device))
+            scratch.is_on_path = wp.empty(self._rows * size, dtype=wp.bool, device=buffers.device)
+            scratch.values = wp.empty(
+                self._rows * size * row_response.BODY_NUMBERS, dtype=wp.float32, device=buffers.device
+            )
             return plants.launches.record(
-                row_response.respond_to_sides, plants.launches.fill(ArticulationModel), size, scratch_rows, slots,
-                *arrays, scratch, there, index_list="items",
+                row_response.respond_to_groups, plants.launches.fill(ArticulationModel), size, self._rows, slots,
+                items, *given, jacobian, self._there, plants.launches.fill(Factors), scratch, numbers,
+                index_list="items",
             )  # fmt: skip
 
-        launches = [bind(1 if buffers.device.is_cpu else 2 * contacts) for _ in range(pool.size)]
-        self._respond = pool.share([join_partitions(launches)], SIDES_PER_CHUNK)
+        pool = plants.launch_pool
+        self._respond = pool.share([join_partitions([bind() for _ in range(pool.size)])], GROUPS_PER_CHUNK)
 
-    def compute(self, contacts: int) -> None:
-        """Fill :attr:`sides` of the first ``contacts``; all touch trees of the last prediction, and belong to it."""
-        self._respond(2 * contacts)
+    def compute(self, groups: int) -> None:
+        """Fill :attr:`numbers` of the first ``groups``; all touch trees of the last prediction, and belong to it."""
+        if self.plants.buffers.device.is_cpu:
+            self._respond(groups)
+            return
+        for first in range(0, groups, self._rows):
+            self._respond(min(self._rows, groups - first), first)
         self.plants.buffers.synchronize()

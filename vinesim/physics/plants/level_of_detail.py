@@ -22,7 +22,7 @@ class LevelOfDetail:
         p = parameters
         self.plants, self.rest_rate = plants, p.detail_rate
         self.fine_steps, self.rest_steps = p.steps(p.detail_duration), p.steps(p.detail_rest_duration)
-        """Steps that a tree stays fine with no actor near, and that its clusters must be at rest."""
+        """Steps that a tree stays fine with no actor near, and that its clusters must be at rest by then."""
         model = plants.model
         trees = len(model.tree_first)
         self._clustered = np.flatnonzero(model.bunch_clusters > 0)
@@ -59,20 +59,28 @@ class LevelOfDetail:
         if len(self._points):
             seen = self._seen()
             wanted = np.union1d(wanted, seen) if len(seen) else wanted
-        fine = self.fine_trees
-        if len(fine):
-            self._wanted[wanted] = True
-            alone = self._alone[fine] = np.where(self._wanted[fine], 0, self._alone[fine] + 1)
-            self._wanted[wanted] = False
-            still = self._still[fine] = np.where(self._rate(fine) < self.rest_rate, self._still[fine] + 1, 0)
-            is_done = (alone > self.fine_steps) & (still >= self.rest_steps)
+        if len(left := self._left_alone(wanted)):
+            self._alone[left] += 1
+            self._still[left] = np.where(self._rate(left) < self.rest_rate, self._still[left] + 1, 0)
+            is_done = (self._alone[left] > self.fine_steps) & (self._still[left] >= self.rest_steps)
             if is_done.any():
-                coarsened = fine[is_done]
+                coarsened = left[is_done]
                 plants.coarsen(coarsened)
-        if len(wanted) and len(fresh := wanted[~state.tree_fine[wanted]]):
-            self._alone[fresh] = self._still[fresh] = 0
-            plants.refine(fresh)
+        if len(wanted):
+            self._alone[wanted] = self._still[wanted] = 0
+            if not state.tree_fine[wanted].all():
+                plants.refine(wanted[~state.tree_fine[wanted]])
         return coarsened
+
+    def _left_alone(self, wanted: np.ndarray) -> np.ndarray:
+        """Fine trees [k] that are not ``wanted``."""
+        fine = self.fine_trees
+        if len(fine) == 0:
+            return fine
+        self._wanted[wanted] = True
+        left = fine[~self._wanted[fine]]
+        self._wanted[wanted] = False
+        return left
 
     def _seen(self) -> np.ndarray:
         """Awake trees [k] with a bunch near a watched point; poses are those of the last tick's start."""

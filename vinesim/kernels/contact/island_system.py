@@ -1,0 +1,281 @@
+"""The contacts of an island as its solver works on them: a dense system, gathered once a solve.
+
+v = free + B x + J_r w: B x is what impulses do to plants, by a matrix for each block of contacts that plants couple;
+w = G x, with G = H^-1 J_r^T, are the changes of the velocities of rigid bodies, which couple the blocks. Here these have
+columns for the degrees of freedom of the island alone, and what does not change from sweep to sweep is computed once.
+
+Contacts come in the order of the list of islands, so that a block is a stretch of memory. Its rows are filled up with
+zeros to a multiple of eight, so that native loops take eight at a time and have no rest. No product is fused: the results
+do not depend on how wide the vectors of a CPU are.
+"""
+
+import warp as wp
+
+from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Rows
+
+wp.set_module_options({"enable_backward": False})
+
+EIGHT = "typedef double Eight __attribute__((vector_size(64), aligned(8)));"
+"""Native code: eight numbers that are computed at once; wider than the vectors of most CPUs, which then take two or four."""
+
+
+@wp.struct
+class IslandSystem:
+    """What the solver of an island works with, by place in the list of islands, or by row of its padded blocks."""
+
+    friction: wp.array(dtype=wp.float64)
+    """[place] 1"""
+    compliance: wp.array(dtype=wp.float64)
+    """[place] 1/kg"""
+    own: wp.array(dtype=wp.mat33d)
+    """[place] 1/kg, velocities along the rows of a contact by impulses along them; plants, rigid bodies and compliance."""
+    mass: wp.array(dtype=wp.vec2d)
+    """[place] kg, by which a velocity along the normal, or along a tangent, becomes an impulse of Gauss-Seidel."""
+    free: wp.array(dtype=wp.float64)
+    """[row] m/s without impulses, bias included."""
+    impulse: wp.array(dtype=wp.float64)
+    """[row] N s"""
+    impulse_first: wp.array(dtype=wp.float64)
+    """[row] N s before the first Newton step."""
+    impulse_before: wp.array(dtype=wp.float64)
+    """[row] N s before the last sweep."""
+    direction: wp.array(dtype=wp.float64)
+    """[row] N s, direction of search."""
+    jacobian: wp.array(dtype=wp.vec3d)
+    """[entry] J_r of each contact in turn, its three rows by degrees of freedom of the island."""
+    response: wp.array(dtype=wp.vec3d)
+    """[entry] G^T, in the same way."""
+    velocity: wp.array(dtype=wp.float64)
+    """[place of dof] w: by which the impulses change the velocities of rigid bodies."""
+    rigid_force: wp.array(dtype=wp.float64)
+    """[dof of MuJoCo] N or N m, generalised force of all contacts on rigid bodies; 0 where there is none."""
+    pressed: wp.array(dtype=wp.int32)
+    """[place] contacts of each block that press, by their numbers in the block, from its first place on."""
+    matrix: wp.array(dtype=wp.float64)
+    """[entry] the linear system of a Newton step, of one block of an island after the other; right-hand sides first."""
+    solution: wp.array(dtype=wp.vec3d)
+    """[entry] its solution of each contact in turn: impulses for w = 0, and their change with each entry of w."""
+    rigid_matrix: wp.array2d(dtype=wp.float64)
+    """[place of dof, 1 + dof of the island] what is left of it for w, right-hand side first."""
+
+
+@wp.func_native(
+    EIGHT
+    + """
+    const double* const entry = matrix.data + at;
+    const double* const x = impulse.data + row;
+    Eight n = {}, u = {}, v = {};
+    for (int i = 0; i < pitch; i += 8) {
+        const Eight given = *(const Eight*)(x + i);
+        n += *(const Eight*)(entry + i) * given;
+        u += *(const Eight*)(entry + pitch + i) * given;
+        v += *(const Eight*)(entry + 2 * pitch + i) * given;
+    }
+    const auto sum = [](Eight s) { return ((s[0] + s[4]) + (s[2] + s[6])) + ((s[1] + s[5]) + (s[3] + s[7])); };
+    return wp::vec3d(sum(n), sum(u), sum(v));
+"""
+)
+def block_velocity(
+    matrix: wp.array(dtype=wp.float64), at: int, pitch: int, impulse: wp.array(dtype=wp.float64), row: int
+) -> wp.vec3d:
+    """Velocities [m/s] along three rows, whose matrix entries begin at ``at``, by the impulses of their block, which begin
+    at ``row``."""
+    ...
+
+
+@wp.func_native("""
+    for (int i = 0; i < count; ++i) value += jacobian.data[at + i] * velocity.data[first + i];
+    return value;
+""")
+def add_rigid_velocity(
+    value: wp.vec3d, jacobian: wp.array(dtype=wp.vec3d), at: int, velocity: wp.array(dtype=wp.float64), first: int,
+    count: int,
+) -> wp.vec3d:  # fmt: skip
+    """Add the velocities [m/s] along three rows by those of ``count`` degrees of freedom."""
+    ...
+
+
+@wp.func_native("""
+    for (int i = 0; i < count; ++i) velocity.data[first + i] += dot(response.data[at + i], impulse);
+""")
+def push_rigid_bodies(
+    impulse: wp.vec3d, response: wp.array(dtype=wp.vec3d), at: int, velocity: wp.array(dtype=wp.float64), first: int,
+    count: int,
+):  # fmt: skip
+    """Change the velocities of ``count`` degrees of freedom by impulses [N s] along three rows."""
+    ...
+
+
+@wp.func
+def three(row: int, values: wp.array(dtype=wp.float64)):
+    """Three numbers from ``row`` on."""
+    return wp.vec3d(values[row], values[row + 1], values[row + 2])
+
+
+@wp.func
+def set_three(row: int, value: wp.vec3d, values_out: wp.array(dtype=wp.float64)):
+    """Set three numbers from ``row`` on."""
+    values_out[row] = value[0]
+    values_out[row + 1] = value[1]
+    values_out[row + 2] = value[2]
+
+
+@wp.func
+def block_pitch(block: int, islands: Islands):
+    """Rows of a block, those that fill it up included: the pitch of its matrix."""
+    return islands.row_start[block + 1] - islands.row_start[block]
+
+
+@wp.func
+def island_dofs(island: int, islands: Islands):
+    """Degrees of freedom of the rigid bodies of an island."""
+    return islands.first_dof[island + 1] - islands.first_dof[island]
+
+
+@wp.func
+def rigid_entry(place: int, island: int, islands: Islands):
+    """Where the rigid Jacobian of a contact begins."""
+    return islands.rigid_start[island] + (place - islands.start[island]) * island_dofs(island, islands)
+
+
+@wp.func
+def solution_entry(place: int, island: int, islands: Islands):
+    """Where the solution of a contact begins, a column longer than its rigid Jacobian."""
+    return rigid_entry(place, island, islands) + place
+
+
+@wp.func
+def contact_velocity(
+    place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system: IslandSystem
+):
+    """Velocities [m/s] along the rows of a contact by all impulses of its island."""
+    pitch = block_pitch(block, islands)
+    k = 3 * (place - islands.block_start[block])
+    start = islands.row_start[block]
+    value = block_velocity(matrix, islands.matrix_start[block] + k * pitch, pitch, system.impulse, start)
+    return add_rigid_velocity(
+        value, system.jacobian, rigid_entry(place, island, islands), system.velocity, islands.first_dof[island],
+        island_dofs(island, islands),
+    )  # fmt: skip
+
+
+@wp.func
+def contact_residual(
+    place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system: IslandSystem
+):
+    """The same with velocity without impulses, bias and compliance: what is 0 along rows that press or stick."""
+    row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+    value = three(row, system.free) + system.compliance[place] * three(row, system.impulse)
+    return value + contact_velocity(place, block, island, islands, matrix, system)
+
+
+@wp.func
+def gather_rigid_rows(
+    c: int, place: int, island: int, geoms: Geoms, contacts: Contacts, islands: Islands, rows: Rows,
+    system_out: IslandSystem,
+):  # fmt: skip
+    """Gather J_r and G^T of a contact: zeros, unless its other side is a rigid body that moves."""
+    moves = bool(False)
+    if contacts.other[c] >= 0:
+        moves = geoms.dof[contacts.other[c]] >= 0
+    at = rigid_entry(place, island, islands)
+    first = islands.first_dof[island]
+    for k in range(island_dofs(island, islands)):
+        jacobian = wp.vec3d()
+        response = wp.vec3d()
+        if moves:
+            jacobian = rows.rigid_jacobian[c, islands.dof[first + k]]
+            response = rows.rigid_response[c, islands.dof[first + k]]
+        system_out.jacobian[at + k] = jacobian
+        system_out.response[at + k] = response
+
+
+@wp.func
+def gather_contact(
+    c: int, place: int, block: int, island: int, contacts: Contacts, islands: Islands, rows: Rows,
+    system_out: IslandSystem,
+):  # fmt: skip
+    """Gather the numbers of a contact, and compute what it does to itself; its rigid rows must be there."""
+    k = 3 * (place - islands.block_start[block])
+    row = islands.row_start[block] + k
+    pitch = block_pitch(block, islands)
+    entry = islands.matrix_start[block] + k * pitch + k
+    own = wp.mat33d()
+    for axis in range(3):
+        for other in range(3):
+            own[axis, other] = rows.delassus[entry + axis * pitch + other]
+        own[axis, axis] = own[axis, axis] + contacts.compliance[c]
+    at = rigid_entry(place, island, islands)
+    for i in range(island_dofs(island, islands)):
+        own = own + wp.outer(system_out.jacobian[at + i], system_out.response[at + i])
+    # with the larger eigenvalue of the tangential block a step of friction stays inside of the cone's convergence
+    mean = wp.float64(0.5) * (own[1, 1] + own[2, 2])
+    spread = wp.float64(0.5) * (own[1, 1] - own[2, 2])
+    one = wp.float64(1.0)
+    eigenvalue = mean + wp.sqrt(spread * spread + own[1, 2] * own[1, 2])
+    system_out.own[place] = own
+    system_out.mass[place] = wp.vec2d(one / own[0, 0], one / eigenvalue)
+    system_out.friction[place] = contacts.friction[c]
+    system_out.compliance[place] = contacts.compliance[c]
+    set_three(row, three(3 * c, rows.velocity_free) + three(3 * c, rows.bias), system_out.free)
+    set_three(row, three(3 * c, rows.impulse), system_out.impulse)
+
+
+@wp.func
+def update_rigid_velocity(island: int, islands: Islands, system_out: IslandSystem):
+    """Compute the velocities of the rigid bodies of an island anew from all its impulses."""
+    first = islands.first_dof[island]
+    dofs = island_dofs(island, islands)
+    for k in range(dofs):
+        system_out.velocity[first + k] = wp.float64(0.0)
+    if dofs > 0:
+        for block in range(islands.first_block[island], islands.first_block[island + 1]):
+            for place in range(islands.block_start[block], islands.block_start[block + 1]):
+                row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+                push_rigid_bodies(
+                    three(row, system_out.impulse), system_out.response, rigid_entry(place, island, islands),
+                    system_out.velocity, first, dofs,
+                )  # fmt: skip
+
+
+@wp.func
+def gather_island(
+    island: int, geoms: Geoms, contacts: Contacts, islands: Islands, rows: Rows, system_out: IslandSystem
+):
+    """Gather all contacts of an island, from the impulses in ``rows`` on."""
+    for block in range(islands.first_block[island], islands.first_block[island + 1]):
+        for place in range(islands.block_start[block], islands.block_start[block + 1]):
+            c = islands.contact[place]
+            gather_rigid_rows(c, place, island, geoms, contacts, islands, rows, system_out)
+            gather_contact(c, place, block, island, contacts, islands, rows, system_out)
+        used = islands.row_start[block] + 3 * (islands.block_start[block + 1] - islands.block_start[block])
+        for row in range(used, islands.row_start[block + 1]):
+            system_out.impulse[row] = wp.float64(0.0)
+    update_rigid_velocity(island, islands, system_out)
+
+
+@wp.func_native("""
+    for (int i = 0; i < count; ++i) force.data[dof.data[first + i]] -= dot(jacobian.data[at + i], impulse) / dt;
+""")
+def add_rigid_force(
+    impulse: wp.vec3d, dt: wp.float64, jacobian: wp.array(dtype=wp.vec3d), at: int, dof: wp.array(dtype=wp.int32),
+    first: int, count: int, force: wp.array(dtype=wp.float64),
+):  # fmt: skip
+    """Add what impulses [N s] along three rows exert on ``count`` degrees of freedom, listed from ``first`` on."""
+    ...
+
+
+@wp.func
+def scatter_impulses(island: int, dt: wp.float64, islands: Islands, system_out: IslandSystem, rows_out: Rows):
+    """Write the impulses of an island back to the rows of its contacts, and the force that rigid bodies feel of them."""
+    first = islands.first_dof[island]
+    dofs = island_dofs(island, islands)
+    for k in range(dofs):
+        dof = islands.dof[first + k]
+        system_out.rigid_force[dof] = wp.float64(0.0)
+    for block in range(islands.first_block[island], islands.first_block[island + 1]):
+        for place in range(islands.block_start[block], islands.block_start[block + 1]):
+            x = three(islands.row_start[block] + 3 * (place - islands.block_start[block]), system_out.impulse)
+            set_three(3 * islands.contact[place], x, rows_out.impulse)
+            at = rigid_entry(place, island, islands)
+            add_rigid_force(x, dt, system_out.jacobian, at, islands.dof, first, dofs, system_out.rigid_force)
