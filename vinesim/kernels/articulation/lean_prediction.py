@@ -117,9 +117,7 @@ def applied_terms(
                 p.dt, phi, axes, q, stiffness, damping, forces.root_turn[tree], forces.root_turn_rate[tree]
             ),
         )  # fmt: skip
-    J, H, M, bias, tension, _steady = own_terms(
-        p, phi, motion, mass, com, inertia, load, contact, falls, fall
-    )
+    J, H, M, bias, tension, _steady = own_terms(p, phi, motion, mass, com, inertia, load, contact, falls, fall)
     if area > 0.0:
         J_more, H_more, M_more, bias_more, tension_more = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
         J += J_more

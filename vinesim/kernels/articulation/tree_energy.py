@@ -54,7 +54,9 @@ def body_energy(
     velocity = wp.spatial_top(motion) + wp.cross(omega, arm)
     spin = wp.quat_rotate_inv(turn, omega)
     crossed = wp.vec3(spin[1] * spin[2], spin[2] * spin[0], spin[0] * spin[1])
-    kinetic = 0.5 * (mass * wp.dot(velocity, velocity) + wp.dot(inertia, wp.cw_mul(spin, spin))) + wp.dot(product, crossed)
+    kinetic = 0.5 * (mass * wp.dot(velocity, velocity) + wp.dot(inertia, wp.cw_mul(spin, spin))) + wp.dot(
+        product, crossed
+    )
     place = wp.transform_get_translation(pose)
     weight = mass * wp.dot(p.gravity, place + arm)
     elastic = spring_energy(stiffness, joint_q)
@@ -96,9 +98,7 @@ def tree_energy(
         elif parent != k - model.pitch:  # else the last body is the parent
             pose = bodies_out.body_q[parent]
             motion = bodies_out.body_qd[parent]
-        _axes, _lever, pose, motion = body_kinematics(
-            pose, motion, offset, rest, q, qd
-        )
+        _axes, _lever, pose, motion = body_kinematics(pose, motion, offset, rest, q, qd)
         energy += body_energy(k, p, model, forces, q, origin, pose, motion)
         bodies_out.body_q[k] = pose
         bodies_out.body_qd[k] = motion

@@ -124,10 +124,9 @@ def write_tree_rows(
 
 
 @wp.func
-def wrench_of_contact(c: int, body_q: wp.array(dtype=wp.transform), contacts: Contacts):
-    """Force and moment [N, N m] of one contact on its body."""
-    force = contacts.force[c]
-    lever = contacts.point[c] - to_double(wp.transform_get_translation(body_q[contacts.body[c]]))
+def wrench_at(pose: wp.transform, point: wp.vec3d, force: wp.vec3d):
+    """Force and moment [N, N m] at a body's origin of a force at a point [m]."""
+    lever = point - to_double(wp.transform_get_translation(pose))
     return wp.spatial_vector(to_single(force), to_single(wp.cross(lever, force)))
 
 
@@ -384,10 +383,12 @@ def apply_tree_impulses(
     for c in range(count):
         slip_u = system.velocity[3 * c + 1] - rows.bias[3 * c + 1]
         slip_v = system.velocity[3 * c + 2] - rows.bias[3 * c + 2]
-        store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts, warm_start)
         body = contacts.body[c]
+        point = contacts.point[c]
+        pose = body_q[body]
+        store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts, warm_start)
         loaded[c] = body
-        body_wrench_out[body] = body_wrench_out[body] + wrench_of_contact(c, body_q, contacts)
+        body_wrench_out[body] = body_wrench_out[body] + wrench_at(pose, point, contacts.force[c])
     apply_loaded_wrenches(
         tree, count, wp.float32(parameters.dt), model, is_branching, loaded, body_wrench_out, factors, work_out,
         scratch_out, prediction_out,

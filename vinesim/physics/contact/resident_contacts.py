@@ -33,7 +33,7 @@ FULL_BLOCK = 128
 """CUDA threads a block of kernels with several threads for each tree."""
 AABB_BLOCK = int(structs.AABB_BLOCK)
 DEFAULT_SLOTS = 8
-"""Contacts that one tree can have at once: 6 kB a tree."""
+"""Contacts that one tree can have at once: 10 kB a tree."""
 PAIRS_PER_SLOT = 4
 """Pairs of capsules and geoms whose boxes may overlap, for each contact that a tree can have."""
 FIRST_LANES = 16
@@ -218,7 +218,7 @@ class ResidentContacts:
     # ------------------------------------------------------------------ kernels
 
     def _bind(self) -> tuple[Launches, Launches, Launches]:
-        """Every kernel of a step, bound to its arrays, with its number of threads: before the solves, these, and after."""
+        """Every kernel of a step, bound to its arrays, with its number of threads: before the solves, these, after."""
         p, plants, trees = self.parameters, self.plants.launches, self._trees
         fill, s, arrays = plants.fill_resident, plant_structs, plants.resident_arrays
         device = str(self._device)
@@ -250,8 +250,8 @@ class ResidentContacts:
             bound(tree_islands.predict_impacted_trees, trees, plants.parameters, model, onset, contacts.is_impact,
                   forces, joints, arrays["phi_used"], arrays["tree_euler_steps"], bodies, factors, scratch, prediction),
             bound(tree_islands.write_tree_rows, entries * self.slots, parameters, self._pairs, capsules, geoms, trees,
-                  self.slots, self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts, self.contacts,
-                  self.rows),
+                  self.slots, self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts,
+                  self.contacts, self.rows),
             bound(tree_delassus.respond_at_contacts, trees, model, arrays["body_branches"], trees, factors,
                   self.contacts, self.rows, contacts, compliances, self._response),
             bound(tree_delassus.write_delassus, entries * self.slots, model, trees, width, factors, contacts,
@@ -267,8 +267,9 @@ class ResidentContacts:
         ]  # fmt: skip
         after = [
             bound(tree_islands.apply_tree_impulses, trees, parameters, model, arrays["body_branches"], onset, trees,
-                  width, self._bodies.q, self.rows, self._system, factors, self._was_in_contact, arrays["tree_euler_steps"], contacts,
-                  self.contacts, self._warm_start, arrays["body_wrench"], work, scratch, prediction),
+                  width, self._bodies.q, self.rows, self._system, factors, self._was_in_contact,
+                  arrays["tree_euler_steps"], contacts, self.contacts, self._warm_start, arrays["body_wrench"], work,
+                  scratch, prediction),
         ]  # fmt: skip
         return before, solves, after
 
@@ -280,7 +281,7 @@ class ResidentContacts:
         if self._beside is None:
             solve_most(of_most)
             solve_busy(of_busy)
-        else:  # side by side: few trees are busy, and each of them long
+        else:  # side by side: few trees are busy, but each of them for long
             with wp.ScopedStream(self._beside):
                 solve_busy(of_busy)
             solve_most(of_most)
