@@ -181,15 +181,13 @@ def eliminate_bodies(
             M += M_carried
             bias += bias_carried
             tension += tension_carried
-
         above = wp.spatial_vector()
         if parent == k - model.pitch:
             above = before
         elif parent >= 0:
             above = bodies.body_qd[parent]
-        turning = wp.spatial_bottom(above)
         metric, drive, _torque = joint_terms(
-            p.dt, phi, axes, q, qd, stiffness, damping, turning, wp.spatial_bottom(motion)
+            p.dt, phi, axes, q, qd, stiffness, damping, wp.spatial_bottom(above), wp.spatial_bottom(motion)
         )
         J = symmetric(J)
         M = symmetric(M)
@@ -204,7 +202,7 @@ def eliminate_bodies(
         carried = False
         if parent >= 0:
             J_left, H_left, M_left, bias_left = terms_left(
-                p, phi, turning, metric, lever, J, H, M, bias, tension, DJ, DH, Du
+                p, phi, wp.spatial_bottom(above), metric, lever, J, H, M, bias, tension, DJ, DH, Du
             )
             if parent == k - model.pitch:
                 carried = True
