@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from vinesim.kernels.articulation.kinematics import max_joint_rate, max_root_speed
+from vinesim.kernels.articulation.kinematics import max_rate_and_speed
 from vinesim.kernels.articulation.spatial import exponential
 from vinesim.kernels.articulation.structs import ArticulationModel, JointState, Prediction, SolverParameters
 
@@ -52,10 +52,10 @@ def integrate(
     size = model.tree_moving[tree]
     pitch = model.pitch
     dt = p.dt / float(substeps)
-    turning = max_joint_rate(prediction.joint_qd_free, first, size, pitch)
-    falling = max_root_speed(
-        joints.joint_x, prediction.joint_xd_free, model.body_parent, model.body_root, first, size, pitch
-    )
+    turning, falling = max_rate_and_speed(
+        prediction.joint_qd_free, joints.joint_x, prediction.joint_xd_free, model.body_parent, model.body_root, first,
+        size, pitch,
+    )  # fmt: skip
     most = wp.length(wp.vec2(turning, falling))
     tree_rate_out[tree] = most
     steps = wp.max(tree_euler_steps_out[tree] - 1, 0)
@@ -72,9 +72,15 @@ def integrate(
     if turning > p.max_rate:
         slower = 0.5 * p.max_rate / turning
     for k in range(first, first + size * pitch, pitch):
-        floats = model.body_parent[k] < 0 and model.body_root[k] >= 0
+        # all that a body needs is read before anything is asked: a GPU then waits for memory once
+        parent = model.body_parent[k]
+        root = model.body_root[k]
+        free = prediction.joint_qd_free[k]
+        rate_before = joints.joint_qd[k]
+        q = joints.joint_q[k]
+        floats = parent < 0 and root >= 0
         if sound:
-            rate = slower * prediction.joint_qd_free[k]
+            rate = slower * free
             share = phi
             if floats:
                 if model.body_falls[k]:  # no spring turns it: phi beyond 1/2 would only add error
@@ -83,12 +89,12 @@ def integrate(
                     (1.0 - share) * joints.joint_xd[k] + share * prediction.joint_xd_free[k]
                 )
                 joints_out.joint_xd[k] = prediction.joint_xd_free[k]
-            mean = (1.0 - share) * joints.joint_qd[k] + share * rate
+            mean = (1.0 - share) * rate_before + share * rate
             joints_out.joint_qd[k] = rate
-            joints_out.joint_q[k] = wp.normalize(exponential(dt * mean) * joints.joint_q[k])
+            joints_out.joint_q[k] = wp.normalize(exponential(dt * mean) * q)
         else:
             joints_out.joint_qd[k] = wp.vec3()
-            joints_out.joint_q[k] = joints.joint_q[k]
+            joints_out.joint_q[k] = q
             if floats:
                 joints_out.joint_xd[k] = wp.vec3()
                 joints_out.joint_x[k] = joints.joint_x[k]

@@ -21,7 +21,8 @@ def max_joint_rate(rates: wp.array(dtype=wp.vec3), first: int, size: int, pitch:
 
 
 @wp.func
-def max_root_speed(
+def max_rate_and_speed(
+    rates: wp.array(dtype=wp.vec3),
     places: wp.array(dtype=wp.vec3),
     speeds: wp.array(dtype=wp.vec3),
     body_parent: wp.array(dtype=wp.int32),
@@ -30,14 +31,20 @@ def max_root_speed(
     size: int,
     pitch: int,
 ):
-    """Fastest of the floating roots [m/s]; NaN, in a speed or a place, enters and stays."""
-    most = float(0.0)
+    """Fastest of some joint rates [rad/s], and of the floating roots [m/s]; NaN, in a place too, enters and stays."""
+    turning = float(0.0)
+    falling = float(0.0)
     for k in range(first, first + size * pitch, pitch):
-        if body_parent[k] < 0 and body_root[k] >= 0:
+        parent = body_parent[k]
+        root = body_root[k]
+        rate = wp.length(rates[k])
+        if rate > turning or rate != rate:
+            turning = rate
+        if parent < 0 and root >= 0:
             speed = wp.length(speeds[k]) + 0.0 * wp.length(places[k])
-            if speed > most or speed != speed:
-                most = speed
-    return most
+            if speed > falling or speed != speed:
+                falling = speed
+    return turning, falling
 
 
 @wp.func

@@ -33,71 +33,8 @@ from vinesim.kernels.articulation.structs import (
     SolverParameters,
     substep_parameters,
 )
-from vinesim.kernels.prefetch import (
-    AHEAD,
-    prefetch_bool,
-    prefetch_float,
-    prefetch_int,
-    prefetch_mat33,
-    prefetch_quat,
-    prefetch_spatial,
-    prefetch_transform,
-    prefetch_vec2i,
-    prefetch_vec3,
-)
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def prefetch_placed(k: int, model: ArticulationModel, joints: JointState, is_branching: wp.array(dtype=wp.bool)):
-    """Fetch what :func:`place_bodies` reads of body k."""
-    prefetch_int(model.body_parent, k)
-    prefetch_vec3(model.body_offset, k)
-    prefetch_quat(model.body_rest, k)
-    prefetch_quat(joints.joint_q, k)
-    prefetch_vec3(joints.joint_qd, k)
-    prefetch_bool(is_branching, k)
-
-
-@wp.func
-def prefetch_eliminated(
-    k: int, model: ArticulationModel, forces: AppliedForces, joints: JointState, bodies: BodyState, factors: Factors
-):
-    """Fetch what :func:`eliminate_bodies` reads of body k."""
-    prefetch_transform(bodies.body_q, k)
-    prefetch_spatial(bodies.body_qd, k)
-    prefetch_quat(factors.axes, k)
-    prefetch_vec3(factors.lever, k)
-    prefetch_quat(joints.joint_q, k)
-    prefetch_vec3(joints.joint_qd, k)
-    prefetch_int(model.body_parent, k)
-    prefetch_int(model.body_root, k)
-    prefetch_float(model.body_mass, k)
-    prefetch_vec3(model.body_com, k)
-    prefetch_vec3(model.body_inertia, k)
-    prefetch_vec3(model.body_product, k)
-    prefetch_float(model.body_drag, k)
-    prefetch_vec3(model.joint_stiffness, k)
-    prefetch_vec3(model.joint_damping, k)
-    prefetch_vec2i(model.tie_span, k)
-    prefetch_spatial(forces.body_load, k)
-    prefetch_spatial(forces.body_wrench, k)
-
-
-@wp.func
-def prefetch_accelerated(
-    k: int, model: ArticulationModel, joints: JointState, bodies: BodyState, factors: Factors, scratch: Scratch
-):
-    """Fetch what :func:`accelerate_tree` reads of body k."""
-    prefetch_int(model.body_parent, k)
-    prefetch_spatial(bodies.body_qd, k)
-    prefetch_vec3(factors.lever, k)
-    prefetch_quat(factors.axes, k)
-    prefetch_vec3(joints.joint_qd, k)
-    prefetch_mat33(factors.DJ, k)
-    prefetch_mat33(factors.DH, k)
-    prefetch_vec3(scratch.Du, k)
 
 
 @wp.func
@@ -116,18 +53,21 @@ def place_bodies(
     motion = wp.spatial_vector()
     end = first + model.tree_moving[tree] * model.pitch
     for k in range(first, end, model.pitch):
-        prefetch_placed(wp.min(k + AHEAD * model.pitch, end - model.pitch), model, joints, is_branching)
+        # all that a body needs is read before anything is asked: a GPU then waits for memory once
         parent = model.body_parent[k]
+        offset = model.body_offset[k]
+        rest = model.body_rest[k]
+        q = joints.joint_q[k]
+        qd = joints.joint_qd[k]
+        branches = is_branching[k]
         if parent < 0 or parent != k - model.pitch:
             pose, motion = parent_kinematics(k, tree, model, joints, bodies_out)
-        axes, lever, pose, motion = body_kinematics(
-            pose, motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
-        )
+        axes, lever, pose, motion = body_kinematics(pose, motion, offset, rest, q, qd)
         bodies_out.body_q[k] = pose
         bodies_out.body_qd[k] = motion
         factors_out.axes[k] = axes
         factors_out.lever[k] = lever
-        if is_branching[k]:
+        if branches:
             scratch_out.J[k] = wp.mat33()
             scratch_out.H[k] = wp.mat33()
             scratch_out.M[k] = wp.mat33()
@@ -139,6 +79,7 @@ def place_bodies(
 def applied_terms(
     k: int,
     tree: int,
+    parent: int,
     p: SolverParameters,
     phi: float,
     model: ArticulationModel,
@@ -152,26 +93,31 @@ def applied_terms(
     damping: wp.vec3,
 ):
     """Implicit inertia J, H, M of body k, its bias and its tension: its own, of drag and of its ties."""
+    mass = model.body_mass[k]
+    local_com = model.body_com[k]
+    local_inertia = model.body_inertia[k]
+    local_product = model.body_product[k]
+    does_fall = model.body_falls[k]
+    load = forces.body_load[k]
+    contact = wp.spatial_top(forces.body_wrench[k])
+    area = model.body_drag[k]
+    ties = model.tie_span[k]
     rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
-    com = rotation * model.body_com[k]
-    inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+    com = rotation * local_com
+    inertia = world_inertia(rotation, local_inertia, local_product)
     falls = float(0.0)
     fall = wp.vec3()
-    if model.body_falls[k]:
+    if does_fall:
         falls = 1.0
         fall = joints.joint_xd[model.body_root[k]]
-    load = forces.body_load[k]
-    if model.body_parent[k] < 0:
+    if parent < 0:
         load = load + wp.spatial_vector(
             wp.vec3(),
             turned_rest_moment(
                 p.dt, phi, axes, q, stiffness, damping, forces.root_turn[tree], forces.root_turn_rate[tree]
             ),
         )  # fmt: skip
-    J, H, M, bias, tension, _steady = own_terms(
-        p, phi, motion, model.body_mass[k], com, inertia, load, wp.spatial_top(forces.body_wrench[k]), falls, fall
-    )
-    area = model.body_drag[k]
+    J, H, M, bias, tension, _steady = own_terms(p, phi, motion, mass, com, inertia, load, contact, falls, fall)
     if area > 0.0:
         J_more, H_more, M_more, bias_more, tension_more = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
         J += J_more
@@ -179,7 +125,6 @@ def applied_terms(
         M += M_more
         bias += bias_more
         tension += tension_more
-    ties = model.tie_span[k]
     for t in range(ties[0], ties[1]):
         J_more, H_more, M_more, bias_more, tension_more = tie_terms(
             p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
@@ -211,17 +156,20 @@ def eliminate_bodies(
     tension_carried = wp.vec3()
     for i in range(size):
         k = last - i * model.pitch
-        prefetch_eliminated(wp.max(k - model.pitch, first), model, forces, joints, bodies, factors_out)
         parent = model.body_parent[k]
         pose = bodies.body_q[k]
         axes = factors_out.axes[k]
+        lever = factors_out.lever[k]
         q = joints.joint_q[k]
+        qd = joints.joint_qd[k]
         stiffness = model.joint_stiffness[k]
         damping = model.joint_damping[k]
+        branches = is_branching[k]
+        before = bodies.body_qd[wp.max(k - model.pitch, first)]
         J, H, M, bias, tension = applied_terms(
-            k, tree, p, phi, model, forces, joints, pose, motion, axes, q, stiffness, damping
+            k, tree, parent, p, phi, model, forces, joints, pose, motion, axes, q, stiffness, damping
         )
-        if is_branching[k]:
+        if branches:
             J += scratch_out.J[k]
             H += scratch_out.H[k]
             M += scratch_out.M[k]
@@ -233,13 +181,13 @@ def eliminate_bodies(
             M += M_carried
             bias += bias_carried
             tension += tension_carried
-
         above = wp.spatial_vector()
-        if parent >= 0:
+        if parent == k - model.pitch:
+            above = before
+        elif parent >= 0:
             above = bodies.body_qd[parent]
-        turning = wp.spatial_bottom(above)
         metric, drive, _torque = joint_terms(
-            p.dt, phi, axes, q, joints.joint_qd[k], stiffness, damping, turning, wp.spatial_bottom(motion)
+            p.dt, phi, axes, q, qd, stiffness, damping, wp.spatial_bottom(above), wp.spatial_bottom(motion)
         )
         J = symmetric(J)
         M = symmetric(M)
@@ -254,7 +202,7 @@ def eliminate_bodies(
         carried = False
         if parent >= 0:
             J_left, H_left, M_left, bias_left = terms_left(
-                p, phi, turning, metric, factors_out.lever[k], J, H, M, bias, tension, DJ, DH, Du
+                p, phi, wp.spatial_bottom(above), metric, lever, J, H, M, bias, tension, DJ, DH, Du
             )
             if parent == k - model.pitch:
                 carried = True
@@ -271,9 +219,7 @@ def eliminate_bodies(
                 scratch_out.H[k] = H
                 scratch_out.bias[k] = bias
                 factors_out.root_inverse_mass[k] = wp.inverse(M - wp.transpose(H) * DH)
-        motion = above
-        if not carried and i + 1 < size:
-            motion = bodies.body_qd[k - model.pitch]
+        motion = before
 
 
 @wp.func
@@ -294,11 +240,15 @@ def accelerate_tree(
     omega = wp.vec3()
     end = first + model.tree_moving[tree] * model.pitch
     for k in range(first, end, model.pitch):
-        prefetch_accelerated(
-            wp.min(k + AHEAD * model.pitch, end - model.pitch), model, joints, bodies, factors, scratch
-        )
         parent = model.body_parent[k]
+        lever = factors.lever[k]
+        axes = factors.axes[k]
+        qd = joints.joint_qd[k]
+        DJ = factors.DJ[k]
+        DH = factors.DH[k]
+        Du = scratch.Du[k]
         turning = omega
+        omega = wp.spatial_bottom(bodies.body_qd[k])
         if parent < 0:
             acceleration = wp.spatial_vector()
             velocity = wp.spatial_vector()
@@ -313,11 +263,9 @@ def accelerate_tree(
             acceleration = prediction_out.body_acceleration[parent]
             velocity = prediction_out.body_qd_free[parent]
             turning = wp.spatial_bottom(bodies.body_qd[parent])
-        omega = wp.spatial_bottom(bodies.body_qd[k])
         acceleration, rate, velocity = accelerate_body(
-            dt, acceleration, velocity, turning, omega, factors.lever[k], factors.axes[k], joints.joint_qd[k],
-            factors.DJ[k], factors.DH[k], scratch.Du[k],
-        )  # fmt: skip
+            dt, acceleration, velocity, turning, omega, lever, axes, qd, DJ, DH, Du
+        )
         prediction_out.body_acceleration[k] = acceleration
         prediction_out.joint_qd_free[k] = rate
         prediction_out.body_qd_free[k] = velocity

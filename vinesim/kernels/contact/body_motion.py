@@ -12,6 +12,12 @@ def to_double(v: wp.vec3):
 
 
 @wp.func
+def to_single(v: wp.vec3d):
+    """A vector of double precision in single precision."""
+    return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
+
+
+@wp.func
 def velocity_at(pose: wp.transform, velocity: wp.spatial_vector, point: wp.vec3d):
     """World velocity [m/s] of a body's material at a point; ``velocity`` (linear, angular) is that of its origin."""
     lever = point - to_double(wp.transform_get_translation(pose))
@@ -60,23 +66,30 @@ def velocity_product_acceleration(
     linear = wp.vec3()
     angular = wp.vec3()
     k = int(body)
+    joint = origin
+    turning = wp.spatial_bottom(body_qd[body])
+    parent = wp.where(body_cut[body], -1, body_parent[body])
     while k >= 0 and k != known:
-        parent = body_parent[k]
-        if body_cut[k]:
-            parent = -1
         if parent >= 0:
-            joint = wp.transform_get_translation(body_q[k])
+            above = wp.transform_get_translation(body_q[parent])
             omega = wp.spatial_bottom(body_qd[parent])
-            relative = wp.cross(omega, wp.spatial_bottom(body_qd[k]))
+            further = body_parent[parent]  # read with the rest, so that a GPU waits for memory once a body
+            is_cut = body_cut[parent]
+            relative = wp.cross(omega, turning)
             angular += relative
             linear += wp.cross(relative, origin - joint)
-            linear += wp.cross(omega, wp.cross(omega, joint - wp.transform_get_translation(body_q[parent])))
-        k = parent
+            linear += wp.cross(omega, wp.cross(omega, joint - above))
+            joint = above
+            turning = omega
+            k = parent
+            parent = wp.where(is_cut, -1, further)
+        else:
+            k = -1
     if k >= 0:
         turn = wp.spatial_bottom(known_acceleration)
         angular += turn
         linear += wp.spatial_top(known_acceleration)
-        linear += wp.cross(turn, origin - wp.transform_get_translation(body_q[k]))
+        linear += wp.cross(turn, origin - joint)
     return wp.spatial_vector(linear, angular)
 
 

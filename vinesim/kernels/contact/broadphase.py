@@ -141,10 +141,14 @@ def sweep_capsule(s: int, dt: float, capsules: Capsules, bodies: PlantBodies):
     body = capsules.body[s]
     pose = bodies.q[body]
     velocity = bodies.qd[body]
-    start = wp.transform_point(pose, capsules.local_start[s])
-    end = wp.transform_point(pose, capsules.local_end[s])
-    speed = wp.length(wp.spatial_top(velocity)) + capsules.extent[s] * wp.length(wp.spatial_bottom(velocity))
-    grown = wp.vec3(capsules.radius[s] + speed * dt)
+    local_start = capsules.local_start[s]
+    local_end = capsules.local_end[s]
+    extent = capsules.extent[s]
+    radius = capsules.radius[s]
+    start = wp.transform_point(pose, local_start)
+    end = wp.transform_point(pose, local_end)
+    speed = wp.length(wp.spatial_top(velocity)) + extent * wp.length(wp.spatial_bottom(velocity))
+    grown = wp.vec3(radius + speed * dt)
     return start, end, speed, wp.min(start, end) - grown, wp.max(start, end) + grown
 
 

@@ -18,9 +18,7 @@ constexpr int ROWS = %(rows)d, LANES = %(lanes)d;
 constexpr unsigned ALL = 0xffffffffu;
 const int lane = threadIdx.x %% LANES, c = lane / 3, part = lane %% 3;
 const int size = 3 * count <= ROWS ? 3 * count : 0;
-int most = size;  // all trees of a warp go through the same steps
-#pragma unroll
-for (int other = 16; other > 0; other /= 2) most = max(most, __shfl_xor_sync(ALL, most, other));
+const int most = __reduce_max_sync(ALL, size);  // all trees of a warp go through the same steps
 if (most == 0) return count > 0 ? -1 : 0;
 const bool is_row = lane < size;
 
@@ -33,8 +31,9 @@ auto coupling = [&](int i, int j) {
     return *(float*)((char*)matrix.data + (size_t)i * matrix.strides[0] + (size_t)j * matrix.strides[1]);
 };
 float a[ROWS];
+const char* column = (const char*)matrix.data + (is_row ? lane * (size_t)matrix.strides[1] : 0);
 #pragma unroll
-for (int j = 0; j < ROWS; ++j) a[j] = is_row && j < size ? coupling(j, lane) : 0.0f;
+for (int j = 0; j < ROWS; ++j, column += matrix.strides[0]) a[j] = is_row && j < size ? *(const float*)column : 0.0f;
 double x = 0.0, outside = 0.0, mu = 0.0, soft = 0.0, by_normal = 0.0, by_tangent = 0.0, nu = 0.0, nv = 0.0;
 if (is_row) {
     x = entry(impulse, lane);

@@ -12,7 +12,7 @@ from vinesim.kernels.contact.jacobians import row_columns
 from vinesim.kernels.contact.structs import Contacts, Rows
 from vinesim.kernels.contact.tree_narrowphase import TreeContacts
 from vinesim.kernels.contact.tree_solver import TreeSystem
-from vinesim.kernels.contact.tree_views import view_contacts, view_rows, view_system
+from vinesim.kernels.contact.tree_views import tree_and_entry, view_contacts, view_rows, view_system
 
 wp.set_module_options({"enable_backward": False})
 
@@ -50,8 +50,8 @@ def respond_at_contacts(
     factors: Factors,
     contacts_all: Contacts,
     rows_all: Rows,
+    tree_contacts: TreeContacts,
     # out
-    tree_contacts_out: TreeContacts,
     compliances_out: BodyCompliances,
     response_out: ResponseRows,
 ):
@@ -63,9 +63,7 @@ def respond_at_contacts(
     of their bodies. is_branching: [body] whether a body is the parent of another than the next one.
     """
     tree = wp.tid()
-    if tree == 0:
-        tree_contacts_out.busy_count[0] = 0
-    count = tree_contacts_out.count[tree]
+    count = tree_contacts.count[tree]
     if count == 0:
         return
     contacts = view_contacts(contacts_all, tree, trees)
@@ -74,8 +72,15 @@ def respond_at_contacts(
     Q = wp.mat33()
     R = wp.mat33()
     at = int(0)
+    touched = int(contacts.body[0])
     for k in range(model.tree_first[tree], contacts.body[count - 1] + 1, model.pitch):
+        # all that a body needs is read before anything is asked: a GPU then waits for memory once
         parent = model.body_parent[k]
+        branches = is_branching[k]
+        lever = factors.lever[k]
+        D = factors.D[k]
+        DH = factors.DH[k]
+        DJ = factors.DJ[k]
         if parent < 0:
             P = wp.mat33()
             Q = wp.mat33()
@@ -84,35 +89,39 @@ def respond_at_contacts(
             P = compliances_out.P[parent]
             Q = compliances_out.Q[parent]
             R = compliances_out.R[parent]
-        lever = factors.lever[k]
-        DH = factors.DH[k]
-        stay = wp.identity(n=3, dtype=float) - factors.DJ[k]
+        stay = wp.identity(n=3, dtype=float) - DJ
         arm = -wp.transpose(cross_rows(R, lever))  # [l]x R
         across = wp.transpose(cross_rows(Q, lever))  # -[l]x Q^T
         P = symmetric(P + across + wp.transpose(across) - cross_rows(arm, lever))
         Q = Q - arm
         turn = stay * wp.transpose(Q) - DH * P
-        R = symmetric(factors.D[k] + (stay * R - DH * Q) * wp.transpose(stay) - turn * wp.transpose(DH))
+        R = symmetric(D + (stay * R - DH * Q) * wp.transpose(stay) - turn * wp.transpose(DH))
         Q = wp.transpose(turn)
-        if is_branching[k]:
+        if branches:
             compliances_out.P[k] = P
             compliances_out.Q[k] = Q
             compliances_out.R[k] = R
-        while at < count and contacts.body[wp.min(at, count - 1)] == k:
+        while touched == k:
             force = row_columns(at, 0, rows.plant_jacobian)
             moment = row_columns(at, 3, rows.plant_jacobian)
             response_out.a[at * trees + tree] = P * force + Q * moment
             response_out.alpha[at * trees + tree] = turn * force + R * moment
             at = at + 1
+            touched = -1
+            if at < count:
+                touched = contacts.body[at]
 
 
 @wp.func
 def carry_to_parent(k: int, factors: Factors, force: wp.mat33, moment: wp.mat33):
     """Impulses on body k, a column each, as those that its parent feels: the joint takes its share."""
-    passed = force - wp.transpose(factors.DH[k]) * moment
+    lever = factors.lever[k]
+    DH = factors.DH[k]
+    DJ = factors.DJ[k]
+    passed = force - wp.transpose(DH) * moment
     # [l]x of a matrix is minus the transpose of its transpose's rows crossed with l
-    arm = -wp.transpose(cross_rows(wp.transpose(passed), factors.lever[k]))
-    return passed, moment - wp.transpose(factors.DJ[k]) * moment + arm
+    arm = -wp.transpose(cross_rows(wp.transpose(passed), lever))
+    return passed, moment - wp.transpose(DJ) * moment + arm
 
 
 @wp.func
@@ -170,24 +179,27 @@ def write_delassus(
     Its impulses go inward; what they do at a body with another contact, that one's response says, both being one
     symmetric matrix.
     """
-    tree = wp.tid() % trees
-    c = wp.tid() // trees
-    if c >= tree_contacts.count[tree]:
+    tree, c = tree_and_entry(wp.tid(), width / 3)
+    if tree >= trees or c >= tree_contacts.count[wp.min(tree, trees - 1)]:
         return
     contacts = view_contacts(contacts_all, tree, trees)
     rows = view_rows(rows_all, tree, trees)
     system = view_system(system_out, tree, trees, width)
-    for row in range(3 * c, 3 * c + 3):
-        system.free[row] = rows.velocity_free[row] + rows.bias[row]
+    n = 3 * c
+    velocity = wp.vec3d(rows.velocity_free[n], rows.velocity_free[n + 1], rows.velocity_free[n + 2])
+    bias = wp.vec3d(rows.bias[n], rows.bias[n + 1], rows.bias[n + 2])
     force = row_columns(c, 0, rows.plant_jacobian)
     moment = row_columns(c, 3, rows.plant_jacobian)
     k = int(contacts.body[c])
+    for r in range(3):
+        system.free[n + r] = velocity[r] + bias[r]
     for back in range(c + 1):
         other = c - back
         body = contacts.body[other]
         while k > body:
+            parent = model.body_parent[k]
             force, moment = carry_to_parent(k, factors, force, moment)
-            k = model.body_parent[k]
+            k = parent
         block = wp.mat33()
         if k == body:
             slot = other * trees + tree

@@ -21,8 +21,9 @@ from vinesim.kernels.articulation.structs import (
     SolverParameters,
     WrenchScratch,
 )
+from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
-from vinesim.kernels.contact.jacobians import row_vector, write_rows
+from vinesim.kernels.contact.jacobians import write_rows
 from vinesim.kernels.contact.row_solver import solve_few_rows, solve_many_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
@@ -50,6 +51,7 @@ from vinesim.kernels.contact.tree_solver import (
 from vinesim.kernels.contact.tree_views import (
     part_of_search,
     part_of_system,
+    tree_and_entry,
     view_contacts,
     view_int,
     view_rows,
@@ -96,6 +98,7 @@ def write_tree_rows(
     geoms: Geoms,
     # in
     trees: int,
+    slots: int,
     bodies: PlantBodies,
     rigid: RigidBodies,
     candidates: Candidates,
@@ -106,31 +109,25 @@ def write_tree_rows(
     rows_out: Rows,
 ):
     """One thread per slot of a tree: the rows of its contact."""
-    tree = wp.tid() % trees
-    c = wp.tid() // trees
-    if c < tree_contacts.count[tree]:
+    tree, c = tree_and_entry(wp.tid(), slots)
+    if tree < trees and c < tree_contacts.count[wp.min(tree, trees - 1)]:
         contacts = view_contacts(contacts_out, tree, trees)
-        contacts.feature[c] = candidates.feature[tree, c]
-        contacts.other[c] = candidates.other[tree, c]
-        contacts.body[c] = capsules.body[candidates.feature[tree, c] // 2]
+        found = contacts.source[c]
+        contacts.feature[c] = candidates.feature[tree, found]
+        contacts.other[c] = candidates.other[tree, found]
+        contacts.body[c] = capsules.body[candidates.feature[tree, found] // 2]
         contacts.other_body[c] = -1
         write_rows(
-            c, tree, c, parameters, pairs, capsules, geoms, bodies, rigid, candidates,
+            c, tree, found, parameters, pairs, capsules, geoms, bodies, rigid, candidates,
             view_warm_start(warm_start, tree, trees), contacts, view_rows(rows_out, tree, trees),
         )  # fmt: skip
 
 
 @wp.func
-def wrench_of_contact(c: int, dt: wp.float64, rows: Rows):
-    """Force and moment [N, N m] of one contact on its body."""
-    wrench = wp.spatial_vector()
-    for r in range(3):
-        row = 3 * c + r
-        share = wp.float32(rows.impulse[row] / dt)
-        wrench = wrench + share * wp.spatial_vector(
-            row_vector(row, 0, rows.plant_jacobian), row_vector(row, 3, rows.plant_jacobian)
-        )
-    return wrench
+def wrench_at(pose: wp.transform, point: wp.vec3d, force: wp.vec3d):
+    """Force and moment [N, N m] at a body's origin of a force at a point [m]."""
+    lever = point - to_double(wp.transform_get_translation(pose))
+    return wp.spatial_vector(to_single(force), to_single(wp.cross(lever, force)))
 
 
 @wp.func
@@ -160,22 +157,32 @@ def apply_loaded_wrenches(
             work_out.subtree_wrench[k] = wp.spatial_vector()
     carried = wp.spatial_vector()
     at = int(count - 1)
+    touched = int(last)
     for i in range((last - first) / model.pitch + 1):
         k = last - i * model.pitch
-        wrench = carried
-        if is_branching[k]:
-            wrench = wrench + work_out.subtree_wrench[k]
-        if at >= 0 and loaded[wp.max(at, 0)] == k:
-            wrench = wrench + body_wrench[k]
-            while at >= 0 and loaded[wp.max(at, 0)] == k:
-                at = at - 1
-        moment = wp.spatial_bottom(wrench)
-        scratch_out.Du[k] = factors.D[k] * moment
-        carried = wp.spatial_vector()
+        # all that a body needs is read before anything is asked: a GPU then waits for memory once
         parent = model.body_parent[k]
+        branches = is_branching[k]
+        lever = factors.lever[k]
+        D = factors.D[k]
+        DH = factors.DH[k]
+        DJ = factors.DJ[k]
+        wrench = carried
+        if branches:
+            wrench = wrench + work_out.subtree_wrench[k]
+        if touched == k:
+            wrench = wrench + body_wrench[k]
+            while touched == k:
+                at = at - 1
+                touched = -1
+                if at >= 0:
+                    touched = loaded[at]
+        moment = wp.spatial_bottom(wrench)
+        scratch_out.Du[k] = D * moment
+        carried = wp.spatial_vector()
         if parent >= 0:
-            force = wp.spatial_top(wrench) - wp.transpose(factors.DH[k]) * moment
-            moment = moment - wp.transpose(factors.DJ[k]) * moment + wp.cross(factors.lever[k], force)
+            force = wp.spatial_top(wrench) - wp.transpose(DH) * moment
+            moment = moment - wp.transpose(DJ) * moment + wp.cross(lever, force)
             carried = wp.spatial_vector(force, moment)
             if parent != k - model.pitch:
                 work_out.subtree_wrench[parent] = work_out.subtree_wrench[parent] + carried
@@ -184,24 +191,30 @@ def apply_loaded_wrenches(
     alpha = wp.vec3()
     for k in range(first, end, model.pitch):
         parent = model.body_parent[k]
+        branches = is_branching[k]
+        lever = factors.lever[k]
+        DH = factors.DH[k]
+        DJ = factors.DJ[k]
+        Du = scratch_out.Du[k]
+        axes = factors.axes[k]
+        acceleration = prediction_out.body_acceleration[k]
+        rate = prediction_out.joint_qd_free[k]
         if parent < 0:
             a = wp.vec3()
             alpha = wp.vec3()
         elif parent != k - model.pitch:
             a = wp.spatial_top(work_out.added_acceleration[parent])
             alpha = wp.spatial_bottom(work_out.added_acceleration[parent])
-        a = a + wp.cross(alpha, factors.lever[k])
-        relative = -(factors.DJ[k] * alpha + factors.DH[k] * a)
+        a = a + wp.cross(alpha, lever)
+        relative = -(DJ * alpha + DH * a)
         if k <= last:
-            relative = relative + scratch_out.Du[k]
+            relative = relative + Du
         alpha = alpha + relative
         added = wp.spatial_vector(a, alpha)
-        if is_branching[k]:
+        if branches:
             work_out.added_acceleration[k] = added
-        prediction_out.body_acceleration[k] = prediction_out.body_acceleration[k] + added
-        prediction_out.joint_qd_free[k] = prediction_out.joint_qd_free[k] + dt * wp.quat_rotate_inv(
-            factors.axes[k], relative
-        )
+        prediction_out.body_acceleration[k] = acceleration + added
+        prediction_out.joint_qd_free[k] = rate + dt * wp.quat_rotate_inv(axes, relative)
 
 
 @wp.func
@@ -240,10 +253,10 @@ def solve_trees(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """``lanes`` threads per tree solve for its impulses; lists the trees that need more threads or sweeps.
+    """``lanes`` threads per tree solve for its impulses.
 
     On a GPU 16 threads solve trees of few contacts at once, see :func:`vinesim.kernels.contact.row_solver.solve_few_rows`,
-    in full warps. On a CPU two sweeps are done here.
+    in full warps; nothing happens with the others. On a CPU two sweeps are done here, and trees that need more are listed.
     """
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
@@ -256,14 +269,14 @@ def solve_trees(
         count, max_sweeps, FIRST_SWEEPS, newton_end, tolerance, system.matrix, system.free, system.friction,
         system.compliance, system.impulse, system.velocity,
     )  # fmt: skip
-    busy = sweeps < 0
+    busy = bool(False)
     if lanes == 1 and count > 0:
         search = view_search(search_out, tree, trees, width + 1)
         update_velocities(lane, lanes, 3 * count, system)
         limit = wp.min(FIRST_SWEEPS, max_sweeps)
         sweeps, busy = solve_tree(0, lane, lanes, count, limit, newton_end, tolerance, system, search)
-    if lane == 0 and count > 0:
-        tree_contacts_out.sweeps[tree] = wp.max(sweeps, 0)
+    if lane == 0 and count > 0 and sweeps >= 0:
+        tree_contacts_out.sweeps[tree] = sweeps
         if busy and sweeps < max_sweeps:
             tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
 
@@ -330,6 +343,7 @@ def apply_tree_impulses(
     # in
     trees: int,
     width: int,
+    body_q: wp.array(dtype=wp.transform),
     rows_all: Rows,
     system_all: TreeSystem,
     factors: Factors,
@@ -369,10 +383,12 @@ def apply_tree_impulses(
     for c in range(count):
         slip_u = system.velocity[3 * c + 1] - rows.bias[3 * c + 1]
         slip_v = system.velocity[3 * c + 2] - rows.bias[3 * c + 2]
-        store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts, warm_start)
         body = contacts.body[c]
+        point = contacts.point[c]
+        pose = body_q[body]
+        store_contact(c, slip_u, slip_v, parameters, rows.impulse, contacts, warm_start)
         loaded[c] = body
-        body_wrench_out[body] = body_wrench_out[body] + wrench_of_contact(c, parameters.dt, rows)
+        body_wrench_out[body] = body_wrench_out[body] + wrench_at(pose, point, contacts.force[c])
     apply_loaded_wrenches(
         tree, count, wp.float32(parameters.dt), model, is_branching, loaded, body_wrench_out, factors, work_out,
         scratch_out, prediction_out,

@@ -1,7 +1,8 @@
-"""Narrowphase of trees that are worlds of their own with geoms that do not move: a thread finds the contacts of a tree.
+"""Narrowphase of trees that are worlds of their own with geoms that do not move: pairs, contacts of each, their numbers.
 
-In a kernel for geoms of any kind, and in a far shorter one for planes, spheres and capsules alone: a GPU whose threads are
-at many places of a long kernel waits for instructions more than for anything else.
+Contacts are found in a kernel for geoms of any kind, and in a far shorter one for planes, spheres and capsules alone: a GPU
+whose threads are at many places of a long kernel waits for instructions more than for anything else. The number of a
+contact in its tree follows from the pairs before its own, so that it is the same in every run.
 """
 
 import warp as wp
@@ -32,9 +33,17 @@ class TreeContacts:
     count: wp.array(dtype=wp.int32)
     """of this step."""
     near: wp.array(dtype=wp.vec2i)
-    """[i * trees + tree] scratch: capsules and geoms whose boxes overlap."""
+    """[k] scratch: capsules and geoms whose boxes overlap, those of all trees in any order."""
+    near_place: wp.array(dtype=wp.int32)
+    """[k] which pair of its tree each is."""
+    near_total: wp.array(dtype=wp.int32)
+    """[1] number of these pairs."""
+    near_count: wp.array(dtype=wp.int32)
+    """of them."""
+    found: wp.array(dtype=wp.int32)
+    """[i * trees + tree] scratch: contacts of such a pair, 0 to 2."""
     busy_count: wp.array(dtype=wp.int32)
-    """[1] number of trees that need more sweeps than one thread takes."""
+    """[1] number of trees that need more threads or sweeps than most."""
     busy: wp.array(dtype=wp.int32)
     """[i] these trees, in any order."""
     is_impact: wp.array(dtype=wp.bool)
@@ -52,75 +61,103 @@ class TreeContacts:
 @wp.func
 def list_near_geoms(
     s: int,
-    tree: int,
-    trees: int,
     near_count: int,
+    room: int,
     low: wp.vec3,
     high: wp.vec3,
     geoms: Geoms,
     geom_states: GeomStates,
     static_blocks: Aabbs,
-    near_out: wp.array(dtype=wp.vec2i),
+    tree_contacts_out: TreeContacts,
 ):
-    """List the geoms whose boxes overlap that of capsule ``s``; returns how many pairs the tree has then. More than there
-    is room for are only counted."""
+    """List the geoms whose boxes overlap that of capsule ``s``; returns how many pairs its tree has then. More than there
+    is ``room`` for are only counted."""
     for block in range(static_blocks.low.shape[0]):
         if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
             for g in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, geoms.count[1])):
                 if not aabbs_disjoint(low, high, geom_states.low[g], geom_states.high[g]):
-                    if near_count * trees + tree < near_out.shape[0]:
-                        near_out[near_count * trees + tree] = wp.vec2i(s, g)
+                    if near_count < room:
+                        k = wp.atomic_add(tree_contacts_out.near_total, 0, 1)
+                        tree_contacts_out.near[k] = wp.vec2i(s, g)
+                        tree_contacts_out.near_place[k] = near_count
                     near_count = near_count + 1
     return near_count
 
 
-@wp.func
-def find_contacts_of_tree(
-    tree: int,
-    is_round: bool,
+@wp.kernel
+def list_near_pairs(
+    # model
     parameters: Parameters,
     capsules: Capsules,
     geoms: Geoms,
+    # in
     trees: int,
-    slots: int,
     bodies: PlantBodies,
-    rigid: RigidBodies,
-    hulls: Hulls,
     geom_states: GeomStates,
     static_blocks: Aabbs,
+    # out
     capsule_states_out: CapsuleStates,
     tree_contacts_out: TreeContacts,
-    candidates_out: Candidates,
 ):
-    """Contacts of a tree with static geoms, in the order of (capsule, geom, end).
+    """One thread per tree: pairs of a capsule and a geom whose boxes overlap, and where these capsules are.
 
-    Capsule i of a tree is ``i * trees + tree``; one without a body is none. What exceeds the slots is only counted. First
-    boxes are compared, then threads in step go through what each of them found near: pairs beyond their room count as dropped.
+    Capsule i of a tree is ``i * trees + tree``; one without a body is none. Pairs beyond their room count as dropped.
     """
+    tree = wp.tid()
+    if tree == 0:
+        tree_contacts_out.busy_count[0] = 0
+    room = tree_contacts_out.near.shape[0] / trees
     near_count = int(0)
-    for s in range(tree, capsules.body.shape[0], trees):
-        if capsules.body[s] >= 0:
+    size = capsules.body.shape[0]
+    following = capsules.body[tree]
+    for s in range(tree, size, trees):
+        body = following
+        if s + trees < size:
+            following = capsules.body[s + trees]
+        if body >= 0:
             start, end, speed, low, high = sweep_capsule(s, wp.float32(parameters.dt), capsules, bodies)
             before = near_count
             near_count = list_near_geoms(
-                s, tree, trees, before, low, high, geoms, geom_states, static_blocks, tree_contacts_out.near
+                s, before, room, low, high, geoms, geom_states, static_blocks, tree_contacts_out
             )
             if near_count > before:
                 capsule_states_out.start[s] = start
                 capsule_states_out.end[s] = end
                 capsule_states_out.speed[s] = speed
-                capsule_states_out.low[s] = low
-                capsule_states_out.high[s] = high
-    room = tree_contacts_out.near.shape[0] / trees
-    count, is_impact = add_pairs(
-        is_round, tree, 0, tree_contacts_out.near, tree, trees, wp.min(near_count, room), parameters, capsules, geoms,
-        bodies, capsule_states_out, rigid, hulls, geom_states, candidates_out,
-    )  # fmt: skip
-    tree_contacts_out.is_impact[tree] = is_impact
-    tree_contacts_out.count[tree] = wp.min(count, slots)
-    dropped = wp.max(count - slots, 0) + wp.max(near_count - room, 0)
-    if dropped > 0:
-        tree_contacts_out.dropped[tree] += dropped
+    tree_contacts_out.near_count[tree] = wp.min(near_count, room)
+    tree_contacts_out.is_impact[tree] = False
+    if near_count > room:
+        tree_contacts_out.dropped[tree] += near_count - room
+
+
+@wp.func
+def find_contacts_of_pairs(
+    thread: int,
+    is_round: bool,
+    parameters: Parameters,
+    capsules: Capsules,
+    geoms: Geoms,
+    trees: int,
+    threads: int,
+    bodies: PlantBodies,
+    capsule_states: CapsuleStates,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    tree_contacts_out: TreeContacts,
+    candidates_out: Candidates,
+):
+    """Contacts of every so-manieth near pair: those of pair i of a tree are its candidates 2 i and 2 i + 1."""
+    for k in range(thread, tree_contacts_out.near_total[0], threads):
+        tree = tree_contacts_out.near[k][0] % trees
+        i = tree_contacts_out.near_place[k]
+        end, is_impact = add_pairs(
+            is_round, tree, 2 * i, tree_contacts_out.near, k, 1, 1, parameters, capsules, geoms, bodies, capsule_states,
+            rigid, hulls, geom_states, candidates_out,
+        )  # fmt: skip
+        tree_contacts_out.found[i * trees + tree] = end - 2 * i
+        if is_impact:
+            tree_contacts_out.is_impact[tree] = True
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -131,25 +168,24 @@ def find_tree_contacts(
     geoms: Geoms,
     # in
     trees: int,
-    slots: int,
+    threads: int,
     bodies: PlantBodies,
+    capsule_states: CapsuleStates,
     rigid: RigidBodies,
     hulls: Hulls,
     geom_states: GeomStates,
-    static_blocks: Aabbs,
     # out
-    capsule_states_out: CapsuleStates,
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """One thread per tree: :func:`find_contacts_of_tree` with geoms of any kind."""
-    find_contacts_of_tree(
-        wp.tid(), False, parameters, capsules, geoms, trees, slots, bodies, rigid, hulls, geom_states, static_blocks,
-        capsule_states_out, tree_contacts_out, candidates_out,
+    """``threads`` threads: :func:`find_contacts_of_pairs` with geoms of any kind."""
+    find_contacts_of_pairs(
+        wp.tid(), False, parameters, capsules, geoms, trees, threads, bodies, capsule_states, rigid, hulls,
+        geom_states, tree_contacts_out, candidates_out,
     )  # fmt: skip
 
 
-@wp.kernel(module="unique", enable_backward=False, cuda_max_registers=128)
+@wp.kernel(module="unique", enable_backward=False)
 def find_round_tree_contacts(
     # model
     parameters: Parameters,
@@ -157,19 +193,49 @@ def find_round_tree_contacts(
     geoms: Geoms,
     # in
     trees: int,
-    slots: int,
+    threads: int,
     bodies: PlantBodies,
+    capsule_states: CapsuleStates,
     rigid: RigidBodies,
     hulls: Hulls,
     geom_states: GeomStates,
-    static_blocks: Aabbs,
     # out
-    capsule_states_out: CapsuleStates,
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """One thread per tree: :func:`find_contacts_of_tree` where all geoms are planes, spheres and capsules."""
-    find_contacts_of_tree(
-        wp.tid(), True, parameters, capsules, geoms, trees, slots, bodies, rigid, hulls, geom_states, static_blocks,
-        capsule_states_out, tree_contacts_out, candidates_out,
+    """``threads`` threads: :func:`find_contacts_of_pairs` where all geoms are planes, spheres and capsules."""
+    find_contacts_of_pairs(
+        wp.tid(), True, parameters, capsules, geoms, trees, threads, bodies, capsule_states, rigid, hulls,
+        geom_states, tree_contacts_out, candidates_out,
     )  # fmt: skip
+
+
+@wp.kernel
+def number_tree_contacts(
+    # in
+    trees: int,
+    slots: int,
+    few: int,
+    # out
+    tree_contacts_out: TreeContacts,
+    source_out: wp.array(dtype=wp.int32),
+):
+    """One thread per tree: its contacts in the order of (capsule, geom, end). What exceeds the slots is only counted.
+
+    few: trees with more contacts are listed as busy. source_out: [slot * trees + tree] which candidate each contact is.
+    """
+    tree = wp.tid()
+    if tree == 0:
+        tree_contacts_out.near_total[0] = 0
+    count = int(0)
+    for i in range(tree_contacts_out.near_count[tree]):
+        for end in range(tree_contacts_out.found[i * trees + tree]):
+            if count < slots:
+                source_out[count * trees + tree] = 2 * i + end
+            count = count + 1
+    tree_contacts_out.count[tree] = wp.min(count, slots)
+    tree_contacts_out.sweeps[tree] = 0
+    if count > few:
+        tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
+    if count > slots:
+        tree_contacts_out.dropped[tree] += count - slots

@@ -57,6 +57,19 @@ def part_matrix(a: wp.array2d(dtype=float), first: int) -> wp.array2d(dtype=floa
 def part_table(a: wp.array2d(dtype=wp.float64), first: int) -> wp.array2d(dtype=wp.float64): ...
 
 
+GROUP = wp.constant(32)
+"""Trees whose entries neighbouring threads take: a warp of a GPU."""
+
+
+@wp.func
+def tree_and_entry(thread: int, entries: int):
+    """Which tree, and which of its ``entries``, a thread takes: all entries of 32 trees before those of the next ones.
+
+    Then threads of one block of a GPU read the same bodies, from a cache. The last trees may be beyond the number of all.
+    """
+    return thread // (GROUP * entries) * GROUP + thread % GROUP, thread // GROUP % entries
+
+
 @wp.func
 def view_contacts(s: Contacts, tree: int, trees: int):
     """The contacts of one tree. All are in one island and one block."""

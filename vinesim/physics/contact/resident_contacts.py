@@ -16,7 +16,9 @@ import warp as wp
 from vinesim.kernels.articulation import structs as plant_structs
 from vinesim.kernels.contact import broadphase, structs, tree_delassus, tree_islands, tree_narrowphase
 from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
+from vinesim.kernels.contact.row_solver import FEW_ROWS
 from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem
+from vinesim.kernels.contact.tree_views import GROUP
 from vinesim.kernels.launch import THREADS_PER_BLOCK, bind_launch
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters, material_pairs
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
@@ -31,13 +33,16 @@ FULL_BLOCK = 128
 """CUDA threads a block of kernels with several threads for each tree."""
 AABB_BLOCK = int(structs.AABB_BLOCK)
 DEFAULT_SLOTS = 8
-"""Contacts that one tree can have at once: 6 kB a tree."""
+"""Contacts that one tree can have at once: 10 kB a tree."""
 PAIRS_PER_SLOT = 4
 """Pairs of capsules and geoms whose boxes may overlap, for each contact that a tree can have."""
 FIRST_LANES = 16
 """Threads of a GPU that share a tree of few contacts, a row each."""
 WARPS = 132 * 32
 """Warps of a GPU that solve at once: as many as one with 132 multiprocessors keeps."""
+
+Launches = list[tuple[Any, int]]
+"""Bound kernels with their numbers of threads."""
 
 
 class ResidentContacts:
@@ -71,7 +76,8 @@ class ResidentContacts:
         self._take_over_plants(PlantArrays(model, plants, plant_capsules(model)))
         self._take_over_geoms(RigidArrays(rigid, set(), self._numbers, None))
         self._allocate()
-        self._launches = self._bind()
+        self._before, self._solves, self._after = self._bind()
+        self._beside = None if self._device.is_cpu else wp.Stream(self._device, priority=-1)
 
     def _check(self, rigid: RigidWorld) -> None:
         plants = self.plants
@@ -181,10 +187,10 @@ class ResidentContacts:
     def _allocate(self) -> None:
         trees, slots = self._trees, self.slots
         self._groups = 1 if self._device.is_cpu else min(trees, WARPS)
-        rows = 3 * slots
+        rows, pairs = 3 * slots, PAIRS_PER_SLOT * slots
         self.candidates = self._allocated(structs.Candidates, {}, {})
         for name in ("feature", "other", "gap", "end_gap", "normal", "point"):
-            setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, slots))
+            setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, 2 * pairs))
         of_all: dict[str, int] = dict.fromkeys(structs.Contacts.vars, trees * slots)
         self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("island", "block", "place"), 1), {})
         of_rows: dict[str, int] = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
@@ -202,16 +208,17 @@ class ResidentContacts:
         )
         of_all = dict.fromkeys(structs.WarmStart.vars, trees * slots) | {"count": trees}
         self._warm_start = self._allocated(structs.WarmStart, of_all, {})
-        of_trees = dict.fromkeys(("count", "is_impact", "dropped", "sweeps", "loaded_count", "busy"), trees)
-        of_trees |= {"loaded": trees * slots, "near": trees * slots * PAIRS_PER_SLOT}
+        of_trees = dict.fromkeys(tree_narrowphase.TreeContacts.vars, trees)
+        of_trees |= dict.fromkeys(("near_total", "busy_count"), 1) | {"loaded": trees * slots}
+        of_trees |= dict.fromkeys(("near", "near_place", "found"), trees * pairs)
         self._tree_contacts = self._allocated(tree_narrowphase.TreeContacts, of_trees, {})
         self._response = self._allocated(tree_delassus.ResponseRows, dict.fromkeys(("a", "alpha"), trees * slots), {})
         self._was_in_contact = self._zeros(wp.bool, trees)
 
     # ------------------------------------------------------------------ kernels
 
-    def _bind(self) -> list[tuple[Any, int]]:
-        """Every kernel of a step, bound to its arrays, with its number of threads."""
+    def _bind(self) -> tuple[Launches, Launches, Launches]:
+        """Every kernel of a step, bound to its arrays, with its number of threads: before the solves, these, after."""
         p, plants, trees = self.parameters, self.plants.launches, self._trees
         fill, s, arrays = plants.fill_resident, plant_structs, plants.resident_arrays
         device = str(self._device)
@@ -221,7 +228,10 @@ class ResidentContacts:
         scratch, prediction, work = fill(s.Scratch), fill(s.Prediction), fill(s.WrenchScratch)
         onset, contacts = self.plants.onset_steps, self._tree_contacts
         width = 3 * self.slots
-        few, lanes, block = (1, 1, 1) if self._device.is_cpu else (FIRST_LANES, WARP_SIZE, FULL_BLOCK)
+        entries = -(-trees // GROUP) * GROUP
+        few, first, lanes, block = self.slots, 1, 1, 1
+        if not self._device.is_cpu:
+            few, first, lanes, block = int(FEW_ROWS) // 3, FIRST_LANES, WARP_SIZE, FULL_BLOCK
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
             block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
@@ -230,33 +240,53 @@ class ResidentContacts:
         is_round = np.isin(self._geoms.kind.numpy(), (PLANE, SPHERE, CAPSULE)).all()
         find = tree_narrowphase.find_round_tree_contacts if is_round else tree_narrowphase.find_tree_contacts
         compliances = fill(tree_delassus.BodyCompliances, P="M", Q="H", R="J")  # free since the prediction
-        return [
-            bound(find, trees, parameters, capsules, geoms, trees, self.slots,
-                  self._bodies, self._rigid_bodies, self._hulls, self._geom_states, self._static_blocks,
-                  self._capsule_states, contacts, self.candidates),
+        before = [
+            bound(tree_narrowphase.list_near_pairs, trees, parameters, capsules, geoms, trees, self._bodies,
+                  self._geom_states, self._static_blocks, self._capsule_states, contacts),
+            bound(find, trees * self.slots, parameters, capsules, geoms, trees, trees * self.slots, self._bodies,
+                  self._capsule_states, self._rigid_bodies, self._hulls, self._geom_states, contacts,
+                  self.candidates),
+            bound(tree_narrowphase.number_tree_contacts, trees, trees, self.slots, few, contacts, self.contacts.source),
             bound(tree_islands.predict_impacted_trees, trees, plants.parameters, model, onset, contacts.is_impact,
                   forces, joints, arrays["phi_used"], arrays["tree_euler_steps"], bodies, factors, scratch, prediction),
-            bound(tree_islands.write_tree_rows, trees * self.slots, parameters, self._pairs, capsules, geoms, trees,
-                  self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts, self.contacts,
-                  self.rows),
+            bound(tree_islands.write_tree_rows, entries * self.slots, parameters, self._pairs, capsules, geoms, trees,
+                  self.slots, self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts,
+                  self.contacts, self.rows),
             bound(tree_delassus.respond_at_contacts, trees, model, arrays["body_branches"], trees, factors,
                   self.contacts, self.rows, contacts, compliances, self._response),
-            bound(tree_delassus.write_delassus, trees * self.slots, model, trees, width, factors, contacts,
+            bound(tree_delassus.write_delassus, entries * self.slots, model, trees, width, factors, contacts,
                   self.contacts, self.rows, compliances, self._response, self._system),
-            bound(tree_islands.solve_trees, -(-trees * few // block) * block, p.solver_sweeps, p.solver_newton_steps,
-                  p.solver_newton_contacts, p.solver_tolerance, trees, width, few, contacts, self._system,
+        ]  # fmt: skip
+        solves = [
+            bound(tree_islands.solve_trees, -(-trees * first // block) * block, p.solver_sweeps, p.solver_newton_steps,
+                  p.solver_newton_contacts, p.solver_tolerance, trees, width, first, contacts, self._system,
                   self._search),
             bound(tree_islands.solve_busy_trees, self._groups * lanes, p.solver_sweeps, p.solver_newton_steps,
                   p.solver_newton_contacts, p.solver_tolerance, trees, width, lanes, self._groups, contacts,
                   self._system, self._dense, self._dense_search),
-            bound(tree_islands.apply_tree_impulses, trees, parameters, model, arrays["body_branches"], onset, trees,
-                  width, self.rows, self._system, factors, self._was_in_contact, arrays["tree_euler_steps"], contacts,
-                  self.contacts, self._warm_start, arrays["body_wrench"], work, scratch, prediction),
         ]  # fmt: skip
+        after = [
+            bound(tree_islands.apply_tree_impulses, trees, parameters, model, arrays["body_branches"], onset, trees,
+                  width, self._bodies.q, self.rows, self._system, factors, self._was_in_contact,
+                  arrays["tree_euler_steps"], contacts, self.contacts, self._warm_start, arrays["body_wrench"], work,
+                  scratch, prediction),
+        ]  # fmt: skip
+        return before, solves, after
 
     def solve(self) -> None:
         """Launch what comes between the prediction and the integration of a step: for ``advance()``."""
-        for launch, count in self._launches:
+        for launch, count in self._before:
+            launch(count)
+        (solve_most, of_most), (solve_busy, of_busy) = self._solves
+        if self._beside is None:
+            solve_most(of_most)
+            solve_busy(of_busy)
+        else:  # side by side: few trees are busy, but each of them for long
+            with wp.ScopedStream(self._beside):
+                solve_busy(of_busy)
+            solve_most(of_most)
+            self._device.stream.wait_stream(self._beside)
+        for launch, count in self._after:
             launch(count)
 
     # ------------------------------------------------------------------ results
