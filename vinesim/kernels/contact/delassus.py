@@ -10,6 +10,7 @@ they add, J_r H^-1 J_r^T, has the rank of their degrees of freedom and stays in 
 
 import warp as wp
 
+from vinesim.kernels.contact.islands import padded
 from vinesim.kernels.contact.row_response import EIGHT
 from vinesim.kernels.contact.structs import (
     Contacts,
@@ -86,7 +87,6 @@ def respond_rigidly(
     EIGHT
     + """
     const int row_pitch = jacobian.strides[0] / (int)sizeof(double);
-    const int width = (3 * count + 7) / 8 * 8;
     const float* const velocity = response.data + number;
     for (int r = 0; r < 3; ++r) {
         const double* const row = jacobian.data + (3 * (side / 2) + r) * row_pitch + 6 * (side % 2);
@@ -105,12 +105,13 @@ def respond_rigidly(
 """
 )
 def add_entries(
-    side: int, jacobian: wp.array2d(dtype=wp.float64), response: wp.array(dtype=float), number: int,
+    side: int, jacobian: wp.array2d(dtype=wp.float64), response: wp.array(dtype=float), number: int, width: int,
     sides: wp.array(dtype=wp.int32), start: int, count: int, place: wp.array(dtype=wp.int32), first_place: int,
     delassus: wp.array(dtype=wp.float64), at: int, pitch: int,
 ):  # fmt: skip
     """Add the velocities along the rows of a side by unit impulses along those of a group of ``count`` sides, listed from
-    ``start`` on. ``number``: first one of the response of the side's body to them; ``at``: entry of the first row."""
+    ``start`` on. ``number``: first one of the response of the side's body to them, in rows of ``width``; ``at``: entry of
+    the first row."""
     ...
 
 
@@ -151,9 +152,10 @@ def assemble_delassus(
             while groups.tree[group] == tree:
                 start = groups.start[group]
                 count = groups.start[group + 1] - start
-                from_number = groups.response[group] + (slot - tree) * 6 * ((3 * count + 7) / 8 * 8)
+                width = padded(3 * count)
+                number = groups.response[group] + (slot - tree) * 6 * width
                 add_entries(
-                    2 * c + k, rows_out.plant_jacobian, response, from_number, groups.side, start, count, contacts.place,
-                    first, rows_out.delassus, at, pitch,
+                    2 * c + k, rows_out.plant_jacobian, response, number, width, groups.side, start, count,
+                    contacts.place, first, rows_out.delassus, at, pitch,
                 )  # fmt: skip
                 group = group + 1

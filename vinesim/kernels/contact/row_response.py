@@ -9,6 +9,7 @@ groups of ten: three rows of each are thirty columns, and eight columns are comp
 import warp as wp
 
 from vinesim.kernels.articulation.structs import ArticulationModel, Factors
+from vinesim.kernels.contact.islands import padded
 from vinesim.kernels.contact.structs import SideGroups
 
 wp.set_module_options({"enable_backward": False})
@@ -202,7 +203,7 @@ def respond_to_groups(
     bodies = (last - first) / model.pitch + 1
     row = group % scratch_rows * stride
     sides = groups.start[group + 1] - groups.start[group]
-    width = (3 * sides + 7) / 8 * 8
+    width = padded(3 * sides)
     mark_paths(first, bodies, row, start, end, place, touched, model, scratch_out)
     for number in range(sides):
         side = groups.side[groups.start[group] + number]
