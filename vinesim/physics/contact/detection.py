@@ -175,7 +175,9 @@ class ContactDetection:
     def find_reached_trees(self) -> np.ndarray:
         """Sleeping trees [k] with which one of the listed awake ones is in contact, or will be before the step ends."""
         self._is_reached[:] = False
-        self._find_reached_trees(int(self.counters[structs.AWAKE_TREES]))
+        awake = int(self.counters[structs.AWAKE_TREES])
+        if awake < len(self._is_reached):  # else no tree sleeps; one that falls asleep has them compared anew
+            self._find_reached_trees(awake)
         return self._is_reached.nonzero()[0]
 
     def find_candidates(self, plant_plant_contacts: bool) -> None:
