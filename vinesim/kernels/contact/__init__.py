@@ -1,6 +1,7 @@
 """Contacts of plants with rigid bodies and with each other: broadphase, narrowphase, islands, friction-cone solver.
 
 The stages in their order, a module each: ``broadphase``, ``narrowphase_rigid`` and ``narrowphase_plants``, ``islands``,
-``jacobians``, ``delassus``, ``projected_gauss_seidel`` with the steps of ``newton``, ``forces``. ``structs`` groups their
-arrays, ``distance`` and ``motion`` hold the geometry.
+``jacobians``, ``row_response``, ``delassus``, ``projected_gauss_seidel`` with the steps of ``newton`` on an
+``island_system``, ``forces``. ``structs`` groups their arrays, ``distance`` and ``body_motion`` hold the geometry. Modules
+named ``tree_`` do the same for batches of trees on a GPU.
 """
