@@ -127,6 +127,12 @@ def block_pitch(block: int, islands: Islands):
 
 
 @wp.func
+def contact_row(place: int, block: int, islands: Islands):
+    """First of the three rows of a contact."""
+    return islands.row_start[block] + 3 * (place - islands.block_start[block])
+
+
+@wp.func
 def island_dofs(island: int, islands: Islands):
     """Degrees of freedom of the rigid bodies of an island."""
     return islands.first_dof[island + 1] - islands.first_dof[island]
@@ -164,7 +170,7 @@ def contact_residual(
     place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system: IslandSystem
 ):
     """The same with velocity without impulses, bias and compliance: what is 0 along rows that press or stick."""
-    row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+    row = contact_row(place, block, islands)
     value = three(row, system.free) + system.compliance[place] * three(row, system.impulse)
     return value + contact_velocity(place, block, island, islands, matrix, system)
 
@@ -231,7 +237,7 @@ def update_rigid_velocity(island: int, islands: Islands, system_out: IslandSyste
     if dofs > 0:
         for block in range(islands.first_block[island], islands.first_block[island + 1]):
             for place in range(islands.block_start[block], islands.block_start[block + 1]):
-                row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+                row = contact_row(place, block, islands)
                 push_rigid_bodies(
                     three(row, system_out.impulse), system_out.response, rigid_entry(place, island, islands),
                     system_out.velocity, first, dofs,
@@ -275,7 +281,7 @@ def scatter_impulses(island: int, dt: wp.float64, islands: Islands, system_out: 
         system_out.rigid_force[dof] = wp.float64(0.0)
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         for place in range(islands.block_start[block], islands.block_start[block + 1]):
-            x = three(islands.row_start[block] + 3 * (place - islands.block_start[block]), system_out.impulse)
+            x = three(contact_row(place, block, islands), system_out.impulse)
             set_three(3 * islands.contact[place], x, rows_out.impulse)
             at = rigid_entry(place, island, islands)
             add_rigid_force(x, dt, system_out.jacobian, at, islands.dof, first, dofs, system_out.rigid_force)

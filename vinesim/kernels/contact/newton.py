@@ -13,6 +13,7 @@ from vinesim.kernels.contact.island_system import (
     IslandSystem,
     block_pitch,
     contact_residual,
+    contact_row,
     island_dofs,
     rigid_entry,
     set_three,
@@ -86,7 +87,7 @@ def linearise_friction(
     ``right``: entries of right-hand sides.
     """
     one = wp.float64(1.0)
-    row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+    row = contact_row(place, block, islands)
     mass = system_out.mass[place][1]
     friction = system_out.friction[place]
     residual = contact_residual(place, block, island, islands, matrix, system_out)
@@ -215,9 +216,7 @@ def eliminate(system: wp.array(dtype=wp.float64), at: int, size: int, right: int
 
 
 @wp.func
-def keep_solution(
-    block: int, island: int, count: int, pitch: int, islands: Islands, system_out: IslandSystem
-):  # fmt: skip
+def keep_solution(block: int, island: int, count: int, pitch: int, islands: Islands, system_out: IslandSystem):
     """Keep the solution of a block for all of its contacts: 0 for those that do not press."""
     start = islands.block_start[block]
     columns = 1 + island_dofs(island, islands)
@@ -331,6 +330,6 @@ def newton_step(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64
             x = system_out.solution[at]
             for i in range(dofs):
                 x = x + system_out.solution[at + 1 + i] * system_out.rigid_matrix[first + i, 0]
-            row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+            row = contact_row(place, block, islands)
             set_three(row, project_into_cone(x, system_out.friction[place]), system_out.impulse)
     update_rigid_velocity(island, islands, system_out)

@@ -11,7 +11,9 @@ from vinesim.kernels.contact.conjugate_gradient import follow_conjugate_directio
 from vinesim.kernels.contact.island_system import (
     IslandSystem,
     contact_residual,
+    contact_row,
     gather_island,
+    island_dofs,
     push_rigid_bodies,
     rigid_entry,
     scatter_impulses,
@@ -37,7 +39,7 @@ def relax_contact(
 ):
     """One Gauss-Seidel step of a contact, normal and then friction; returns the largest change of an impulse [N s]."""
     zero = wp.float64(0.0)
-    row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+    row = contact_row(place, block, islands)
     before = three(row, system_out.impulse)
     residual = contact_residual(place, block, island, islands, matrix, system_out)
     mass = system_out.mass[place]
@@ -58,10 +60,9 @@ def relax_contact(
     change = wp.vec3d(pressed, fu - before[1], fv - before[2])
     if change[0] != zero or change[1] != zero or change[2] != zero:
         set_three(row, wp.vec3d(normal, fu, fv), system_out.impulse)
-        first = islands.first_dof[island]
         push_rigid_bodies(
-            change, system_out.response, rigid_entry(place, island, islands), system_out.velocity, first,
-            islands.first_dof[island + 1] - first,
+            change, system_out.response, rigid_entry(place, island, islands), system_out.velocity,
+            islands.first_dof[island], island_dofs(island, islands),
         )  # fmt: skip
     return wp.max(wp.abs(change[0]), wp.abs(change[1]) + wp.abs(change[2]))
 
@@ -75,7 +76,7 @@ def sweep(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), sys
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         for place in range(islands.block_start[block], islands.block_start[block + 1]):
             change = wp.max(change, relax_contact(place, block, island, islands, matrix, system_out))
-            row = islands.row_start[block] + 3 * (place - islands.block_start[block])
+            row = contact_row(place, block, islands)
             largest = wp.max(largest, system_out.impulse[row])
     return change, largest
 
