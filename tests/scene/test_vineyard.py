@@ -1,6 +1,10 @@
 """Generation of vineyards: determinism, local randomness, statistics of the plant file, and equilibrium."""
 
 import math
+import os
+import platform
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
@@ -11,7 +15,7 @@ from vinesim import frames
 from vinesim.scene import plant_parameters
 from vinesim.scene import spec as scenes
 from vinesim.scene.berries import VARIETIES
-from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.generation.vineyard import generate, generate_uncached
 from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
 from vinesim.scene.summary import summary_rows, total_leaf_area
@@ -31,6 +35,20 @@ def test_generation_is_deterministic_by_seed(vineyard):
     scene, model = vineyard
     assert generate(scene).digest() == model.digest()
     assert generate(msgspec.structs.replace(scene, seed=scene.seed + 1)).digest() != model.digest()
+
+
+def test_generation_gives_the_same_bits_on_another_cpu(vineyard):
+    """NumPy without AVX and AVX-512: clients on unlike machines must hold the same vineyard."""
+    scene, model = vineyard
+    found = (
+        "from vinesim.scene import spec; from vinesim.scene.generation.vineyard import generate_uncached as generate"
+    )
+    code = f"{found}; print(generate(spec.load_scene({scene.name!r})).digest())"
+    environment = os.environ | {"OPENBLAS_CORETYPE": "Prescott"}
+    if platform.machine() == "x86_64":
+        environment["NPY_DISABLE_CPU_FEATURES"] = "X86_V3 X86_V4 AVX512_ICL AVX512_SPR"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == generate_uncached(scene).digest() == model.digest()
 
 
 def test_another_row_changes_no_tree_of_the_others(vineyard):

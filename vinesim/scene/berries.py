@@ -15,7 +15,7 @@ import numpy as np
 
 from vinesim import disk_cache, frames
 from vinesim.frames import normalize
-from vinesim.scene import plant_parameters
+from vinesim.scene import plant_parameters, portable_math
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ def mass_by_segment(
     count, pieces = np.asarray(count), np.asarray(pieces)
     length = _tables()[0][which, count]
     position, radius = position[which] / length[:, None, None], radius[which] / length[:, None]
-    weight = np.where(number < count[:, None], radius**3, 0.0)
+    weight = np.where(number < count[:, None], portable_math.power(radius, 3), 0.0)
     weight = weight / weight.sum(1, keepdims=True)
     piece = np.clip((position[..., 0] * pieces[:, None]).astype(int), 0, pieces[:, None] - 1)
     flat = (np.arange(len(count))[:, None] * most + piece).ravel()
@@ -218,11 +218,12 @@ def _draft(count: int, taper: float, wings: int, seed: int) -> tuple[np.ndarray,
         lines.append((np.array([1.0 + wing, 0.0, 0.0]), tip, 0.55 * wide))
     which = g.choice(len(lines), count, p=np.array([1.0] + [0.2] * wings) / (1.0 + 0.2 * wings))
     start, end, spread = (np.array([line[k] for line in lines])[which] for k in range(3))
-    along = 0.03 + 0.97 * (1.0 - (1.0 - g.uniform(0.0, 0.985, count)) ** (1.0 / (2.0 * taper + 1.0)))
+    along = 0.03 + 0.97 * (1.0 - portable_math.power(1.0 - g.uniform(0.0, 0.985, count), 1.0 / (2.0 * taper + 1.0)))
     foot = start + (end - start) * along[:, None]
     around = g.uniform(0.0, 2.0 * np.pi, count)
     out = normalize(np.stack([g.uniform(-0.25, 0.7, count), np.cos(around), np.sin(around)], 1))
-    pedicel = 0.9 * spread * (1.0 - along) ** taper * np.sqrt(g.uniform(0.15, 1.0, count)) + 0.6 * radius
+    narrowed = spread * portable_math.power(1.0 - along, taper)
+    pedicel = 0.9 * narrowed * np.sqrt(g.uniform(0.15, 1.0, count)) + 0.6 * radius
     share = np.linspace(0.0, 0.8, 5)[:, None]
     rachis = np.stack([a + (b - a) * share for a, b, _ in lines])
     return foot + out * pedicel[:, None], foot, radius, rachis

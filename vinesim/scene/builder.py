@@ -9,13 +9,14 @@ between unlike segments what their halves give in series.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
 
 from vinesim import frames
 from vinesim.errors import checked_index
-from vinesim.scene import berries, plant_parameters
+from vinesim.scene import berries, plant_parameters, portable_math
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
@@ -273,7 +274,7 @@ class TreeBuilder:
         above = self.bodies[parent]
         berry = berries.VARIETIES[variety]
         share = parameters.bunch.stem_share.value
-        size = berry.volume_radius * np.cbrt(mass * (1.0 - share) / (count * berry.mass))
+        size = berry.volume_radius * math.cbrt(mass * (1.0 - share) / (count * berry.mass))
         length, radius = berries.hull_size(np.array(count), np.array(seed)) * size
         one = segment_bunches(
             np.array([mass]), np.array([length]), np.array([radius]), np.array([count]), np.array([seed]),
@@ -368,7 +369,7 @@ def segment_properties(
     inertia = np.stack([0.5 * mass * middle * middle, across, across], -1)
     halves = []
     for radius in (start, end):
-        area_moment = np.pi * radius**4 / 2.0 / length
+        area_moment = np.pi * portable_math.power(radius, 4) / 2.0 / length
         bend = modulus * area_moment
         twist = (shear_modulus(modulus) if shear is None else shear) * 2.0 * area_moment
         halves.append(np.stack([twist, bend, bend], -1))
@@ -402,18 +403,18 @@ def solve_rest_pose(model: Model) -> Model:
         above = parent[here]
         np.add.at(force, above, force[here])
         np.add.at(moment, above, moment[here] + frames.cross(world[here, :3] - world[above, :3], force[here]))
-    settled = np.broadcast_to(frames.IDENTITY, drawn.shape).copy()
     local = frames.rotate(frames.conjugate(world[:, 3:]), moment)
-    open_joints = np.arange(len(settled))
+    theta = np.zeros((len(drawn), 3))
+    open_joints = np.arange(len(drawn))
     for _ in range(60):  # the joint's middle axes depend on the answer; the map contracts for theta below ~1 rad
-        before = settled[open_joints]
-        theta = frames.log(before)
-        torque = _without_curvature(theta, frames.rotate(frames.exp(0.5 * theta), local[open_joints]))
-        settled[open_joints] = after = frames.exp(torque / model.joint_stiffness[open_joints])
+        before = theta[open_joints]
+        torque = _without_curvature(before, frames.rotate(frames.exp(0.5 * before), local[open_joints]))
+        theta[open_joints] = after = torque / model.joint_stiffness[open_joints]
         change = np.abs(after - before).max(1, initial=0.0)
         if change.max(initial=0.0) < 1e-12:
             break
         open_joints = open_joints[change > 0.0]  # the others have reached a fixed point, to the last bit
+    settled = frames.exp(theta)
     model.body_rest[:] = frames.multiply(drawn, frames.conjugate(settled))
     model.joint_settled[:] = settled
     return model

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene import berries
+from vinesim.scene import berries, portable_math
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.shoot_slots import AXIS_SEGMENTS, MAX_BUNCHES, PEDUNCLE_SEGMENTS
 from vinesim.scene.plant_parameters import Range, VineParameters
@@ -33,8 +34,8 @@ def sample_fruit(
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Two bunches for every shoot, of which :func:`choose_bunches` keeps some: fruit, at, peduncle, axis, roll."""
     fruit, peduncle = parameters.bunch, parameters.peduncle
-    sigma = np.sqrt(np.log(1.0 + fruit.mass_variation.value**2))
-    mass = fruit.mass.value * np.exp(sigma * normal(MAX_BUNCHES) - 0.5 * sigma**2)
+    sigma = math.sqrt(math.log(1.0 + fruit.mass_variation.value**2))
+    mass = fruit.mass.value * portable_math.exp(sigma * normal(MAX_BUNCHES) - 0.5 * sigma**2)
     mass = np.clip(mass, *fruit.mass_range.value)
     names = [v.name for v in berries.VARIETIES]
     in_turn = np.array([names.index(name) for name in scene.fruit.varieties])
@@ -43,7 +44,8 @@ def sample_fruit(
     berry_mass = np.array([v.mass for v in berries.VARIETIES])[variety]
     count = np.clip(np.round(juice / berry_mass), berries.MIN_BERRIES, berries.MAX_BERRIES).astype(int)
     seed = (uniform(MAX_BUNCHES) * 2.0**32).astype(np.uint32)
-    size = np.array([v.volume_radius for v in berries.VARIETIES])[variety] * np.cbrt(juice / (count * berry_mass))
+    volume_radius = np.array([v.volume_radius for v in berries.VARIETIES])[variety]
+    size = volume_radius * portable_math.cbrt(juice / (count * berry_mass))
     hull = berries.hull_size(count, seed) * size[..., None]
     drawn = {
         "mass": mass, "count": count, "length": hull[..., 0], "radius": hull[..., 1], "seed": seed, "variety": variety,

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene import builder
+from vinesim.scene import builder, portable_math
 from vinesim.scene.generation.shoot_slots import (
     AXIS_SEGMENTS,
     CORE_SLOTS,
@@ -70,7 +71,8 @@ def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
     share = np.linspace(0.0, 1.0, AXIS_SEGMENTS + 1)
     radius = shoots.base[:, None] + (tip - shoots.base[:, None]) * share
     green = np.clip((share[:-1] - cane.woody_share.value) / 0.2 + 0.5, 0.0, 1.0)
-    modulus = np.exp(np.log(cane.woody_modulus.value) * (1.0 - green) + np.log(cane.green_modulus.value) * green)
+    woody, soft = math.log(cane.woody_modulus.value), math.log(cane.green_modulus.value)
+    modulus = portable_math.exp(woody * (1.0 - green) + soft * green)
     parent = np.broadcast_to(np.arange(-1, AXIS_SEGMENTS - 1), (count, AXIS_SEGMENTS))
     _fill_rod(bodies, slice(0, AXIS_SEGMENTS), shoots.points, radius, modulus, cane, shoots.up, parent)
 

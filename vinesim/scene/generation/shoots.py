@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from vinesim import frames
-from vinesim.scene import builder
+from vinesim.scene import builder, portable_math
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.fruit import choose_bunches, sample_fruit
 from vinesim.scene.generation.shoot_slots import (
@@ -88,7 +88,7 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     base = 0.5 * cane.base_diameter.at(uniform())
     side_sign = np.where(number % 2, 1.0, -1.0)
     if tendone:
-        turn = np.arctan2(along[:, 1], along[:, 0]) + side_sign * (1.0 + 0.6 * uniform())
+        turn = portable_math.arctan2(along[:, 1], along[:, 0]) + side_sign * (1.0 + 0.6 * uniform())
         heading = np.stack([np.cos(turn), np.sin(turn), -0.38 + 0.15 * uniform()], -1)
         up = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
     else:
@@ -110,7 +110,7 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
         scene, parameters, points, nodes, structure.row[owner], uniform, normal
     )
     rise = np.maximum(peduncle[:, :, 0, 2] - points[:, :1, 2], 0.0)
-    stiffness = cane.woody_modulus.value * np.pi / 4.0 * base**4
+    stiffness = cane.woody_modulus.value * np.pi / 4.0 * portable_math.power(base, 4)
     burden = fruit["mass"] * -builder.GRAVITY[2] * rise**2 / stiffness[:, None]
     chosen = choose_bunches(scene, structure, per_vine, peduncle, burden, fruit)
     leaf_normal = np.moveaxis(normal(MAX_NODES + LATERAL_NODES, 8), -1, 0)

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from vinesim import array_fields, disk_cache, frames
-from vinesim.scene import berries, builder, leaves, plant_parameters
+from vinesim.scene import berries, builder, leaves, plant_parameters, portable_math
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
 from vinesim.scene.generation.foliage import place_leaves
 from vinesim.scene.generation.plant_bodies import Bodies, build_bodies
@@ -132,7 +132,7 @@ def _assemble_model(
     model.bunch_berries[:] = fruit["count"]
     for name in ("length", "radius", "seed", "variety", "pull"):
         getattr(model, f"bunch_{name}")[:] = fruit[name]
-    model.bunch_bend[:] = parameters.peduncle.bend_strength.value * np.pi / 4.0 * fruit["thick"] ** 3
+    model.bunch_bend[:] = parameters.peduncle.bend_strength.value * np.pi / 4.0 * portable_math.power(fruit["thick"], 3)
     model.bunch_cluster[:] = np.stack([number[:, cluster_slots(k).start] for k in range(MAX_BUNCHES)], 1)[
         shoots.has_bunch
     ]

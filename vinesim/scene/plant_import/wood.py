@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -192,7 +193,7 @@ def _turned(turn: np.ndarray, along: np.ndarray) -> np.ndarray:
     size = float(np.linalg.norm(axis))
     if size < 1e-9:
         return turn if x @ along > 0.0 else frames.from_x_axis(along)
-    return frames.multiply(frames.exp(axis / size * np.arctan2(size, x @ along)), turn)
+    return frames.multiply(frames.exp(axis / size * math.atan2(size, x @ along)), turn)
 
 
 def _hang(
