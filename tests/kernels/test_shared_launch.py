@@ -3,6 +3,7 @@ pool that is closed or garbage-collected leaves no thread running."""
 
 from __future__ import annotations
 
+import ctypes
 import random
 import threading
 import time
@@ -13,7 +14,7 @@ import warp as wp
 
 from tests.support.waiting import wait
 from vinesim.kernels.launch import bind_launch, join_partitions
-from vinesim.kernels.shared_launch import LaunchPool
+from vinesim.kernels.shared_launch import ONCE, LaunchPool
 
 SIZE = 500
 
@@ -38,6 +39,20 @@ def double(
 ):
     """Double the count of one listed entry."""
     counts_out[entries[wp.tid()]] *= 2
+
+
+@wp.kernel(enable_backward=False)
+def count_positive(
+    # in
+    entries: wp.array(dtype=wp.int32),
+    counts: wp.array(dtype=wp.int32),
+    # out
+    number_out: wp.array(dtype=wp.int32),
+):
+    """One thread in all: how many entries have been counted."""
+    for i in range(counts.shape[0]):
+        if counts[i] > 0:
+            number_out[0] += 1
 
 
 @wp.kernel(enable_backward=False)
@@ -91,6 +106,33 @@ def test_each_entry_goes_once_through_all_launches_in_their_order(pool: LaunchPo
         counted = Counted(pool, chunk)
         for count in (0, 1, 2 * chunk - 1, 2 * chunk, SIZE, *(draw.randint(0, SIZE) for _ in range(200))):
             counted.check(count, draw.randint(0, SIZE - count))
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_a_launch_of_a_sequence_may_determine_the_number_of_threads_of_the_next(
+    pool: LaunchPool, packed: bool, monkeypatch
+) -> None:
+    if not packed:
+        monkeypatch.setattr("vinesim.kernels.launch.ctypes", None)
+    counted, following = Counted(pool, 3), Counted(pool, 64)
+    listed, given = np.zeros(1, np.int32), ctypes.c_int32()
+    number = wp.array(listed, dtype=wp.int32, device="cpu", copy=False)
+    entries = wp.array(counted.entries, dtype=wp.int32, device="cpu")
+    count = bind_launch(count_positive, [entries, counted.counts], [number])
+    run = pool.sequence(
+        [(counted.launch, given), (count, ONCE), (following.launch, ctypes.c_int32.from_buffer(listed))]
+    )
+    for entry_count in (0, 1, 5, 6, 127, 128, SIZE):
+        counted.launch(2, 7)  # the next launch begins with the first entry again
+        counted.counts.zero_()
+        following.counts.zero_()
+        given.value, listed[0] = entry_count, 0
+        run()
+        assert listed[0] == entry_count
+        for each in (counted, following):
+            wanted = np.zeros(SIZE, np.int32)
+            wanted[each.entries[:entry_count]] = 2
+            np.testing.assert_array_equal(each.counts.numpy(), wanted)
 
 
 def test_threads_that_sleep_are_woken_by_a_launch(pool: LaunchPool) -> None:

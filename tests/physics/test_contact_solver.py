@@ -362,7 +362,7 @@ def test_kernels_stay_bound_while_hands_close_and_bunches_take_bodies():
         spec = HumanSpec("eva", 1, standing_pose(frames.pose([0.4, 0.1, 0.0])))
         physics.add_human(spec)
         physics.step()
-        launches = physics.contact_solver.detection._find_rigid_contacts
+        launches = physics.contact_solver.detection.narrowphase
         for tick in range(60):
             if tick in (5, 25):
                 physics.pick(tick // 10)
@@ -371,7 +371,7 @@ def test_kernels_stay_bound_while_hands_close_and_bunches_take_bodies():
             if make_anew and physics.contact_solver._generation != physics.rigid.generation:
                 physics.contact_solver._rigid_arrays.world = None
             physics.step()
-        assert (physics.contact_solver.detection._find_rigid_contacts is launches) != make_anew
+        assert (physics.contact_solver.detection.narrowphase is launches) != make_anew
         data = physics.rigid.mj_data
         return physics.state.joint_q.tobytes() + data.qpos.tobytes() + data.qvel.tobytes()
 

@@ -45,19 +45,14 @@ def dense(physics: Physics, response: np.ndarray) -> np.ndarray:
     return np.einsum("rui,uitj,stj->rs", jacobian, response, jacobian)
 
 
-def check(physics: Physics, monkeypatch: pytest.MonkeyPatch) -> int:
+def check(physics: Physics) -> int:
     """Compare both in one step; returns the largest number of sides on one tree."""
-    kept: list[np.ndarray] = []
-    compute = RowResponse.compute
-
-    def compute_both(responses: RowResponse, groups: int) -> None:
-        compute(responses, groups)
-        kept[:] = [physics.plants.impulse_response(physics.contact_solver.impulses.bodies)]
-
-    with monkeypatch.context() as patched:
-        patched.setattr(RowResponse, "compute", compute_both)
-        physics.step()
-    expected, found = dense(physics, kept[0]), assembled(physics)
+    response = np.zeros(0)
+    for name, stage in physics.stages:
+        stage()
+        if name.endswith("solve all together"):
+            response = physics.plants.impulse_response(physics.contact_solver.impulses.bodies)
+    expected, found = dense(physics, response), assembled(physics)
     np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(expected).max())
     solver, count = physics.contact_solver, physics.contact_solver.count
     sides = np.diff(solver.impulses.response.groups.start[: solver.detection.counters[structs.GROUPS] + 1])
@@ -65,17 +60,17 @@ def check(physics: Physics, monkeypatch: pytest.MonkeyPatch) -> int:
     return int(np.bincount(physics.model.body_tree[solver.impulses.contacts.body[:count]]).max())
 
 
-def test_entries_are_those_of_dense_responses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entries_are_those_of_dense_responses() -> None:
     """Canes between many bars: more rows on a tree than one group has."""
     physics = Physics(scenes.cane_row(3))
     physics.add_robot(scenes.combs("combs", 14, 3))
     for tick in range(40):
         physics.rigid.command("combs", np.full(2, min(0.0005 * tick, 0.005)))
         physics.step()
-    assert check(physics, monkeypatch) > MOST_SIDES
+    assert check(physics) > MOST_SIDES
 
 
-def test_entries_of_plants_on_plants_have_two_sides(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_entries_of_plants_on_plants_have_two_sides() -> None:
     """A cane that lies across two others: contacts with a side on either tree, all in one block."""
     lower = [cane((0.0, side, 1.0), radius=0.005) for side in (0.0, 0.3)]
     upper = cane((0.5, -0.9, 1.02), radius=0.004, heading=0.5 * np.pi)
@@ -85,7 +80,7 @@ def test_entries_of_plants_on_plants_have_two_sides(monkeypatch: pytest.MonkeyPa
     scenes.keep_awake(physics, np.arange(3))
     while physics.contact_solver.count < 2:
         physics.step()
-    check(physics, monkeypatch)
+    check(physics)
     assert (physics.contact_solver.impulses.contacts.other_slot[: physics.contact_solver.count] >= 0).all()
 
 
@@ -114,7 +109,7 @@ def test_responses_are_those_of_bodies_wherever_kernels_find_them(interleave: in
     response.groups.start[:6], response.groups.tree[:5] = 3 * np.arange(6), 3 * np.arange(5)
     width = 16
     response.groups.response[:5] = 3 * 6 * width * np.arange(5)
-    response.compute(5)
+    response.launch(5)
     found = response.numbers[: 5 * 3 * 6 * width].reshape(5, 3, 6, width)
     expected = plants.impulse_response(bodies)
     for tree in range(5):

@@ -36,9 +36,9 @@ def test_rows_that_are_cleared_where_they_were_written_are_rows_of_zeros(monkeyp
     """To the bit as with arrays that are cleared as a whole before every solve."""
     solve, used = ImpulseSolver.solve, set()
 
-    def solve_with_clear_rows(solver: ImpulseSolver, count: int, counters: np.ndarray) -> None:
+    def solve_with_clear_rows(solver: ImpulseSolver, count: int) -> None:
         solver.rows.rigid_jacobian[:] = solver.rows.rigid_response[:] = 0.0
-        solve(solver, count, counters)
+        solve(solver, count)
         used.update(solver._rigid_spans[:count, 0].tolist())
 
     usual = states(Physics(scenes.cane_row(CANES)))

@@ -25,7 +25,7 @@ class PackedLaunch:
     """A launch as native code makes it."""
 
     head: tuple[int, int, int]
-    """Address of the kernel, address of the list, bytes of an entry."""
+    """Address of the kernel, address of the list, bytes of an entry; without a list nothing but the first counts."""
     parts: tuple[tuple[int, int, int, int, int], ...]
     """For each partition the addresses of its bounds, of their shape and their size, of its arguments, and of the
     address of the list in these."""
@@ -35,7 +35,9 @@ class BoundLaunch(Protocol):
     """A kernel on its arrays: ``launch(threads, first, partition)``, see :func:`bind_launch`."""
 
     packed: PackedLaunch | None
-    """None without a list, on CUDA, and where Warp is another."""
+    """None on CUDA, where Warp is another, and of what is no single kernel."""
+    job: ctypes.Array | None
+    """What the threads of a pool share: see :meth:`vinesim.kernels.shared_launch.LaunchPool.share`."""
 
     def __call__(self, threads: int, first: int = 0, partition: int = 0) -> None: ...
 
@@ -65,20 +67,19 @@ def bind_launch(
     if not wp.get_device(device).is_cpu:
         return _recorded(commands, inputs, at)
     try:
-        calls, parts = [], []
+        calls, parts, no_list = [], [], ctypes.c_int64()
         for command in commands:
             bounds, values = command.params[0], command.params[1:]
             fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, values, strict=True)]
             packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
             listed = getattr(packed, index_list) if index_list else None
             calls.append((bounds, bounds.shape, listed, ctypes.byref(bounds), ctypes.byref(packed)))
-            if listed is not None:
-                at_bounds, fields_of = ctypes.addressof(bounds), type(bounds)
-                at_list = ctypes.addressof(listed) + type(listed).data.offset
-                parts.append((
-                    at_bounds, at_bounds + fields_of.shape.offset, at_bounds + fields_of.size.offset,
-                    ctypes.addressof(packed), at_list,
-                ))  # fmt: skip
+            at_bounds, fields_of = ctypes.addressof(bounds), type(bounds)
+            at_list = ctypes.addressof(no_list if listed is None else listed)
+            parts.append((
+                at_bounds, at_bounds + fields_of.shape.offset, at_bounds + fields_of.size.offset,
+                ctypes.addressof(packed), at_list + (0 if listed is None else type(listed).data.offset),
+            ))  # fmt: skip
         forward = commands[0].hooks.forward
         start, step = (listed.data, inputs[at].strides[0]) if index_list else (0, 0)
         address = ctypes.cast(forward, ctypes.c_void_p).value or 0
@@ -93,13 +94,15 @@ def bind_launch(
             shape[0] = bounds.size = threads
             forward(at_bounds, at_packed)
 
-    launch.keeps = (commands, inputs, outputs, calls)  # type: ignore[attr-defined]
-    return bound(launch, PackedLaunch((address, start, step), tuple(parts)) if index_list else None)
+    launch.keeps = (commands, inputs, outputs, calls, no_list)  # type: ignore[attr-defined]
+    return bound(launch, PackedLaunch((address, start, step), tuple(parts)))
 
 
-def bound(launch: Callable[..., None], packed: PackedLaunch | None = None) -> BoundLaunch:
+def bound(
+    launch: Callable[..., None], packed: PackedLaunch | None = None, job: ctypes.Array | None = None
+) -> BoundLaunch:
     """A function that launches kernels, as a :class:`BoundLaunch`."""
-    launch.packed = packed  # type: ignore[attr-defined]
+    launch.packed, launch.job = packed, job  # type: ignore[attr-defined]
     return cast(BoundLaunch, launch)
 
 

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import itertools
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import warp as wp
 
@@ -27,6 +28,12 @@ _IDLE, _ASLEEP, _ENDED = 0, 3, 4
 _FIRST_THREAD, _LINE = 16, 8
 """Places in the memory of a pool, by numbers of eight bytes: the states of the threads, each in a cache line of its own
 with the address of its semaphore. Before them, in lines of their own, are the next chunk and the address of the job."""
+ONCE = ctypes.c_int32(1)
+"""Number of threads of a kernel that is one thread in all, for :meth:`LaunchPool.sequence`."""
+_FIRST_ENTRY = 3
+"""Place in a job, see ``_COMMON``."""
+_ALL = 1 << 40
+"""Entries of a chunk of a launch that is not shared."""
 _SEMAPHORE_SIZE = 128
 """[bytes] More than any C library's ``sem_t``."""
 _C_FUNCTIONS = ("sem_wait", "clock_gettime", "sem_post", "sched_yield")
@@ -54,10 +61,7 @@ _COMMON = """
     };
     // job: chunks, entries of a chunk, entries, first entry, launches, numbers of a launch; of each launch: kernel, address
     // of the list, bytes of an entry; for each thread addresses of bounds, their shape and size, arguments, list in them
-    const auto run_chunk = [&](const long long* job, int thread) {
-        const long long chunk = __atomic_fetch_add(pool, 1, __ATOMIC_RELAXED);
-        if (chunk >= job[0]) return false;
-        const long long first = chunk * job[1], left = job[2] - first, count = left < job[1] ? left : job[1];
+    const auto run_part = [&](const long long* job, int thread, long long first, long long count) {
         for (long long i = 0; i < job[4]; ++i) {
             const long long* const launch = job + 6 + i * job[5];
             const long long* const mine = launch + 3 + 5 * thread;
@@ -66,6 +70,12 @@ _COMMON = """
             *(long long*)mine[4] = launch[1] + (job[3] + first) * launch[2];
             ((Kernel)launch[0])((void*)mine[0], (void*)mine[3]);
         }
+    };
+    const auto run_chunk = [&](const long long* job, int thread) {
+        const long long chunk = __atomic_fetch_add(pool, 1, __ATOMIC_RELAXED);
+        if (chunk >= job[0]) return false;
+        const long long first = chunk * job[1], left = job[2] - first;
+        run_part(job, thread, first, left < job[1] ? left : job[1]);
         return true;
     };
 """
@@ -77,26 +87,42 @@ _COMMON = """
 """
     + _COMMON
     + """
-    const long long* const work = (const long long*)(size_t)job;
-    __atomic_store_n(pool, 0, __ATOMIC_RELAXED);
-    __atomic_store_n(pool + 8, (long long)job, __ATOMIC_RELEASE);
-    const long long wanted = threads < work[0] ? threads : work[0];
-    for (int i = 1; i < wanted; ++i) {  // to wake one takes as long as eight chunks
-        if (!change(i, IDLE, ASSIGNED) && work[0] >= 8 && change(i, ASLEEP, ASSIGNED)) ((Semaphore)(size_t)post)((void*)state_of(i)[1]);
-    }
-    while (run_chunk(work, 0)) {}
-    for (int i = 1; i < threads; ++i) {
-        change(i, ASSIGNED, IDLE);  // one that has not begun, perhaps for want of a core, is not waited for
-        for (int polls = 0; __atomic_load_n(state_of(i), __ATOMIC_ACQUIRE) == WORKING; ++polls) {
-            pause();
-            if (polls > 1000 && yield_) ((Yield)(size_t)yield_)();
+    const auto lead = [&](const long long* job) {
+        __atomic_store_n(pool, 0, __ATOMIC_RELAXED);
+        __atomic_store_n(pool + 8, (long long)(size_t)job, __ATOMIC_RELEASE);
+        const long long wanted = threads < job[0] ? threads : job[0];
+        for (int i = 1; i < wanted; ++i) {  // to wake one takes as long as eight chunks
+            if (!change(i, IDLE, ASSIGNED) && job[0] >= 8 && change(i, ASLEEP, ASSIGNED)) ((Semaphore)(size_t)post)((void*)state_of(i)[1]);
+        }
+        while (run_chunk(job, 0)) {}
+        for (int i = 1; i < threads; ++i) {
+            change(i, ASSIGNED, IDLE);  // one that has not begun, perhaps for want of a core, is not waited for
+            for (int polls = 0; __atomic_load_n(state_of(i), __ATOMIC_ACQUIRE) == WORKING; ++polls) {
+                pause();
+                if (polls > 1000 && yield_) ((Yield)(size_t)yield_)();
+            }
+        }
+    };
+    const long long* const listed = (const long long*)(size_t)jobs;
+    for (int i = 0; i < count; ++i) {
+        long long* const job = (long long*)(size_t)listed[2 * i];
+        const long long entries = *(const int*)(size_t)listed[2 * i + 1];
+        if (threads > 1 && entries >= 2 * job[1]) {
+            job[0] = (entries + job[1] - 1) / job[1];
+            job[2] = entries;
+            lead(job);
+        } else if (entries > 0) {
+            run_part(job, 0, 0, entries);
         }
     }
 #endif
 """
 )
-def lead(address: wp.uint64, job: wp.uint64, threads: int, post: wp.uint64, yield_: wp.uint64):
-    """Work on a job with the other threads until all of it is done."""
+def lead(address: wp.uint64, jobs: wp.uint64, count: int, threads: int, post: wp.uint64, yield_: wp.uint64):
+    """Do jobs one after the other, each with the other threads if it has two chunks or more.
+
+    jobs: for each its address, and that of the number of its entries, which is read when the job begins.
+    """
     ...
 
 
@@ -144,10 +170,11 @@ def lead_threads(
     yield_address: wp.uint64,
     # in
     address: wp.uint64,
-    job: wp.uint64,
+    jobs: wp.uint64,
+    count: int,
 ):
     """One thread in all: the one that launches."""
-    lead(address, job, threads, post, yield_address)
+    lead(address, jobs, count, threads, post, yield_address)
 
 
 @wp.kernel(enable_backward=False)
@@ -179,7 +206,7 @@ class LaunchPool:
             self._post = library.sem_post
             can_sleep = not any(library.sem_init(semaphore, 0, 0) for semaphore in self._semaphores)
         except (OSError, AttributeError, TypeError):
-            calls, can_sleep = [], False
+            calls, can_sleep = [0] * len(_C_FUNCTIONS), False
         self.size = size if can_sleep else 1  # without POSIX semaphores the caller works alone
         self._calls = [wp.uint64(call) for call in calls]
         self._memory = (ctypes.c_int64 * (_FIRST_THREAD + _LINE * (size + 1)))()
@@ -203,31 +230,58 @@ class LaunchPool:
         All ``launches`` have the same list and are bound with :attr:`size` partitions; a chunk goes through one after
         the other. Fewer than two chunks are launched here, and so are launches that native code cannot make.
         """
-
         if self.size == 1 and len(launches) == 1:
             return launches[0]
+        job = _job(launches, chunk)
+        if job is None:
 
-        def launch_here(threads: int, first: int = 0, partition: int = 0) -> None:
-            for launch in launches:
-                launch(threads, first)
+            def launch_here(threads: int, first: int = 0, partition: int = 0) -> None:
+                for launch in launches:
+                    launch(threads, first)
 
-        packed = [launch.packed for launch in launches]
-        if self.size == 1 or not all(packed):
             return bound(launch_here)
-        numbers = [[*one.head, *(number for part in one.parts for number in part)] for one in packed if one]
-        head = [0, chunk, 0, 0, len(numbers), len(numbers[0])]
-        job = (ctypes.c_int64 * (len(head) + sum(map(len, numbers))))(*head, *(n for each in numbers for n in each))
-        at_job = wp.uint64(ctypes.addressof(job))
-        run = bind_launch(lead_threads, [self.size, *self._calls[2:], self._address, at_job], [])
+        entries = ctypes.c_int32()
+        run = self._bind([(job, entries)])
 
         def launch(threads: int, first: int = 0, partition: int = 0) -> None:
-            if threads < 2 * chunk:
-                launch_here(threads, first)
-            else:
-                job[0], job[2], job[3] = -(-threads // chunk), threads, first
-                run(1)
+            entries.value, job[_FIRST_ENTRY] = threads, first
+            run(1)
+            job[_FIRST_ENTRY] = 0
 
-        return bound(launch)
+        launch.keeps = launches  # type: ignore[attr-defined]
+        return bound(launch, job=job)
+
+    def sequence(self, launches: Sequence[tuple[BoundLaunch, ctypes.c_int32]]) -> Callable[[], None]:
+        """A function that makes ``launches`` one after the other, in one call of native code.
+
+        With each comes the memory of its number of threads, which is read when the launch begins: kernels before it may
+        write it. Launches with :meth:`share` are shared.
+        """
+        jobs = [(_job([launch], _ALL) if launch.job is None else launch.job, count) for launch, count in launches]
+        native = [(job, count) for job, count in jobs if job is not None]
+        if len(native) < len(jobs):  # on CUDA, or with another Warp
+
+            def launch_each() -> None:
+                for launch, count in launches:
+                    launch(count.value)
+
+            return launch_each
+        run = self._bind(native)
+
+        def launch() -> None:
+            run(1)
+
+        launch.keeps = launches  # type: ignore[attr-defined]
+        return launch
+
+    def _bind(self, jobs: Sequence[tuple[ctypes.Array, ctypes.c_int32]]) -> BoundLaunch:
+        """One launch for jobs, each with the memory of its number of entries."""
+        addresses = [(ctypes.addressof(job), ctypes.addressof(count)) for job, count in jobs]
+        listed = (ctypes.c_int64 * (2 * len(jobs)))(*itertools.chain.from_iterable(addresses))
+        given = [self.size, *self._calls[2:], self._address, wp.uint64(ctypes.addressof(listed)), len(jobs)]
+        run = bind_launch(lead_threads, given, [])
+        run.keeps = (run.keeps, jobs, listed)  # type: ignore[attr-defined]
+        return run
 
     def wake(self) -> None:
         """Wake the threads that sleep, for a launch that comes soon; on other cores than the caller's.
@@ -261,6 +315,16 @@ class LaunchPool:
     def __del__(self) -> None:
         with contextlib.suppress(AttributeError):  # of one that could not be made
             self.close()
+
+
+def _job(launches: Sequence[BoundLaunch], chunk: int) -> ctypes.Array | None:
+    """What native code reads of launches over one list in chunks of so many entries; None if it cannot make them."""
+    packed = [launch.packed for launch in launches]
+    numbers = [[*one.head, *(number for part in one.parts for number in part)] for one in packed if one]
+    if len(numbers) < len(launches):
+        return None
+    head = [0, chunk, 0, 0, len(numbers), len(numbers[0])]
+    return (ctypes.c_int64 * (len(head) + sum(map(len, numbers))))(*head, *itertools.chain.from_iterable(numbers))
 
 
 def _follow(run: BoundLaunch, *_memory: object) -> None:

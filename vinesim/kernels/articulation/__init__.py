@@ -52,5 +52,5 @@ over children are read and stored, not added in place: that would be an atomic o
 Files: ``structs`` (arguments), ``spatial`` (rotations, inertias), ``forces`` (springs, ties, drag), ``kinematics``,
 ``body_dynamics`` (one body and its joint), ``prediction`` (the three passes over one tree), ``eight_trees`` and ``lane_records`` (over
 eight at once, on a CPU), ``first_mode`` (substeps), ``energy_budget``, ``impulse_response``, ``integration``, ``floating_components`` (what has been cut
-off), ``joint_wrench``, ``gather_scatter`` (rows between host and device).
+off), ``joint_wrench``, ``fastest_tree``, ``gather_scatter`` (rows between host and device).
 """

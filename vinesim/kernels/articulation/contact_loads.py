@@ -12,11 +12,9 @@ TICK = wp.constant(2)
 """Of the number of this step."""
 ONSET_STEPS = wp.constant(3)
 """Of the steps with phi = 1 that follow on the first one of a contact, and that one."""
-TOUCHED = wp.constant(4)
-"""Of how many trees they belong to."""
-REFUSED = wp.constant(5)
+REFUSED = wp.constant(4)
 """Of the number of the first given body that cannot be loaded, counted from 1; 0 if all can."""
-NUMBERS = 6
+NUMBERS = 5
 
 
 @wp.kernel
@@ -34,6 +32,7 @@ def load_bodies(
     loaded_out: wp.array(dtype=wp.int32),
     body_wrench_out: wp.array(dtype=wp.spatial_vector),
     touched_out: wp.array(dtype=wp.int32),
+    touched_count_out: wp.array(dtype=wp.int32),
     last_contact_out: wp.array(dtype=wp.int64),
     tree_euler_steps_out: wp.array(dtype=wp.int32),
 ):
@@ -42,11 +41,12 @@ def load_bodies(
     Nothing happens if a body cannot be loaded: its tree was not in the last prediction (is_stepped [tree]), or it is not
     among the first tree_moving [tree] bodies of that. place_in_tree: [body] from 0 on.
     body, wrench: [k] a body may be given several times. loaded_out: [k] the bodies of the last call, then those of this
-    one. body_wrench_out: [body] N, N m sums. touched_out: [j] each tree once. last_contact_out: [tree] step in which it
+    one. body_wrench_out: [body] N, N m sums. touched_out: [j] each tree once; touched_count_out: [1] how many. last_contact_out: [tree] step in which it
     was touched last. tree_euler_steps_out: [tree] raised where contact begins.
     """
     given = int(numbers_out[GIVEN])
     numbers_out[REFUSED] = wp.int64(0)
+    touched_count_out[0] = 0
     for i in range(given):
         tree = body_tree[body[i]]
         if not is_stepped[tree] or place_in_tree[body[i]] >= tree_moving[tree]:
@@ -69,4 +69,4 @@ def load_bodies(
             if last < tick - wp.int64(1):
                 tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], int(numbers_out[ONSET_STEPS]))
     numbers_out[LOADED] = wp.int64(given)
-    numbers_out[TOUCHED] = wp.int64(count)
+    touched_count_out[0] = count

@@ -8,6 +8,7 @@ import warp as wp
 
 from vinesim.kernels.contact.structs import (
     AABB_BLOCK,
+    NEAR_ASLEEP,
     Aabbs,
     Actors,
     Capsules,
@@ -293,13 +294,16 @@ def mark_near_trees(
     geom_states: GeomStates,
     # out
     is_near_out: wp.array(dtype=wp.bool),
+    counters_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per block: mark those of its trees whose box a geom of an actor overlaps.
+    """One thread per block: mark those of its trees, and no others, whose box a geom of an actor overlaps.
 
     Boxes and free bunches must overlap the box of a capsule: one that lies on a canopy for hours keeps few trees awake.
     A remote actor counts at remote trees only. capsule_states: of the last step of each tree.
     """
     block = wp.tid()
+    for tree in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, tree_boxes.low.shape[0])):
+        is_near_out[tree] = False
     for actor in range(actors.count[0]):
         actor_low = actor_boxes.low[actor]
         actor_high = actor_boxes.high[actor]
@@ -314,6 +318,8 @@ def mark_near_trees(
                             if not actors.may_sleep[actor] or overlaps_capsule(
                                 geom_states.low[g], geom_states.high[g], tree, capsules, trees, capsule_states
                             ):
+                                if not is_near_out[tree] and not trees.is_awake[tree]:
+                                    wp.atomic_add(counters_out, NEAR_ASLEEP, 1)
                                 is_near_out[tree] = True
 
 

@@ -6,6 +6,8 @@ from vinesim.kernels.contact.island_system import IslandSystem, contact_velocity
 from vinesim.kernels.contact.structs import (
     BODIES,
     CONTACTS,
+    ISLANDS,
+    UNFINISHED,
     Contacts,
     Islands,
     Parameters,
@@ -71,6 +73,23 @@ def store_warm_start(
         contacts_out.place[c], contacts_out.block[c], contacts_out.island[c], islands, rows.delassus, system
     )
     store_contact(c, velocity[1], velocity[2], parameters, rows.impulse, contacts_out, warm_start_out)
+
+
+@wp.kernel
+def count_unfinished(
+    # model
+    most_sweeps: int,
+    # in
+    islands: Islands,
+    # out
+    counters_out: wp.array(dtype=wp.int32),
+):
+    """One thread in all: the islands whose solve took ``most_sweeps``, so that it may not be within its tolerance."""
+    unfinished = int(0)
+    for island in range(counters_out[ISLANDS]):
+        if islands.sweeps[island] >= most_sweeps:
+            unfinished = unfinished + 1
+    counters_out[UNFINISHED] = unfinished
 
 
 @wp.kernel

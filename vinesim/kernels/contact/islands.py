@@ -12,6 +12,7 @@ from vinesim.kernels.contact.structs import (
     BODIES,
     CONTACTS,
     GROUPS,
+    HAVE_ROOM,
     IMPACTED_TREES,
     ISLANDS,
     MATRIX_ENTRIES,
@@ -60,6 +61,9 @@ def compact_candidates(
                 contacts_out.source[count] = row * slots + slot
             count = count + 1
     counters_out[CONTACTS] = count
+    counters_out[HAVE_ROOM] = 0
+    if count > 0 and count <= contacts_out.source.shape[0]:
+        counters_out[HAVE_ROOM] = 1
     counters_out[OVERFLOW] = overflow
     counters_out[IMPACTED_TREES] = impacted
     counters_out[SKIPPED_GEOMS] = skipped

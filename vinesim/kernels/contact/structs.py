@@ -30,7 +30,13 @@ GROUPS = wp.constant(10)
 """Groups of sides of contacts."""
 RESPONSE_NUMBERS = wp.constant(11)
 """Numbers of the responses to all groups."""
-COUNTERS = 12
+HAVE_ROOM = wp.constant(12)
+"""1 if there are contacts, and room for all of them; else 0."""
+UNFINISHED = wp.constant(13)
+"""Islands whose solve ended at the largest number of sweeps."""
+NEAR_ASLEEP = wp.constant(14)
+"""Sleeping trees that actors are near to."""
+COUNTERS = 15
 
 AABB_BLOCK = wp.constant(32)
 """So many static boxes share one box around them, and are skipped by one comparison."""

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import functools
-from collections.abc import Callable
 
 import numpy as np
 import warp as wp
 
 from vinesim import frames
 from vinesim.kernels.contact import broadphase, structs
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.physics.contact.collision_geoms import RigidGeoms, concatenate, persistent_names
 from vinesim.physics.contact.plant_capsules import PlantCapsules
 from vinesim.physics.contact.warp_arrays import SharedArrays, share
@@ -184,6 +184,8 @@ class RigidArrays:
         )
         qvel, qacc = (share(values, wp.float64) for values in (data.qvel, data.qacc))
         self._free_velocities = [kernel_parameters, qvel, qacc]
+        self.dofs = ctypes.c_int32(world.nv)
+        """How many there are."""
         self.factors = SharedArrays(
             structs.RigidFactors,
             tree_dof=world.tree_dofadr,
@@ -239,9 +241,6 @@ class RigidArrays:
         return number[former]
 
     @functools.cached_property
-    def _take_free_velocities(self) -> Callable[..., None]:
+    def take_free_velocities(self) -> BoundLaunch:
+        """Takes over the free velocity of each dof in the coming step, and what plants changed in the last one."""
         return bind_launch(broadphase.take_free_velocities, self._free_velocities, [self.bodies.struct])
-
-    def begin_step(self) -> None:
-        """Take over the free velocities of the coming step, and what plants changed in the last one."""
-        self._take_free_velocities(self.world.nv)

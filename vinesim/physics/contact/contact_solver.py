@@ -79,61 +79,55 @@ class ContactSolver:
         """Wake the trees that a robot, a person or a moving object is near to; the rest cost one comparison each."""
         if self._generation != self.rigid.generation:
             self._update_rigid_world()
-        tree_awake = self.plants.state.tree_awake
-        fallen_asleep = self._awake[~tree_awake[self._awake]]
-        if len(fallen_asleep):
-            self.update_tree_bounds(fallen_asleep)
-        assert self._rigid_arrays is not None
-        self._rigid_arrays.begin_step()
+        if self._awake is not self.plants.awake:
+            fallen_asleep = self._awake[~self.plants.state.tree_awake[self._awake]]
+            if len(fallen_asleep):
+                self.update_tree_bounds(fallen_asleep)
         if self._wires is not None and (len(self._deflected) or len(self._wires.deflected)):
             self.detection.move_wires(np.union1d(self._deflected, self._wires.deflected), self._wires)
             self._deflected = self._wires.deflected.copy()
         self.near_trees = self.detection.find_near_trees()
-        if len(self.near_trees) and not tree_awake[self.near_trees].all():
+        if self.detection.counters[structs.NEAR_ASLEEP]:
             self.plants.wake(self.near_trees)
 
     def solve(self) -> None:
         """Find the contacts of all awake trees, and of those that these wake, and their forces."""
         self.count, self._reported, self._touched = 0, (), ()
-        self.impulses.clear()
         self._awake = self.plants.awake
         if len(self._awake):
             self._awake = awake = self._wake_reached_trees()
             self._find_contacts(awake)
-            self._predict_impacted(awake)
         if self.count:
-            self.impulses.solve(self.count, self.detection.counters)
+            self.impulses.solve(self.count)
             self._reported = self._touched = None
         else:
-            self.impulses.warm_start.count[0] = 0
+            self.impulses.clear()
 
     def _wake_reached_trees(self) -> np.ndarray:
         """Wake the sleeping trees that awake ones touch, those that these touch, and so on.
 
         Returns all awake trees [k].
         """
-        plants, detection = self.plants, self.detection
-        detection.list_awake(plants.awake)
-        while self.plant_plant_contacts and len(reached := detection.find_reached_trees()):
+        plants, detection, candidates = self.plants, self.detection, self.detection.candidates
+        while len(reached := detection.find_reached_trees(plants.awake, self.plant_plant_contacts)):
             plants.wake(reached)
             plants.predict(reached)
-            detection.list_awake(plants.awake)
+        if detection.candidates is not candidates:
+            self.impulses.bind_launches(detection)
         return plants.awake
 
     def _find_contacts(self, awake: np.ndarray) -> None:
         """List the contacts of the awake trees; of too many, the deepest."""
-        detection, capacity = self.detection, self.impulses.capacity
-        candidates = detection.candidates
-        detection.find_candidates(self.plant_plant_contacts)
-        if detection.candidates is not candidates:
-            self.impulses.bind_launches(detection)
-        self.impulses.compact_candidates(1)
-        self.skipped_geoms += int(detection.counters[structs.SKIPPED_GEOMS])
-        count, overflow = int(detection.counters[structs.CONTACTS]), int(detection.counters[structs.OVERFLOW])
+        detection, impulses, capacity = self.detection, self.impulses, self.impulses.capacity
+        impulses.find_contacts()
+        counters = detection.counters.tolist()
+        count, overflow = counters[structs.CONTACTS], counters[structs.OVERFLOW]
+        self.skipped_geoms += counters[structs.SKIPPED_GEOMS]
         if count > capacity:
             overflow += count - capacity
-            self.impulses.contacts.source[:] = detection.deepest(len(awake), capacity)
+            impulses.contacts.source[:] = detection.deepest(len(awake), capacity)
             detection.counters[structs.CONTACTS] = count = capacity
+            impulses.build_islands()
         if overflow:
             self.dropped_contacts += overflow
             self.overflow_message = (
@@ -141,6 +135,8 @@ class ContactSolver:
                 f"for {capacity}, and for {len(detection.slots)} at one tree: raise contact_capacity or "
                 "max_contacts_per_tree of PhysicsParameters, or touch less at once"
             )
+        if counters[structs.IMPACTED_TREES]:
+            self._predict_impacted(awake)
         self.count = count
 
     def _predict_impacted(self, awake: np.ndarray) -> None:
@@ -149,12 +145,11 @@ class ContactSolver:
         The trapezoidal rule moves a body by the mean of its velocities before and after: a body hit from rest would
         give way only half as far as it must, overlap, and be thrown out again.
         """
-        if self.detection.counters[structs.IMPACTED_TREES]:
-            impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
-            changed = impacted[self.plants.phi_used[impacted] < 1.0]
-            if len(changed):
-                self.plants.use_backward_euler(impacted)
-                self.plants.predict(changed)
+        impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
+        changed = impacted[self.plants.phi_used[impacted] < 1.0]
+        if len(changed):
+            self.plants.use_backward_euler(impacted)
+            self.plants.predict(changed)
 
     def report_wires(self) -> None:
         """Tell the wires what plants pressed on them in the last step."""

@@ -2,11 +2,13 @@
 
 The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then, with the
 prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake ones touch) and
-:meth:`ContactDetection.find_candidates` (narrowphase of the awake trees). Kernels are bound to their arrays once for
-each listing of the rigid world: a bound launch costs a fifth of a plain one.
+:attr:`ContactDetection.narrowphase` (of the awake trees). Kernels are bound to their arrays once for each listing of
+the rigid world: a bound launch costs a fifth of a plain one.
 """
 
 from __future__ import annotations
+
+import ctypes
 
 import numpy as np
 import warp as wp
@@ -20,10 +22,11 @@ from vinesim.kernels.contact import (
     sweep_order,
 )
 from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.kernels.shared_launch import ONCE
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays
 from vinesim.physics.contact.collision_geoms import PLANE_HALF_SIZE
 from vinesim.physics.contact.deflected_wires import DeflectedWires
-from vinesim.physics.contact.warp_arrays import SharedArrays, share
+from vinesim.physics.contact.warp_arrays import SharedArrays, entry, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
@@ -55,6 +58,7 @@ class ContactDetection:
         self._sorted_rows = np.zeros((2, trees), np.int32)
         self._is_near, self._is_reached = np.zeros(trees, np.bool_), np.zeros(trees, np.bool_)
         self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
+        self._no_trees = np.zeros(0, np.intp)
         self._passing = np.full((trees, MAX_PASSING_BUNCHES), -1, np.int32)
         self.counters = np.zeros(structs.COUNTERS, np.int32)
         """See :mod:`vinesim.kernels.contact.structs`."""
@@ -63,8 +67,11 @@ class ContactDetection:
         blocks = -(-trees // AABB_BLOCK)
         self._blocks, self._block_boxes = np.zeros(blocks, np.int32), SharedArrays.zeros(structs.Aabbs, blocks)
         self._listed: np.ndarray | None = None
-        self._awake_blocks = np.zeros(0, np.int32)
-        """Blocks of the trees that :meth:`list_awake` was called with last."""
+        """Awake trees that the kernels' lists are about; None after others were listed."""
+        self._block_count = ctypes.c_int32()
+        """Blocks of these trees."""
+        self._searching_trees, self._paired_trees = ctypes.c_int32(), ctypes.c_int32()
+        """Awake trees that look for sleeping ones, and for each other."""
         self.slots = np.arange(parameters.max_contacts_per_tree)
         self._room = 0
 
@@ -98,15 +105,17 @@ class ContactDetection:
 
     def update_tree_bounds(self, trees: np.ndarray) -> None:
         """Bring the boxes of some trees [k], and of their blocks, up to the poses of their bodies."""
-        self.arrays.trees.awake[: len(trees)] = trees
-        self._tree_aabbs(len(trees))
+        self._list(trees)
+        self._listed = None
+        self._searching_trees.value = 0
+        self._find_reached_trees()
         self.compare_anew()
-        self._update_blocks(np.unique(trees // AABB_BLOCK))
 
-    def _update_blocks(self, blocks: np.ndarray) -> None:
-        """Bring the boxes of some blocks [k] up to those of their trees."""
-        self._blocks[: len(blocks)] = blocks
-        self._block_aabbs(len(blocks))
+    def _list(self, trees: np.ndarray) -> None:
+        """Write the lists of kernels that are about some trees [k], and their blocks."""
+        blocks = np.unique(trees // AABB_BLOCK)
+        self.arrays.trees.awake[: len(trees)], self._blocks[: len(blocks)] = trees, blocks
+        self.counters[structs.AWAKE_TREES], self._block_count.value = len(trees), len(blocks)
 
     def compare_anew(self) -> None:
         """Compare all capsules of awake trees with the sleeping ones in the next step, however little they move."""
@@ -114,20 +123,15 @@ class ContactDetection:
 
     def find_near_trees(self) -> np.ndarray:
         """Trees [k] whose box a geom of an actor overlaps within the step."""
-        if self._static_bounded:
-            self._geom_aabbs(self.rigid_arrays.movable)
-        else:
-            self._geom_aabbs(self.rigid_arrays.count)
+        if not self._static_bounded:
             self._bound_static_geoms()
-        self._actor_aabbs(self.rigid_arrays.actor_count)
-        self._is_near[:] = False
-        self._mark_near_trees(len(self._blocks))
+        self.counters[structs.NEAR_ASLEEP] = 0
+        self._mark_near_trees()
         return self._is_near.nonzero()[0]
 
     def move_wires(self, pieces: np.ndarray, wires: DeflectedWires) -> None:
         """Bring the geoms of wires [k] to where these are deflected to."""
         if not self._static_bounded:
-            self._geom_aabbs(self.rigid_arrays.count)
             self._bound_static_geoms()
         arrays, states, boxes = self.rigid_arrays, self.rigid_arrays.geom_states, self._static_blocks
         geoms = arrays.geom_of_wire[pieces]
@@ -144,6 +148,7 @@ class ContactDetection:
 
     def _bound_static_geoms(self) -> None:
         """Boxes around blocks of static geoms; the ground reaches down without end."""
+        self._geom_aabbs(self.rigid_arrays.count)
         first, states, boxes = self.rigid_arrays.movable, self.rigid_arrays.geom_states, self._static_blocks
         states.offset[:] = 0.0  # move_wires() follows
         ground = np.flatnonzero(self.rigid_arrays.geoms.kind[first:] == 0) + first
@@ -163,32 +168,23 @@ class ContactDetection:
         near, room = near[room.any(1)], room[room.any(1)]
         self._passing[near, room.argmax(1)] = bunch
 
-    def list_awake(self, awake: np.ndarray) -> None:
-        """Take the awake trees [k] and bring their boxes up to their predicted motion."""
-        self.arrays.trees.awake[: len(awake)] = awake
-        self.counters[structs.AWAKE_TREES] = len(awake)
-        self._tree_aabbs(len(awake))
+    def find_reached_trees(self, awake: np.ndarray, among_plants: bool) -> np.ndarray:
+        """Take the awake trees [k] and bring their boxes up to their predicted motion. Returns the sleeping trees [j]
+        that they touch, or will before the step ends; none unless plants touch each other (``among_plants``)."""
         if awake is not self._listed:
-            self._listed, self._awake_blocks = awake, np.unique(awake // AABB_BLOCK)
-        self._update_blocks(self._awake_blocks)  # or a tree that was dragged out of its block would have no actor near
-
-    def find_reached_trees(self) -> np.ndarray:
-        """Sleeping trees [k] with which one of the listed awake ones is in contact, or will be before the step ends."""
-        self._is_reached[:] = False
-        awake = int(self.counters[structs.AWAKE_TREES])
-        if awake < len(self._is_reached):  # else no tree sleeps; one that falls asleep has them compared anew
-            self._find_reached_trees(awake)
-        return self._is_reached.nonzero()[0]
-
-    def find_candidates(self, plant_plant_contacts: bool) -> None:
-        """Fill ``candidates`` for the listed awake trees."""
-        trees = int(self.counters[structs.AWAKE_TREES])
-        if trees > self._room:
-            self._allocate_candidates(2 * trees)
-        self._find_rigid_contacts(trees)
-        if plant_plant_contacts:
-            self._sort_awake_trees(1)
-            self._find_plant_contacts(trees)
+            self._list(awake)
+            self._listed = awake
+            if len(awake) > self._room:
+                self._allocate_candidates(2 * len(awake))
+        count, sleep = len(awake), among_plants and len(awake) < len(self._is_reached)
+        self._paired_trees.value = count if among_plants else 0
+        self._searching_trees.value = count if sleep else 0  # one that falls asleep has them compared anew
+        self._find_reached_trees()
+        if not sleep:
+            return self._no_trees
+        reached = self._is_reached.nonzero()[0]
+        self._is_reached[reached] = False
+        return reached
 
     def deepest(self, trees: int, count: int) -> np.ndarray:
         """The ``count`` candidates with the smallest gap, as numbers row * slots + slot in ascending order."""
@@ -214,30 +210,28 @@ class ContactDetection:
             return pool.share([launch], TREES_PER_CHUNK[chunk])
 
         self._geom_aabbs = bind_launch(broadphase.geom_aabbs, [parameters, geoms, rigid.bodies.struct], [geom_states])
-        self._actor_aabbs = bind_launch(
+        actor_aabbs = bind_launch(
             broadphase.actor_aabbs, [actors, geoms, rigid.bodies.struct, geom_states], [actor_boxes]
         )
-        self._tree_aabbs = bind_shared(
+        mark_near_trees = bind_launch(
+            broadphase.mark_near_trees,
+            [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
+            [share(self._is_near, wp.bool), share(self.counters, wp.int32)],
+        )
+        tree_aabbs = bind_shared(
             broadphase.tree_aabbs,
             [parameters, capsules, order, trees, bodies],
             [capsule_states, wood_boxes, tree_boxes],
             "boxes",
         )
-        self._block_aabbs = bind_launch(
-            broadphase.block_aabbs, [share(self._blocks, wp.int32), tree_boxes], [block_boxes]
-        )
-        self._mark_near_trees = bind_launch(
-            broadphase.mark_near_trees,
-            [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
-            [share(self._is_near, wp.bool)],
-        )
-        self._find_reached_trees = bind_shared(
+        block_aabbs = bind_launch(broadphase.block_aabbs, [share(self._blocks, wp.int32), tree_boxes], [block_boxes])
+        find_reached_trees = bind_shared(
             sleeping_trees.find_reached_trees,
             [parameters, capsules, order, trees, block_boxes, tree_boxes, bodies, capsule_states],
             [self._clearances.struct, share(self._is_reached, wp.bool)],
             "boxes",
         )
-        self._find_rigid_contacts = bind_shared(
+        find_rigid_contacts = bind_shared(
             narrowphase_rigid.find_rigid_contacts,
             [parameters, self.parameters.max_static_geoms_per_tree, capsules, geoms, order, trees, tree_boxes, bodies,
              capsule_states, rigid.bodies.struct, rigid.hulls.struct, geom_states, self._static_blocks.struct],
@@ -245,13 +239,29 @@ class ContactDetection:
             "rigid",
         )  # fmt: skip
         sorted_rows, scratch = (share(rows, wp.int32) for rows in self._sorted_rows)
-        self._sort_awake_trees = bind_launch(
+        sort_awake_trees = bind_launch(
             sweep_order.sort_awake_trees, [trees, tree_boxes], [share(self.counters, wp.int32), sorted_rows, scratch]
         )
-        self._find_plant_contacts = bind_shared(
+        find_plant_contacts = bind_shared(
             narrowphase_plants.find_plant_contacts,
             [parameters, capsules, order, sorted_rows, share(self.counters, wp.int32), trees,
              tree_boxes, wood_boxes, bodies, capsule_states],
             [candidates],
             "plants",
         )  # fmt: skip
+        sequence, awake = self.plants.launch_pool.sequence, entry(self.counters, structs.AWAKE_TREES)
+        self._mark_near_trees = sequence([
+            (rigid.take_free_velocities, rigid.dofs),
+            (self._geom_aabbs, entry(rigid.geoms.count)),
+            (actor_aabbs, entry(rigid.actors.count)),
+            (mark_near_trees, ctypes.c_int32(len(self._blocks))),
+        ])  # fmt: skip
+        # a tree that was dragged out of its block would have no actor near
+        self._find_reached_trees = sequence([
+            (tree_aabbs, awake), (block_aabbs, self._block_count), (find_reached_trees, self._searching_trees),
+        ])  # fmt: skip
+        self.narrowphase = [
+            (find_rigid_contacts, awake), (sort_awake_trees, ONCE),
+            (find_plant_contacts, self._paired_trees),
+        ]  # fmt: skip
+        """Launches that fill ``candidates`` for the listed awake trees, each with its number of threads."""

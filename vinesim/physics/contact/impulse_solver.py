@@ -15,11 +15,12 @@ from vinesim import frames
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
 from vinesim.kernels.contact.island_system import IslandSystem
 from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.kernels.shared_launch import ONCE
 from vinesim.physics.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
 from vinesim.physics.contact.deflected_wires import DeflectedWires, WireContacts
 from vinesim.physics.contact.detection import ContactDetection
 from vinesim.physics.contact.row_response import RowResponse
-from vinesim.physics.contact.warp_arrays import SharedArrays, share
+from vinesim.physics.contact.warp_arrays import SharedArrays, entry, share
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.rigid.rigid_world import RigidWorld
@@ -84,13 +85,11 @@ class ImpulseSolver:
         """See :meth:`_kept`."""
         self._wrench = np.zeros((2 * n, 6))
         self.bodies = np.zeros(0, np.int32)
-        """Plant bodies in contact [n], sorted."""
+        """Plant bodies in contact [n], sorted; a view that the next solve changes, as the next two."""
         self.wrenches = np.zeros((0, 6))
         """[n, 6] N, N m on them, at their origins, world axes."""
         self.rigid_force: np.ndarray | None = None
         """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
-        self.island_count = 0
-        """Islands of the last solve."""
         self._padded_rows = 0
         """Rows of all blocks of the last solve, those that fill them up included."""
         self.unfinished = 0
@@ -161,56 +160,69 @@ class ImpulseSolver:
         return memory[:size].reshape(shape)
 
     @property
+    def island_count(self) -> int:
+        """Islands of the last solve."""
+        return int(self._detection.counters[structs.ISLANDS])
+
+    @property
     def sweeps(self) -> int:
         """Sweeps that the slowest island of the last solve took."""
         return int(self.islands.sweeps[: self.island_count].max(initial=0))
 
     def clear(self) -> None:
-        """Forget the last solve, but for its warm start."""
-        self.bodies, self.wrenches, self.rigid_force = self.bodies[:0], self.wrenches[:0], None
-        self._at_wires = self._at_wires[:0]
+        """Forget the last solve: there is no contact."""
+        self.bodies, self.wrenches, self.rigid_force = self.touched.body[:0], self._wrench[:0], None
+        self._detection.counters[structs.ISLANDS] = self.warm_start.count[0] = 0
 
-    def solve(self, count: int, counters: np.ndarray) -> None:
+    def find_contacts(self) -> None:
+        """List the contacts of the listed awake trees, the plant bodies in contact, and the islands.
+
+        Of too many contacts no islands are built: see :meth:`build_islands`.
+        """
+        self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
+        self._find_contacts()
+
+    def build_islands(self) -> None:
+        """Build the islands of the contacts that are listed now."""
+        self._build_islands(1)
+
+    def solve(self, count: int) -> None:
         """Find the impulses of the first ``count`` contacts, and what they do to either side."""
         n = count
-        self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
-        self._build_islands(1)
-        if self._make_room(counters):
+        if self._make_room():
             self._build_islands(1)
-        touched, island_count = int(counters[structs.BODIES]), int(counters[structs.ISLANDS])
+        counters = self._detection.counters
         self._padded_rows = int(self.islands.row_start[counters[structs.BLOCKS]])
-        self.bodies = self.touched.body[:touched].copy()
         self._most_contacts = max(self._most_contacts, n)
         if self._wires is not None:
             self._end_at_wires(n, self._wires)
-        self._write_contact_rows(n)
-
-        self.response.compute(int(counters[structs.GROUPS]))
-        is_constrained = bool(self.rigid.mj_data.nefc) and self.rigid.is_constrained(self._touched_rigid_bodies(n))
-        if is_constrained:
-            self._rigid_spans[:n] = 0, self.rigid.mj_model.nv
-            self._respond_constrained(by_rows(self.rows.rigid_jacobian[:n]))
-        else:
-            self._respond_rigidly(n)
-        self._assemble_delassus(n)
         self.rigid_force = self.system.rigid_force
         self.rigid_force.fill(0.0)
-        self._solve_islands(island_count)
-        if is_constrained:
-            self._follow_constraints(n, island_count)
-        self.island_count = island_count
-        self.unfinished += int(np.count_nonzero(self.islands.sweeps[:island_count] >= self.parameters.solver_sweeps))
-
+        if self.rigid.mj_data.nefc and self.rigid.is_constrained(self._touched_rigid_bodies(n)):
+            self._solve_constrained(n)
+        else:
+            self._solve()
+        self.unfinished += int(counters[structs.UNFINISHED])
         self.warm_start.count[0] = n
-        self._store_warm_start(n)
-        self._accumulate_wrenches(1)
-        self.wrenches = self._wrench[:touched].copy()
+        self.bodies = self.touched.body[: counters[structs.BODIES]]
+        self.wrenches = self._wrench[: counters[structs.BODIES]]
 
-    def _make_room(self, counters: np.ndarray) -> bool:
+    def _solve_constrained(self, count: int) -> None:
+        """The same where MuJoCo's constraints bind rigid bodies: their response comes from MuJoCo."""
+        self._write_rows()
+        self._rigid_spans[:count] = 0, self.rigid.mj_model.nv
+        self._respond_constrained(by_rows(self.rows.rigid_jacobian[:count]))
+        self._assemble_and_solve()
+        self._follow_constraints(count)
+        self._store()
+
+    def _make_room(self) -> bool:
         """Make room for the matrices and responses of the listed contacts; whether they must be listed again."""
-        larger = int(counters[structs.MATRIX_ENTRIES]) > len(self._matrix)
+        counters = self._detection.counters
+        entries = int(counters[structs.MATRIX_ENTRIES])
+        larger = entries > len(self._matrix)
         if larger:
-            self._matrix = np.zeros(2 * int(counters[structs.MATRIX_ENTRIES]))
+            self._matrix = np.zeros(2 * entries)
             self._allocate()
         if self.response.make_room(int(counters[structs.RESPONSE_NUMBERS])) or larger:
             self.bind_launches(self._detection)
@@ -220,6 +232,7 @@ class ImpulseSolver:
         """Find the springs of the wires that are in contact."""
         contacts, candidates = self.contacts, self._detection.candidates
         piece = self.rigid_arrays.wire_of_geom[np.maximum(contacts.other[:count], -1)]
+        self._at_wires = self._at_wires[:0]
         contacts.wire_stiffness[:count] = contacts.wire_shift[:count] = 0.0
         if piece.max() < 0:
             return
@@ -248,7 +261,7 @@ class ImpulseSolver:
         self.rows.rigid_response[: len(response) // 3] = response.reshape(-1, 3, response.shape[1]).transpose(0, 2, 1)
         return response
 
-    def _follow_constraints(self, count: int, island_count: int) -> None:
+    def _follow_constraints(self, count: int) -> None:
         """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve took them to.
 
         The response to impulses is linear, but contacts of a body with its support may open, or begin to slide. A light
@@ -276,7 +289,7 @@ class ImpulseSolver:
             response = self._respond_constrained(jacobian)
             free_before, free = free, velocity + impulse @ response
             velocity_free -= jacobian @ (free - free_before)
-            self._solve_islands(island_count)
+            self._solve_islands(self.island_count)
         if error > best_error:
             for values, those in zip(kept, best, strict=True):
                 values[:] = those
@@ -297,7 +310,6 @@ class ImpulseSolver:
         system, side_groups = self.system.struct, self.response.groups.struct
         response = share(self.response.numbers, wp.float32)
         counters, touched = share(detection.counters, wp.int32), self.touched.struct
-        self.compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
         items = share(self._items, wp.int32)
 
         def bind_shared(kernel: wp.Kernel, model: list, given: list, results: list) -> BoundLaunch:
@@ -306,21 +318,22 @@ class ImpulseSolver:
             launch = bind_launch(kernel, [*model, items, *given], results, index_list="items", partitions=pool.size)
             return pool.share([launch], ITEMS_PER_CHUNK[kernel.key])
 
+        compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
         self._build_islands = bind_launch(
             islands.build_islands,
             [capsules, geoms, bodies, rigid_bodies, candidates],
             [counters, touched, contacts, island_lists, side_groups],
         )
-        self._write_contact_rows = bind_shared(
+        write_contact_rows = bind_shared(
             jacobians.write_contact_rows,
             [parameters, self._pairs.struct, capsules, geoms],
             [bodies, rigid_bodies, rigid.factors.struct, candidates, warm_start],
             [share(self._rigid_spans, wp.vec2i), contacts, rows],
         )
-        self._respond_rigidly = bind_shared(
+        respond_rigidly = bind_shared(
             delassus.respond_rigidly, [geoms], [rigid_bodies, rigid.factors.struct, contacts], [rows]
         )
-        self._assemble_delassus = bind_shared(
+        assemble_delassus = bind_shared(
             delassus.assemble_delassus, [], [contacts, touched, island_lists, side_groups, response], [rows]
         )
         self._solve_islands = bind_shared(
@@ -329,12 +342,26 @@ class ImpulseSolver:
             [contacts],
             [island_lists, system, rows],
         )
-        self._store_warm_start = bind_shared(
+        store_warm_start = bind_shared(
             forces.store_warm_start, [parameters], [island_lists, system, rows], [contacts, warm_start]
         )
-        self._accumulate_wrenches = bind_launch(
+        count_unfinished = bind_launch(forces.count_unfinished, [p.solver_sweeps, island_lists], [counters])
+        accumulate_wrenches = bind_launch(
             forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
         )
+        sequence = self.plants.launch_pool.sequence
+        of_contacts, of_groups, of_islands, have_room = (
+            entry(detection.counters, place)
+            for place in (structs.CONTACTS, structs.GROUPS, structs.ISLANDS, structs.HAVE_ROOM)
+        )
+        rows_first = [(write_contact_rows, of_contacts), (self.response.launch, of_groups)]
+        solved = [(assemble_delassus, of_contacts), (self._solve_islands, of_islands)]
+        stored = [(store_warm_start, of_contacts), (count_unfinished, ONCE), (accumulate_wrenches, ONCE)]
+        self._find_contacts = sequence([
+            *detection.narrowphase, (compact_candidates, ONCE), (self._build_islands, have_room),
+        ])  # fmt: skip
+        self._solve = sequence([*rows_first, (respond_rigidly, of_contacts), *solved, *stored])
+        self._write_rows, self._assemble_and_solve, self._store = map(sequence, (rows_first, solved, stored))
 
 
 def by_rows(jacobian: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import warp as wp
 from vinesim.kernels.articulation.structs import ArticulationModel, Factors
 from vinesim.kernels.contact import row_response
 from vinesim.kernels.contact.structs import SideGroups
-from vinesim.kernels.launch import BoundLaunch, join_partitions
+from vinesim.kernels.launch import BoundLaunch, bound, join_partitions
 from vinesim.physics.contact.warp_arrays import SharedArrays
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
@@ -73,13 +73,12 @@ class RowResponse:
             )  # fmt: skip
 
         pool = plants.launch_pool
-        self._respond = pool.share([join_partitions([bind() for _ in range(pool.size)])], GROUPS_PER_CHUNK)
+        respond = pool.share([join_partitions([bind() for _ in range(pool.size)])], GROUPS_PER_CHUNK)
 
-    def compute(self, groups: int) -> None:
-        """Fill :attr:`numbers` of the first ``groups``; all touch trees of the last prediction, and belong to it."""
-        if self.plants.buffers.device.is_cpu:
-            self._respond(groups)
-            return
-        for first in range(0, groups, self._rows):
-            self._respond(min(self._rows, groups - first), first)
-        self.plants.buffers.synchronize()
+        def respond_in_parts(groups: int, first: int = 0, partition: int = 0) -> None:
+            for start in range(first, first + groups, self._rows):
+                respond(min(self._rows, first + groups - start), start)
+            buffers.synchronize()
+
+        self.launch = respond if buffers.device.is_cpu else bound(respond_in_parts)
+        """Fills :attr:`numbers` of groups: all touch trees of the last prediction, and belong to it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,12 @@ def share(data: np.ndarray, dtype: Any) -> wp.array:
     if data.size and array.ptr != data.ctypes.data:
         raise ValueError(f"an array of {data.shape} {data.dtype} is not contiguous: Warp would work on a copy")
     return array
+
+
+def entry(data: np.ndarray, place: int = 0) -> ctypes.c_int32:
+    """An entry of an int32 array that is contiguous, over the same memory: the number of threads of a launch in a
+    sequence."""
+    return ctypes.c_int32.from_buffer(data.data, data.itemsize * place)
 
 
 def zeros(dtype: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -25,6 +25,7 @@ import warp as wp
 from vinesim import frames
 from vinesim.errors import checked_index
 from vinesim.kernels.articulation.first_mode import MAX_SUBSTEPS, substeps_for
+from vinesim.kernels.launch import bound
 from vinesim.kernels.shared_launch import LaunchPool
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.berry_clusters import BerryClusters, spans
@@ -116,10 +117,17 @@ class ArticulationSolver:
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
             | model.is_on_arm(),
         )  # fmt: skip
+
+        def apply_on_device(touched: int, first: int = 0, partition: int = 0) -> None:
+            self.launches.upload_wrenches(len(self._runner.stepped))
+            self.launches.apply_wrenches(touched)
+
         self._loads = ContactLoads(
             body_tree=model.body_tree, place_in_tree=self._place_in_tree, is_stepped=self._runner.is_stepped,
             tree_moving=self.tree_moving, body_wrench=self._wrench, touched=self._subset,
             euler_steps=self._euler_steps, onset=self.onset_steps + 1,  # the first step counts
+            apply=bound(apply_on_device) if buffers.has_copies else self.launches.apply_wrenches,
+            pool=self.launch_pool,
         )  # fmt: skip
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -357,9 +365,7 @@ class ArticulationSolver:
         launches, touched, loads = self.launches, _NO_TREES, self._loads
         count = len(self._runner.stepped)
         if bodies is not None and len(bodies):
-            touched = loads.replace(np.asarray(bodies), np.asarray(wrenches), self.tick)
-            launches.upload_wrenches(count)
-            launches.apply_wrenches(len(touched))
+            touched = loads.replace(bodies, np.asarray(wrenches), self.tick)
         elif len(loads):
             self._unload(count)
         self._runner.integrate(touched, *self._floating_roots())

@@ -6,8 +6,9 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.articulation import contact_loads as kernels
-from vinesim.kernels.launch import bind_launch
-from vinesim.physics.contact.warp_arrays import share
+from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.kernels.shared_launch import ONCE, LaunchPool
+from vinesim.physics.contact.warp_arrays import entry, share
 
 LEAST_ROOM = 64
 """Bodies for which there is room at least."""
@@ -27,6 +28,8 @@ class ContactLoads:
         touched: np.ndarray,
         euler_steps: np.ndarray,
         onset: int,
+        apply: BoundLaunch,
+        pool: LaunchPool,
     ) -> None:
         """Args:
         body_tree, place_in_tree: [body] tree of each, and its number there.
@@ -34,7 +37,11 @@ class ContactLoads:
         body_wrench: [body, 6] N, N m where the sums are written; zero for bodies that are not loaded.
         touched: [tree] where the touched trees are listed.
         euler_steps: [tree] steps with phi = 1 that are left; raised to ``onset`` where contact begins.
+        apply: lets what has been summed act on the touched trees.
+        pool: makes the launches.
         """
+        self._apply, self._pool = apply, pool
+        self._touched_count = np.zeros(1, np.int32)
         self._touched, self._body_tree, self._place_in_tree = touched, body_tree, place_in_tree
         self._is_stepped, self._tree_moving = is_stepped, tree_moving
         self._numbers = np.zeros(kernels.NUMBERS, np.int64)
@@ -45,8 +52,8 @@ class ContactLoads:
             share(tree_moving, wp.int32),
         ]  # fmt: skip
         self._results = [
-            share(body_wrench, wp.spatial_vector), share(touched, wp.int32), share(last_contact, wp.int64),
-            share(euler_steps, wp.int32),
+            share(body_wrench, wp.spatial_vector), share(touched, wp.int32), share(self._touched_count, wp.int32),
+            share(last_contact, wp.int64), share(euler_steps, wp.int32),
         ]  # fmt: skip
         self._loaded = self._body = np.zeros(0, np.int32)  # room is made, and the kernel loaded, by the first contact
 
@@ -54,18 +61,20 @@ class ContactLoads:
         loaded, self._loaded = self._loaded, np.zeros(bodies, np.int32)
         self._loaded[: len(loaded)] = loaded
         self._body, self._wrench = np.zeros(bodies, np.int32), np.zeros((bodies, 6), np.float32)
-        self._load = bind_launch(
+        load = bind_launch(
             kernels.load_bodies,
             [*self._given, share(self._body, wp.int32), share(self._wrench, wp.spatial_vector)],
             [share(self._numbers, wp.int64), share(self._loaded, wp.int32), *self._results],
         )
+        self._load = self._pool.sequence([(load, ONCE), (self._apply, entry(self._touched_count))])
 
     def __len__(self) -> int:
         """How many bodies are loaded, those given several times counted so often."""
         return int(self._numbers[kernels.LOADED])
 
     def replace(self, bodies: np.ndarray, wrenches: np.ndarray, tick: int) -> np.ndarray:
-        """Load ``bodies`` [k] with ``wrenches`` [k, 6] in step ``tick`` instead of those of the last call.
+        """Load ``bodies`` [k] with ``wrenches`` [k, 6] in step ``tick`` instead of those of the last call, and let them
+        act.
 
         A body may be given several times. Returns the trees touched [j], a view of the list. :class:`ValueError`, and
         nothing is changed, if a body was not in the last prediction.
@@ -75,10 +84,10 @@ class ContactLoads:
             self._make_room(max(2 * count, LEAST_ROOM))
         self._body[:count], self._wrench[:count] = bodies, wrenches
         self._numbers[kernels.GIVEN], self._numbers[kernels.TICK] = count, tick
-        self._load(1)
+        self._load()
         if self._numbers[kernels.REFUSED]:
             self.require_stepped(bodies)
-        return self._touched[: self._numbers[kernels.TOUCHED]]
+        return self._touched[: self._touched_count[0]]
 
     def require_stepped(self, bodies: np.ndarray) -> None:
         """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""

@@ -7,6 +7,7 @@ on it, its bunches still hanging from it (:meth:`ArticulationSolver.cut`).
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import math
 
@@ -83,22 +84,26 @@ class DetachmentMonitor:
         self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
         self._awake: np.ndarray | None = None
-        self._awake_count, self._awake_bunches = 0, np.zeros(len(order), np.int32)
-        self._awake_bodies = np.zeros(0, np.int32)
-        self._carried, self._longest = np.zeros((len(order), 6), np.float32), np.zeros(1, np.int32)
+        self._awake_count, self._awake_bunches = ctypes.c_int32(), np.zeros(len(order), np.int32)
+        self._longest = np.zeros(1, np.int32)
         self._detachments: list[Detachment] = []
         self._bind()
 
     def _bind(self) -> None:
         model = self.plants.model
-        self._count_overloaded_steps = bind_launch(
+        self._peduncles = peduncles = self.plants.launches.record_joint_wrenches(max(len(self._bunches), 1))
+        count_steps = bind_launch(
             count_overloaded_steps,
             [share(model.bunch_body, wp.int32), share(model.body_tree, wp.int32), share(model.bunch_pull, wp.float32),
              share(model.bunch_bend, wp.float32), share(self._awake_bunches, wp.int32),
-             share(self._carried, wp.spatial_vector), share(self.plants.state.bunch_attached, wp.bool),
+             share(peduncles.carried, wp.spatial_vector), share(self.plants.state.bunch_attached, wp.bool),
              share(self.contact_solver.remote_trees, wp.bool)],
             [share(self._overloaded_steps, wp.int32), share(self._longest, wp.int32)],
         )  # fmt: skip
+        count = self._awake_count
+        self._count_overloaded_steps = self.plants.launch_pool.sequence([
+            (peduncles.compute, count), (count_steps, count),
+        ])  # fmt: skip
 
     # ------------------------------------------------------------------ the tick
 
@@ -115,24 +120,21 @@ class DetachmentMonitor:
         """Detach the bunches whose peduncles have been overloaded for long enough, on trees that this client
         simulates."""
         self._list_awake_bunches()
-        count = self._awake_count
-        if count == 0:
-            return
-        self._carried[:count] = self.plants.joint_wrench(self._awake_bodies)
         self._longest[0] = 0
-        self._count_overloaded_steps(count)
+        self._count_overloaded_steps()
         if self._longest[0] < self._overload_limit:
             return
+        count = self._awake_count.value
         model, attached = self.plants.model, self.plants.state.bunch_attached
         for i in np.flatnonzero(self._overloaded_steps[self._awake_bunches[:count]] >= self._overload_limit).tolist():
             bunch = int(self._awake_bunches[i])
             is_remote = self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunch]]]
             if attached[bunch] and not is_remote:
-                square = np.square(self._carried[i])
+                square = np.square(self._peduncles.carried[i])
                 pulled = square[:3].sum() / np.square(model.bunch_pull[bunch])
                 bent = square[3:].sum() / np.square(model.bunch_bend[bunch])
                 cause, actor = "pull" if pulled >= bent else "bend", self._hardest_pressing_actor(bunch)
-                self._pick(bunch, cause, actor, self._carried[i].copy())
+                self._pick(bunch, cause, actor, self._peduncles.carried[i].copy())
 
     def _list_awake_bunches(self) -> None:
         """List the bunches of awake trees, those that have been picked included."""
@@ -141,9 +143,9 @@ class DetachmentMonitor:
             self._awake = awake
             first = self._first[awake]
             bunches = self._bunches[spans(first, self._first[awake + 1] - first)]
-            self._awake_count = len(bunches)
+            self._awake_count.value = len(bunches)
             self._awake_bunches[: len(bunches)] = bunches
-            self._awake_bodies = self.plants.model.bunch_body[bunches]
+            self._peduncles.places[: len(bunches)] = self.plants.buffers.slots[self.plants.model.bunch_body[bunches]]
 
     def _cut_with_blades(self) -> None:
         """Cut what is in the mouths that are closing."""

@@ -11,13 +11,18 @@ import dataclasses
 import logging
 
 import numpy as np
+import warp as wp
 
+from vinesim.kernels.articulation.fastest_tree import find_fastest
+from vinesim.kernels.launch import bind_launch
+from vinesim.physics.contact.warp_arrays import share
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 
 log = logging.getLogger(__name__)
 
 MAX_PENDING_FAULTS = 1000
 """Most faults kept for the log between two reports; the count goes on."""
+_NO_TREES = np.zeros(0, np.int32)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -40,14 +45,25 @@ class FaultGuard:
         self.slowed = 0
         """How often a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from it."""
         self._faults: list[Fault] = []
+        self._listed: np.ndarray | None = None
+        self._awake, self._awake_count = np.zeros(len(self.count), np.int32), np.zeros(1, np.int32)
+        self._fastest = np.zeros(1, np.float32)
+        self._find_fastest = bind_launch(
+            find_fastest,
+            [share(self._awake_count, wp.int32), share(self._awake, wp.int32), share(plants.tree_rate, wp.float32)],
+            [share(self._fastest, wp.float32)],
+        )
 
     def stop_faulty_trees(self) -> np.ndarray:
         """After an integration: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
         plants, state = self.plants, self.plants.state
         awake = plants.awake
+        if awake is not self._listed:
+            self._listed, self._awake_count[0], self._awake[: len(awake)] = awake, len(awake), awake
+        self._find_fastest(1)
+        if self._fastest[0] <= plants.max_rate and self._fastest[0] <= plants.fault_rate:
+            return _NO_TREES
         rate = plants.tree_rate[awake]
-        if rate.max(initial=0.0) <= min(plants.max_rate, plants.fault_rate):  # not for NaN
-            return awake[:0]
         stopped = awake[~(rate <= plants.fault_rate)]
         self.slowed += int(np.count_nonzero(rate > plants.max_rate)) - int(np.count_nonzero(rate > plants.fault_rate))
         if len(stopped) == 0:

@@ -29,7 +29,7 @@ from vinesim.kernels.articulation.lane_records import LANES, RECORD
 from vinesim.kernels.articulation.lean_prediction import predict_lean
 from vinesim.kernels.articulation.prediction import predict
 from vinesim.kernels.launch import BoundLaunch as Launch
-from vinesim.kernels.launch import bind_launch, join_partitions
+from vinesim.kernels.launch import bind_launch, bound, join_partitions
 from vinesim.kernels.shared_launch import LaunchPool
 from vinesim.physics.parameters import PhysicsParameters
 
@@ -80,6 +80,18 @@ BUDGET_PERIOD = 8
 
 MIN_CAPACITY = 16
 """Bodies that a list holds at least."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointWrenches:
+    """Wrenches that joints carried in the last step."""
+
+    places: np.ndarray
+    """[joint] int32 bodies, where kernels find them: to be written by the caller."""
+    carried: np.ndarray
+    """[joint, 6] N, N m"""
+    compute: Launch
+    """Fills :attr:`carried` of the first joints."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,8 +147,8 @@ class KernelLaunches:
         self._record_impact(
             self.fill(structs.SolverParameters, **(parameters | {"fast_rate": math.inf, "geometric_stiffness": 0.0}))
         )
-        self.response_capacity = self.joint_capacity = 0
-        self._record_joint_wrench(MIN_CAPACITY)  # or the first bunch that is picked would wait for it
+        self.response_capacity = 0
+        self._joint_wrenches = self.record_joint_wrenches(1)  # or the first bunch that is picked would wait for it
 
     # ------------------------------------------------------------------ arrays
 
@@ -413,22 +425,26 @@ class KernelLaunches:
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
         """Wrench [n, 6] N, N m that the joints of some bodies [n] carried in the last step."""
-        n, buffers = len(bodies), self.buffers
-        if n > self.joint_capacity:
-            self._record_joint_wrench(max(2 * self.joint_capacity, n))
-        self._joint_bodies[:n] = buffers.slots[bodies]
-        self._sum_joint_wrenches(n)
-        buffers.synchronize()
-        return self._joint_wrench[:n].copy()
+        wrenches = self._joint_wrenches
+        if len(bodies) > len(wrenches.places):
+            wrenches = self._joint_wrenches = self.record_joint_wrenches(2 * len(bodies))
+        wrenches.places[: len(bodies)] = self.buffers.slots[bodies]
+        wrenches.compute(len(bodies))
+        return wrenches.carried[: len(bodies)].copy()
 
-    def _record_joint_wrench(self, capacity: int) -> None:
-        self.joint_capacity, buffers = capacity, self.buffers
-        self._joint_bodies = buffers.pinned(np.zeros(capacity, np.int32))
-        self._joint_wrench = buffers.pinned(np.zeros((capacity, 6), np.float32))
-        wrench: Any = wp.spatial_vector
-        buffers.add_shared("joint_bodies", self._joint_bodies, wp.int32)
-        buffers.add_shared("joint_wrench", self._joint_wrench, wrench)
-        self._sum_joint_wrenches = self.record(
-            joint_wrench, self.parameters, self._model, "joint_bodies", "phi_used", "tree_steps", self._forces,
-            self._bodies, "body_acceleration", "joint_wrench",
+    def record_joint_wrenches(self, capacity: int) -> JointWrenches:
+        """What computes the wrenches that up to so many joints carried in the last step."""
+        buffers = self.buffers
+        places = buffers.pinned(np.zeros(capacity, np.int32))
+        carried = buffers.pinned(np.zeros((capacity, 6), np.float32))
+        launch = self.record(
+            joint_wrench, self.parameters, self._model, buffers.reach(places, wp.int32, "joint_bodies"), "phi_used",
+            "tree_steps", self._forces, self._bodies, "body_acceleration",
+            buffers.reach(carried, wp.spatial_vector, "joint_wrench"),
         )  # fmt: skip
+
+        def launch_and_wait(count: int, first: int = 0, partition: int = 0) -> None:
+            launch(count)
+            buffers.synchronize()
+
+        return JointWrenches(places, carried, bound(launch_and_wait) if buffers.has_copies else launch)

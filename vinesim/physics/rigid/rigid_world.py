@@ -181,19 +181,21 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         for human in self._humans.values():
             human.apply_controls(m, d, self.dt)
         self._valid_qpos[:] = d.qpos
-        self._set_passing(self._passing_bunches, True)
+        if self._passing_bunches:
+            self._set_passing(self._passing_bunches, True)
         has_margins = self._speculative_contacts.set_margins(m, d)
         if self._soft_wires is not None:
             self._soft_wires.place_geoms(m, d)
         # qfrc_applied is still that of the last step: what pushed a sleeping box wakes it now
         mujoco.mj_step1(m, d)
-        self._end_passing()
+        if self._passing_bunches:
+            self._end_passing()
         self._pair_friction.apply(m, d)
         if has_margins:
             self._speculative_contacts.limit_closing(m, d)
         if self._soft_wires is not None:
             self._soft_wires.soften(m, d)
-        d.qfrc_applied[:] = 0.0
+        d.qfrc_applied.fill(0.0)
         # the whole forward pass after the velocity stage: single calls of its parts leave out dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
 
@@ -278,7 +280,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
     def _is_faulty(self) -> bool:
         """Whether a number is not finite, or a rate beyond :data:`MAX_RATE`."""
         rate, position = self.mj_data.qvel, self.mj_data.qpos
-        if rate @ rate < MAX_RATE**2 and position @ position < np.inf:  # enough, and the cheapest
+        if rate.dot(rate) < MAX_RATE**2 and position.dot(position) < np.inf:  # enough, and the cheapest
             return False
         return not (rate.min() > -MAX_RATE and rate.max() < MAX_RATE and np.isfinite(position).all())
 
