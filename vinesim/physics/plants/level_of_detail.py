@@ -49,6 +49,8 @@ class LevelOfDetail:
         """Before ``predict()``: ``near`` [k] are the awake trees that an actor reaches into; those that were coarsened
         [k] are returned."""
         coarsened = near[:0]
+        if len(self._clustered) == 0:
+            return coarsened
         plants, state = self.plants, self.plants.state
         attached = int(np.count_nonzero(state.bunch_attached))
         if attached != self._attached:  # a tree whose bunches are gone has nothing to refine

@@ -18,7 +18,7 @@ def _check_finite(name: str, what: str, given: object, size: int) -> None:
     values = np.asarray(given, float)
     if values.shape != (size,):
         raise RobotError(f"robot {name!r}: {what} has the shape {values.shape}; give {size} numbers")
-    if not math.isfinite(values @ values) and not np.isfinite(values).all():  # the first is the cheapest
+    if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():  # the first is the cheapest
         raise RobotError(f"robot {name!r}: {what} is {values.tolist()}; give finite numbers")
 
 
@@ -44,8 +44,11 @@ class RobotAccess(WorldCore):
 
     def command(self, name: str, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
         """Set the targets of the servos: ``position`` [joint] and ``velocity`` [joint] (zero unless given)."""
-        self._check_joints(name, position=position, velocity=velocity)
-        self.robot(name).command(position, velocity)
+        robot = self.robot(name)
+        _check_finite(name, "joint position", position, len(robot.spec.drives))
+        if velocity is not None:
+            _check_finite(name, "joint velocity", velocity, len(robot.spec.drives))
+        robot.command(position, velocity)
 
     def set_gains(
         self,
