@@ -3,6 +3,7 @@
     python benchmarks/gpu.py --reference cpu.npz        # on a machine whose Warp has CPU kernels
     python benchmarks/gpu.py --compare cpu.npz          # on one with an NVIDIA GPU
     python benchmarks/gpu.py --peer --trees 65536       # beside mujoco-warp, which must be installed
+    python benchmarks/gpu.py --scenes                   # whole steps, robots included; Warp must have CPU kernels
 
 Trees are the canes of ``vinesim bench plants``: 16 bodies and a bunch. *resident*: joints and bodies stay on the
 device for all ticks; *visible*: every tick the host may read bodies and add forces, as a client does. *with contacts*:
@@ -23,9 +24,11 @@ import numpy as np
 import warp as wp
 
 from vinesim import frames
+from vinesim.bench import scenes
 from vinesim.physics.contact.resident_contacts import ResidentContacts
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.physics.step import Physics
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -38,6 +41,8 @@ BARS = ((0.3, 1.975), (0.6, 1.9), (0.85, 1.75))
 BAR_RADIUS = 0.012
 SWEEPS = 20
 """Largest number of sweeps: a GPU waits for the tree that takes most."""
+SCENES, SCENE_STEPS = ((2, 10), (8, 64)), 120
+"""Bars of two combs, and canes between them; steps."""
 PEERS = ("discrete", "implicitfast")
 """Integrators of mujoco-warp."""
 CONTACT_CLOCK = 300
@@ -220,6 +225,34 @@ def compare_contacts(about: dict, theirs: Any, ours: dict[str, np.ndarray]) -> N
     say(about, f"the same: contacts, {counts[0]} on the CPU", counts[1], "contacts")
 
 
+def scene_steps(device: str, bars: int, canes: int) -> tuple[np.ndarray, Physics, float]:
+    """Canes between the bars of two combs that close: where bodies are in each step [step, body, 3] m, the physics, and
+    the median time of a step [ms]."""
+    physics = Physics(scenes.cane_row(canes), device=device)
+    physics.add_robot(scenes.combs("combs", bars, canes))
+    scenes.keep_awake(physics, np.arange(canes))
+    position, took = [], []
+    for tick in range(SCENE_STEPS):
+        physics.rigid.command("combs", np.full(2, 0.005 * min(1.0, tick / 100)))
+        start = time.perf_counter()
+        physics.step()
+        took.append(time.perf_counter() - start)
+        position.append(physics.state.body_q[:, :3].copy())
+    return np.array(position), physics, 1e3 * float(np.median(took))
+
+
+def compare_scenes(about: dict, device: str) -> None:
+    """Whole steps with plants on the GPU beside those on the CPU: contacts and robots are on the CPU in both."""
+    for comb_bars, canes in SCENES:
+        theirs, cpu, cpu_took = scene_steps("cpu", comb_bars, canes)
+        ours, gpu, took = scene_steps(device, comb_bars, canes)
+        case = f"{canes} canes between {comb_bars} bars, {gpu.contact_solver.count} contacts, plants on the GPU"
+        say(about, f"{case}: largest distance from the CPU's bodies", 1e3 * float(np.abs(ours - theirs).max()), "mm")
+        force = [float(np.abs(which.contact_solver.wrenches[:, :3]).sum()) for which in (cpu, gpu)]
+        say(about, f"{case}: force, difference from the CPU's, of it", abs(force[1] / force[0] - 1.0), "1")
+        say(about | {"peer": "the same on the CPU", "peer_value": cpu_took}, f"{case}: step", took, "ms")
+
+
 def measure_contacts(about: dict, device: str, count: int, with_peer: bool) -> None:
     """Canes that lie on bars, beside mujoco-warp if asked."""
     plants, contacts = canes_on_bars(device, count)
@@ -248,6 +281,7 @@ def main() -> None:
     ask.add_argument("--device", default="cuda")
     ask.add_argument("--trees", type=int, nargs="*", default=[64, 1024, 4096, 16384, 65536, 131072])
     ask.add_argument("--contacts", action="store_true", help="only with contacts")
+    ask.add_argument("--scenes", action="store_true", help="only whole steps beside the CPU's")
     given = ask.parse_args()
     if given.reference:
         np.savez_compressed(given.reference, allow_pickle=False, **trajectory("cpu"), **contact_trajectory("cpu"))
@@ -258,6 +292,9 @@ def main() -> None:
         answer = subprocess.run(query, capture_output=True, text=True, check=True).stdout
         name, driver = answer.splitlines()[0].split(", ")
     about = {"device": name, "driver": driver, "warp": wp.config.version}
+    if given.scenes:
+        compare_scenes(about, given.device)
+        return
     if given.compare:
         theirs, ours = np.load(given.compare), trajectory(given.device)
         apart = np.abs(theirs["body_q"][:, :3] - ours["body_q"][:, :3]).max()
