@@ -47,7 +47,11 @@ JitterBuffer = Annotated[
     typer.Option(min=0.0, max=500.0, help="Show other actors this much later, without the network's jitter [ms]."),
 ]
 Device = Annotated[
-    str, typer.Option(help="Where plants are simulated, cameras and lidars compute: cpu, cuda or cuda:N.")
+    str,
+    typer.Option(
+        help="Where plants are simulated, cameras and lidars compute: cpu, cuda or cuda:N. For plants alone a GPU pays "
+        "from 200 awake trees, beside four threads from 1,000."
+    ),
 ]
 Threads = Annotated[
     int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 100 awake trees, on free cores.")

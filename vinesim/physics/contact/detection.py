@@ -126,7 +126,7 @@ class ContactDetection:
         if not self._static_bounded:
             self._bound_static_geoms()
         self.counters[structs.NEAR_ASLEEP] = 0
-        self._mark_near_trees()
+        self._find_near_trees()
         return self._is_near.nonzero()[0]
 
     def move_wires(self, pieces: np.ndarray, wires: DeflectedWires) -> None:
@@ -250,13 +250,13 @@ class ContactDetection:
             "plants",
         )  # fmt: skip
         sequence, awake = self.plants.launch_pool.sequence, entry(self.counters, structs.AWAKE_TREES)
-        self._mark_near_trees = sequence([
+        self._find_near_trees = sequence([
             (rigid.take_free_velocities, rigid.dofs),
             (self._geom_aabbs, entry(rigid.geoms.count)),
             (actor_aabbs, entry(rigid.actors.count)),
             (mark_near_trees, ctypes.c_int32(len(self._blocks))),
         ])  # fmt: skip
-        # a tree that was dragged out of its block would have no actor near
+        # boxes of blocks: or a tree that was dragged out of its block would have no actor near
         self._find_reached_trees = sequence([
             (tree_aabbs, awake), (block_aabbs, self._block_count), (find_reached_trees, self._searching_trees),
         ])  # fmt: skip
