@@ -33,6 +33,7 @@ GROUND = ""
 
 _STATIC, _BOX, _LINK, _BUNCH, _HUMAN = range(5)
 _NONE = -1
+_NO_PAIRS = np.zeros((0, 2), np.int64)
 
 
 class SupportTracker:
@@ -55,11 +56,13 @@ class SupportTracker:
         self._still_steps = self._slow_steps = np.zeros(0, np.int64)
         """[object] For how many steps it has been within its band, and slower than ``support_move_speed``."""
         self._row_of_object: dict[int, int] = {}
-        self._touching_pairs = np.zeros((0, 2), np.int64)
+        self._touching_pairs = _NO_PAIRS
         """[k, 2] Row and MuJoCo body of all contacts of the last step."""
         self._bands_before = self._bands_on_ground = np.zeros((0, 2))
         """[object, 2] m, rad: bands in the last step, and bands of objects that all rest on the ground."""
         self._touched: list[tuple[int, str]] | None = None
+        self._all_sleep = False
+        """Whether all objects slept after the last step."""
         self._rebuild_tables()
 
     # ------------------------------------------------------------------ the tick
@@ -71,13 +74,19 @@ class SupportTracker:
         d, move_speed = self.rigid.mj_data, self.rigid.parameters.support_move_speed
         self._still_steps += 1
         self._still_steps[self._held_rows()] = 0
+        asleep = d.tree_asleep[self._tree] >= 0
+        all_slept, self._all_sleep = self._all_sleep, bool(asleep.all())
+        if all_slept and self._all_sleep and self._bands_before is self._bands_on_ground and not self._support.any():
+            self._slow_steps += 1
+            self._touching_pairs, self._touched = _NO_PAIRS, None  # MuJoCo reports none of what sleeps
+            return
         speed = d.qvel[self._v[:, None] + np.arange(3)]
         self._slow_steps = np.where((speed * speed).sum(1) > move_speed * move_speed, 0, self._slow_steps + 1)
         self._touching_pairs, self._touched = self._find_touching_pairs(), None
         bands, before = self._band_sizes(), self._bands_before
         self._bands_before = bands
         # an object that fell asleep in a moving box is checked when the box has come to rest
-        awake = np.flatnonzero((d.tree_asleep[self._tree] < 0) | (bands[:, 0] < before[:, 0]))
+        awake = np.flatnonzero(~asleep | (bands[:, 0] < before[:, 0]))
         if len(awake) == 0:
             return
         if (self._kind_of_body[self._support[awake]] == _LINK).any():
@@ -286,7 +295,7 @@ class SupportTracker:
         """(row, MuJoCo body) of all contacts of the last step [k, 2], each from both sides."""
         m, d = self.rigid.mj_model, self.rigid.mj_data
         if d.ncon == 0:
-            return np.zeros((0, 2), np.int64)
+            return _NO_PAIRS
         pairs = m.geom_bodyid[d.contact.geom[d.contact.efc_address >= 0]].astype(np.int64)
         pairs = np.concatenate([pairs, pairs[:, ::-1]])
         row = self._row_of_body[pairs[:, 0]]
