@@ -25,7 +25,7 @@ class PackedLaunch:
     """A launch as native code makes it."""
 
     head: tuple[int, int, int]
-    """Address of the kernel, address of the list, bytes of an entry; without a list nothing but the first counts."""
+    """Address of the kernel, address of the list, bytes of an entry; the last two are 0 without a list."""
     parts: tuple[tuple[int, int, int, int, int], ...]
     """For each partition the addresses of its bounds, of their shape and their size, of its arguments, and of the
     address of the list in these."""
@@ -35,9 +35,9 @@ class BoundLaunch(Protocol):
     """A kernel on its arrays: ``launch(threads, first, partition)``, see :func:`bind_launch`."""
 
     packed: PackedLaunch | None
-    """None on CUDA, where Warp is another, and of what is no single kernel."""
+    """None on CUDA, with another version of Warp, and for a launch of several kernels."""
     job: ctypes.Array | None
-    """What the threads of a pool share: see :meth:`vinesim.kernels.shared_launch.LaunchPool.share`."""
+    """What :meth:`vinesim.kernels.shared_launch.LaunchPool.share` made for the threads of a pool; else None."""
 
     def __call__(self, threads: int, first: int = 0, partition: int = 0) -> None: ...
 

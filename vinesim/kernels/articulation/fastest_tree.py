@@ -8,21 +8,16 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def find_fastest(
     # in
-    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_rate: wp.array(dtype=float),
     # out
     fastest_out: wp.array(dtype=float),
 ):
-    """One thread in all: the largest rate of the first ``count`` [1] of ``trees``, infinite if one is not a number.
+    """One thread per listed tree: the largest rate of all, infinite if one is not a number.
 
-    tree_rate: [tree] rad/s. fastest_out: [1] rad/s.
+    tree_rate: [tree] rad/s. fastest_out: [1] rad/s, 0 before.
     """
-    fastest = float(0.0)
-    for i in range(count[0]):
-        rate = tree_rate[trees[i]]
-        if not rate <= fastest:
-            fastest = rate
-            if wp.isnan(rate):
-                fastest = wp.inf
-    fastest_out[0] = fastest
+    rate = tree_rate[trees[wp.tid()]]
+    if wp.isnan(rate):
+        rate = wp.inf
+    wp.atomic_max(fastest_out, 0, rate)

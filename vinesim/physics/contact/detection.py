@@ -39,6 +39,7 @@ PAIRS_AT_ONCE = 64
 """Pairs of capsules and geoms of one tree that are looked at in one go."""
 MIN_TREE_ROOM = 64
 """Rows of the candidates that are allocated at least; more when more trees are awake."""
+_NO_TREES = np.zeros(0, np.intp)
 
 
 class ContactDetection:
@@ -58,7 +59,6 @@ class ContactDetection:
         self._sorted_rows = np.zeros((2, trees), np.int32)
         self._is_near, self._is_reached = np.zeros(trees, np.bool_), np.zeros(trees, np.bool_)
         self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
-        self._no_trees = np.zeros(0, np.intp)
         self._passing = np.full((trees, MAX_PASSING_BUNCHES), -1, np.int32)
         self.counters = np.zeros(structs.COUNTERS, np.int32)
         """See :mod:`vinesim.kernels.contact.structs`."""
@@ -181,7 +181,7 @@ class ContactDetection:
         self._searching_trees.value = count if sleep else 0  # one that falls asleep has them compared anew
         self._find_reached_trees()
         if not sleep:
-            return self._no_trees
+            return _NO_TREES
         reached = self._is_reached.nonzero()[0]
         self._is_reached[reached] = False
         return reached
@@ -261,7 +261,6 @@ class ContactDetection:
             (tree_aabbs, awake), (block_aabbs, self._block_count), (find_reached_trees, self._searching_trees),
         ])  # fmt: skip
         self.narrowphase = [
-            (find_rigid_contacts, awake), (sort_awake_trees, ONCE),
-            (find_plant_contacts, self._paired_trees),
+            (find_rigid_contacts, awake), (sort_awake_trees, ONCE), (find_plant_contacts, self._paired_trees),
         ]  # fmt: skip
         """Launches that fill ``candidates`` for the listed awake trees, each with its number of threads."""

@@ -146,6 +146,8 @@ class ArticulationSolver:
         """phi asked for each tree [tree]; set it as you like. 1 where a tie is stiff (``stiff_tie_mass``)."""
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``predict()`` [tree]."""
+        self.awake_list = np.zeros(trees, np.int32)
+        """Its first entries are :attr:`awake`: for kernels, which stay bound to it [tree]."""
         self.tree_rate = np.zeros(trees, np.float32)
         """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
         self.tree_substeps = np.ones(trees, np.int32)
@@ -252,6 +254,7 @@ class ArticulationSolver:
 
     def _list_awake(self) -> None:
         self._awake = np.flatnonzero(self.state.tree_awake).astype(np.int32)
+        self.awake_list[: len(self._awake)] = self._awake
 
     def bodies_of(self, trees: np.ndarray) -> np.ndarray:
         """All bodies of some trees, tree by tree [k]."""

@@ -45,12 +45,10 @@ class FaultGuard:
         self.slowed = 0
         """How often a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from it."""
         self._faults: list[Fault] = []
-        self._listed: np.ndarray | None = None
-        self._awake, self._awake_count = np.zeros(len(self.count), np.int32), np.zeros(1, np.int32)
         self._fastest = np.zeros(1, np.float32)
         self._find_fastest = bind_launch(
             find_fastest,
-            [share(self._awake_count, wp.int32), share(self._awake, wp.int32), share(plants.tree_rate, wp.float32)],
+            [share(plants.awake_list, wp.int32), share(plants.tree_rate, wp.float32)],
             [share(self._fastest, wp.float32)],
         )
 
@@ -58,9 +56,8 @@ class FaultGuard:
         """After an integration: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
         plants, state = self.plants, self.plants.state
         awake = plants.awake
-        if awake is not self._listed:
-            self._listed, self._awake_count[0], self._awake[: len(awake)] = awake, len(awake), awake
-        self._find_fastest(1)
+        self._fastest[0] = 0.0
+        self._find_fastest(len(awake))
         if self._fastest[0] <= plants.max_rate and self._fastest[0] <= plants.fault_rate:
             return _NO_TREES
         rate = plants.tree_rate[awake]

@@ -56,12 +56,11 @@ class SleepMonitor:
         """Tick of each tree's :attr:`_seen_x` [tree]; -1: it has none."""
         self._seen_x = np.zeros((len(plants.model.body_mass), 3), np.float32)
         """[body, 3] m where bodies were then."""
-        self._limit, self._trees = np.zeros(1, np.float32), np.zeros(trees, np.int32)
-        self._longest = np.zeros(1, np.int32)
-        """[1] For how many steps the joints of one of them have been."""
+        self._limit, self._longest = np.zeros(1, np.float32), np.zeros(1, np.int32)
+        """[1] What :attr:`rate` is, and for how many steps the joints of the quietest awake tree have been slower."""
         self._count_quiet_steps = bind_launch(
             count_quiet_steps,
-            [share(self._limit, wp.float32), share(self._trees, wp.int32), share(plants.tree_rate, wp.float32)],
+            [share(self._limit, wp.float32), share(plants.awake_list, wp.int32), share(plants.tree_rate, wp.float32)],
             [share(self.quiet_steps, wp.int32), share(self._is_at_rest, wp.bool), share(self._seen_tick, wp.int64),
              share(self._longest, wp.int32)],
         )  # fmt: skip
@@ -99,9 +98,9 @@ class SleepMonitor:
 
     def watch(self) -> bool:
         """After an integration: note which trees were slow in it; whether some are due for :meth:`check`."""
-        plants, awake = self.plants, self.plants.awake
-        self._limit[0], self._longest[0], self._trees[: len(awake)] = self.rate, 0, awake
-        self._count_quiet_steps(len(awake))
+        plants = self.plants
+        self._limit[0], self._longest[0] = self.rate, 0
+        self._count_quiet_steps(len(plants.awake))
         return plants.tick % self._check_steps == 0 and bool(self._longest[0] >= self.patience)
 
     def check(

@@ -44,11 +44,8 @@ class RobotAccess(WorldCore):
 
     def command(self, name: str, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
         """Set the targets of the servos: ``position`` [joint] and ``velocity`` [joint] (zero unless given)."""
-        robot = self.robot(name)
-        _check_finite(name, "joint position", position, len(robot.spec.drives))
-        if velocity is not None:
-            _check_finite(name, "joint velocity", velocity, len(robot.spec.drives))
-        robot.command(position, velocity)
+        self._check_joints(name, position=position, velocity=velocity)
+        self.robot(name).command(position, velocity)
 
     def set_gains(
         self,
