@@ -90,6 +90,10 @@ def test_a_full_queue_never_waits_and_a_failed_record_takes_no_room(context):
             pass
     assert record is None
     assert queue.lost == 1
+    assert queue.waiting_count == queue.capacity == 2
+    queue.wake()
+    assert queue.take(0.0) is not None
+    assert queue.waiting_count == 1
     queue.close()
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import logging
 import pathlib
+import time
 import types
 from collections.abc import Sequence
 from typing import Any, Self
@@ -20,7 +22,7 @@ from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, run_ros_worker
 from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
-from vinesim.client.sensing.worker_process import Run, WorkerProcess
+from vinesim.client.sensing.worker_process import IdleTime, Run, WorkerProcess
 from vinesim.client.signals import GestureLog, IntentionLog
 from vinesim.client.sound.exchange import SoundStep
 from vinesim.client.sound.microphone_step import at_place
@@ -35,8 +37,14 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import ComponentStatus, JointReference, RigidVisual
 from vinesim.scene.values.signals import Color
 
+log = logging.getLogger(__name__)
+
 START_TIMEOUT = 120.0
 """How long the process may take to start; a first run builds message packages [s]."""
+HOLD_TIMEOUT = 3.0
+"""A process that has done nothing for so long, though it could, holds the loop no longer [s]."""
+IDLE_LOOK_PERIOD = 0.1
+"""Time between two looks at what a process does that holds the loop [s]."""
 TRUTH_ORGANS = (Organ.BOX, Organ.BUNCH, Organ.HUMAN)
 """Rigid bodies whose true poses are published; robots have their own transforms."""
 
@@ -95,6 +103,7 @@ class RosProcess:
         body_sensors = {*config.imus, *config.wrenches}
         self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
         self._parameters = config.parameters
+        self._hold: _Hold | None = None
         self.worker = WorkerProcess(
             f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
             lambda context: RosChannel(config, context), self._receive,
@@ -122,6 +131,37 @@ class RosProcess:
             client.between_steps.append(self._simulation)
 
     # ------------------------------------------------------------------ in the loop
+
+    def held(self) -> str:
+        """Why the next step must wait, in two words: "ROS messages", of which no more fit on the way to the process, or
+        "ROS subscribers", which are behind. Empty when it may run.
+
+        A loop that calls it before each step, until it is empty, loses no message of a step on the way. A process that
+        is not ready, or has done nothing for :data:`HOLD_TIMEOUT`, does not hold the loop; what finds no room is lost
+        then, and counted.
+        """
+        run = self.worker.current()
+        cause = _cause_to_wait(run.shared) if self.worker.is_ready else ""
+        if not cause:
+            self._hold = None
+            return ""
+        if self._hold is None or self._hold.run is not run:
+            self._hold = _Hold(run)
+        if self._hold.is_over():
+            if not self._hold.is_logged:
+                self._hold.is_logged = True
+                log.warning(
+                    "%s has done nothing for %.0f s: until it goes on, its messages are lost, and counted",
+                    self.worker.title, HOLD_TIMEOUT,
+                )  # fmt: skip
+            return ""
+        return cause
+
+    @property
+    def backlog(self) -> float:
+        """Share of the room for steps on the way to the process that is taken, 0 to 1."""
+        steps = self.worker.current().shared.steps
+        return steps.waiting_count / steps.capacity
 
     def _control(self, time: float) -> None:
         """Apply commands; goals of a process that is gone end."""
@@ -281,6 +321,33 @@ class RosProcess:
 
     def __exit__(self, *_: types.TracebackType | type[BaseException] | BaseException | None) -> None:
         self.close()
+
+
+def _cause_to_wait(channel: RosChannel) -> str:
+    if channel.steps.waiting_count >= channel.steps.capacity:
+        return "ROS messages"
+    return "ROS subscribers" if channel.wanted["pause"][0] else ""
+
+
+class _Hold:
+    """A time in which one run of the process holds the loop."""
+
+    def __init__(self, run: Run[RosChannel]) -> None:
+        self.run = run
+        self.is_logged = False
+        self._idle = IdleTime(run.process.pid or 0)
+        self._turns = 0
+        self._next_look = 0.0
+
+    def is_over(self) -> bool:
+        """Whether the process has done nothing for :data:`HOLD_TIMEOUT`."""
+        if (turns := int(self.run.shared.wanted["turns"][0])) != self._turns:
+            self._turns = turns
+            self._idle.end()
+        elif time.monotonic() >= self._next_look:
+            self._next_look = time.monotonic() + IDLE_LOOK_PERIOD
+            self._idle.look()
+        return self._idle.seconds >= HOLD_TIMEOUT
 
 
 class _Microphone:

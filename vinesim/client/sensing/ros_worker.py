@@ -39,7 +39,7 @@ SOUND_TOPICS = ("audio", "audio_stamped")
 NICENESS = 5
 """Behind the client's loop, before the renderer."""
 QUEUE_CAPACITY = 100
-"""Steps that may wait for the process, a second of them; later ones are lost, and counted."""
+"""Steps that may wait for the process, a second of them; the loop waits then (:meth:`RosProcess.held`)."""
 STATISTICS_PERIOD = 0.2
 """Wall time between two reports to the client [s]."""
 COUNT_PERIOD = 0.05
@@ -105,10 +105,13 @@ class RosChannel:
                 "truth_period": ((1,), "f8"),
                 "goals": ((1,), "?"),
                 "sound": ((1,), "?"),
+                "pause": ((1,), "?"),
+                "turns": ((1,), "i8"),
             }
         )
         """Whether topics have subscribers, and actions goals, and how often true poses are wanted [s], 0 for never;
-        written by the process."""
+        whether the world shall wait for subscribers; how often the process has looked at all this, so that the client
+        sees that it lives. Written by the process."""
 
     def close(self) -> None:
         """Release the memory."""
@@ -227,6 +230,7 @@ class RosWorker:
     def _report(self) -> None:
         """Tell the client what is subscribed to, and now and then what was sent."""
         wanted, now = self.channel.wanted, time.monotonic()
+        wanted["turns"][0] += 1
         wanted["goals"][0] = self.node.has_goals
         if now >= self._next_count:
             self._next_count = now + COUNT_PERIOD

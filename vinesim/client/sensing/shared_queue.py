@@ -24,15 +24,23 @@ class SharedQueue:
         """Records that found no room."""
         self.put_count = 0
         """Records that were put; the writer's."""
-        self.taken_count = 0
-        """Records that were taken; the reader's."""
-        self._capacity = capacity
-        self._memory = SharedArrays({"records": ((capacity,), record)})
+        self.capacity = capacity
+        self._memory = SharedArrays({"records": ((capacity,), record), "taken": ((1,), "i8")})
         self._free = context.Semaphore(capacity)
         self._filled = context.Semaphore(0)
         self._next = 0
         self._unannounced = 0
         """Records that were put since the reader was woken last."""
+
+    @property
+    def taken_count(self) -> int:
+        """Records that were taken."""
+        return int(self._memory["taken"][0])
+
+    @property
+    def waiting_count(self) -> int:
+        """Records that were put and not taken yet; for the writer."""
+        return self.put_count - self.taken_count
 
     @contextlib.contextmanager
     def put(self) -> Iterator[Any | None]:
@@ -46,7 +54,7 @@ class SharedQueue:
         except BaseException:
             self._free.release()
             raise
-        self._next = (self._next + 1) % self._capacity
+        self._next = (self._next + 1) % self.capacity
         self._unannounced += 1
         self.put_count += 1
 
@@ -61,9 +69,9 @@ class SharedQueue:
         if not self._filled.acquire(timeout=timeout):
             return None
         record = self._memory["records"][self._next].copy()
-        self._next = (self._next + 1) % self._capacity
+        self._next = (self._next + 1) % self.capacity
         self._free.release()
-        self.taken_count += 1
+        self._memory["taken"][0] += 1  # after the release, so that whoever reads it finds the room
         return record
 
     def close(self) -> None:

@@ -64,6 +64,31 @@ def cpu_use(pid: int) -> tuple[float, bool]:
     return used, any(thread.split()[0] == "R" for thread in threads)
 
 
+class IdleTime:
+    """How long a process has done nothing although it could [s]: time in which it waits for a CPU does not count.
+
+    Time between two looks counts for a second at most: after both processes were stopped for an hour, as a shell does
+    it, only one second has passed.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self.seconds = 0.0
+        self._pid, self._used, self._looked = pid, 0.0, time.monotonic()
+
+    def end(self) -> None:
+        """The process has done something."""
+        self.seconds, self._looked = 0.0, time.monotonic()
+
+    def look(self) -> float:
+        """Add the time since the last look; the sum."""
+        now = time.monotonic()
+        passed = min(now - self._looked, 1.0)
+        used, wants_cpu = cpu_use(self._pid)
+        self.seconds += min(used - self._used, passed) if wants_cpu else passed
+        self._used, self._looked = used, now
+        return self.seconds
+
+
 def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
     """The whole life of a process: ``work``, until it returns, fails, or the client's process has ended.
 
@@ -303,16 +328,13 @@ class WorkerProcess(Generic[S]):
     def _serve(self, run: Run[S]) -> str:
         """Take the messages of a run until it ends or hangs; why it did."""
         reason = ""
-        silent = 0.0  # seconds, counted one by one: when both processes were stopped for long, only one has passed
-        before = 0.0
-        while silent < (START_TIMEOUT if run.ready_since is None else HANG_TIMEOUT):
+        silence = IdleTime(run.process.pid or 0)
+        while silence.seconds < (START_TIMEOUT if run.ready_since is None else HANG_TIMEOUT):
             self._keep_standby(run)
             if connection.wait([run.pipe, run.process.sentinel], 1.0):
-                silent = 0.0
+                silence.end()
             else:
-                used, wants_cpu = cpu_use(run.process.pid or 0)
-                silent += min(used - before, 1.0) if wants_cpu else 1.0
-                before = used
+                silence.look()
             try:
                 while run.pipe.poll():
                     kind, value = run.pipe.recv()
@@ -331,4 +353,4 @@ class WorkerProcess(Generic[S]):
             if not run.process.is_alive():
                 return reason or f"it ended with exit code {run.process.exitcode}"
         run.process.kill()
-        return reason or f"it hung: nothing came from it for {silent:.0f} s"
+        return reason or f"it hung: nothing came from it for {silence.seconds:.0f} s"
