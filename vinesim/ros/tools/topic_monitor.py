@@ -12,8 +12,9 @@ as the report then. With ``--once TOPIC`` a topic is left after its first messag
 nothing from then on. With ``--arrivals FILE`` it writes when each message was sent and came, with its stamp and number:
 one array [message, 4] int64 a topic, see :attr:`TopicStats.arrivals`.
 
-It takes messages in their serialised form, so that counting costs next to nothing; the first one of every topic is
-deserialised, to check that it is well-formed. It runs without vinesim's middleware profile, as any other node.
+It takes messages in their serialised form, all that wait of every topic a hundred times a second, so that counting
+costs next to nothing; the first one of every topic is deserialised, to check that it is well-formed. A message arrives
+when the middleware of this process receives it. It runs without vinesim's middleware profile, as any other node.
 """
 
 from __future__ import annotations
@@ -44,23 +45,40 @@ DISCOVERY_PERIOD = 0.05
 EXCLUDED_TOPICS = ("/rosout", "/parameter_events")
 """Topics of every node, not monitored unless named."""
 CLOCK = "/clock"
-QUEUE_DEPTH = 10
-"""Messages that wait for this node: rclpy's default."""
+POLL_PERIOD = 0.01
+"""Time between two looks at what has come [s]."""
+QUEUE_DEPTH = 1000
+"""Messages of a topic that may wait for this node: seconds of those of every step."""
+LARGE_QUEUE_DEPTH = 10
+"""The same of :data:`LARGE_TYPES`, whose memory counts: rclpy's default."""
+LARGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
 
 
 class SimulationClock:
-    """Simulated time by the /clock messages of the last second, the quickest of which is taken for undelayed."""
+    """Simulated time by the last hundred messages of /clock, which give its rate, too: a world may be slower than real
+    time. The quickest of them is taken for undelayed."""
 
     def __init__(self) -> None:
-        self._offsets: deque[int] = deque(maxlen=100)
+        self._messages: deque[tuple[int, int]] = deque(maxlen=100)
+        """Arrival and stamp [ns]."""
+        self._line: tuple[float, int, int] | None = None
+        """Simulated time per real time; arrival and stamp of the quickest message. None: not known since the last."""
 
     def add(self, arrival: int, stamp: int) -> None:
         """A /clock message of simulated time ``stamp`` [ns] arrived at wall time ``arrival`` [ns]."""
-        self._offsets.append(arrival - stamp)
+        self._messages.append((arrival, stamp))
+        self._line = None
 
     def age(self, arrival: int, stamp: int) -> int | None:
         """Simulated time since ``stamp`` at ``arrival`` [ns]; None without a clock."""
-        return arrival - stamp - min(self._offsets) if self._offsets else None
+        if not self._messages:
+            return None
+        if self._line is None:
+            (first, begin), (last, end) = self._messages[0], self._messages[-1]
+            rate = (end - begin) / (last - first) if last > first else 1.0
+            self._line = rate, *max(self._messages, key=lambda one: one[1] - begin - rate * (one[0] - first))
+        rate, quickest, its_stamp = self._line
+        return its_stamp - stamp + round(rate * (arrival - quickest))
 
 
 class TopicStats:
@@ -95,7 +113,7 @@ class TopicStats:
 
     def add(self, message: bytes, info: dict[str, Any]) -> None:
         """Count one serialised message with its meta-data from the middleware."""
-        now = time.time_ns()
+        now = info.get("received_timestamp") or time.time_ns()
         if self.first is None:
             from rclpy.serialization import deserialize_message
 
@@ -155,13 +173,12 @@ class TopicMonitor:
 
     def __init__(
         self, topics: Sequence[str] = (), once: Sequence[str] = (),
-        announce: Callable[[str, float], None] | None = None, queue_depth: int = QUEUE_DEPTH, arrivals: bool = False,
+        announce: Callable[[str, float], None] | None = None, queue_depth: int | None = None, arrivals: bool = False,
     ) -> None:  # fmt: skip
         """``topics`` and ``once`` name the topics, all if both are empty; ``announce`` is called with each topic and
-        the wall time of its first message [s]; ``queue_depth``: messages of one topic that may wait for this node;
-        ``arrivals``: keep the times of every message."""
+        the wall time of its first message [s]; ``queue_depth``: messages of one topic that may wait for this node, None
+        for :data:`QUEUE_DEPTH` and :data:`LARGE_QUEUE_DEPTH`; ``arrivals``: keep the times of every message."""
         from rclpy.context import Context
-        from rclpy.executors import SingleThreadedExecutor
         from rclpy.node import Node
 
         self.stats: dict[str, TopicStats] = {}
@@ -174,8 +191,6 @@ class TopicMonitor:
         self._context.init([])
         self._node = Node("topic_monitor", context=self._context, enable_rosout=False, start_parameter_services=False)
         self._subscriptions: dict[str, Any] = {}
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
 
     def run(self, requests: queue.SimpleQueue[str], seconds: float | None) -> None:
         """Count messages and obey requests until "stop", or for so many ``seconds`` [s] after the first message."""
@@ -185,7 +200,8 @@ class TopicMonitor:
             if time.monotonic() >= next_look and not (self._topics and self._topics <= self.stats.keys()):
                 self._discover()
                 next_look = time.monotonic() + DISCOVERY_PERIOD
-            self._executor.spin_once(timeout_sec=DISCOVERY_PERIOD)
+            time.sleep(POLL_PERIOD)
+            self._take()
             if self._unannounced:
                 self._announce_first()
             if seconds is not None and deadline is None and any(topic.count for topic in self.stats.values()):
@@ -198,6 +214,13 @@ class TopicMonitor:
                         _print_line({"counts": {name: topic.count for name, topic in self.stats.items()}})
                     case _:
                         self.restart()
+
+    def _take(self) -> None:
+        """Count all messages that wait. An executor would take one of them at a time, and look at all topics again."""
+        for name, subscription in self._subscriptions.items():
+            take, message, add = subscription.handle.take_message, subscription.msg_type, self.stats[name].add
+            while (taken := take(message, True)) is not None:
+                add(*taken)
 
     def restart(self) -> None:
         """Begin all counts anew."""
@@ -217,7 +240,6 @@ class TopicMonitor:
 
     def close(self) -> None:
         """Leave the graph."""
-        self._executor.shutdown()
         self._node.destroy_node()
         self._context.shutdown()
 
@@ -235,14 +257,15 @@ class TopicMonitor:
         message = message_class(type_name)
         if not offered or message is None:
             return
-        qos = offered_qos(offered, self._queue_depth)
+        depth = self._queue_depth or (LARGE_QUEUE_DEPTH if type_name in LARGE_TYPES else QUEUE_DEPTH)
         topic = TopicStats(type_name, str(offered[0].topic_type_hash), message, len(offered), self._clock)
         topic.is_clock = name == CLOCK
         topic.arrivals = [] if self._keeps_arrivals else None
         self.stats[name] = topic
         self._unannounced.add(name)
-        add: Any = topic.add  # rclpy hands over what the signature has room for, its annotations know less
-        self._subscriptions[name] = self._node.create_subscription(message, name, add, qos, raw=True)
+        self._subscriptions[name] = self._node.create_subscription(
+            message, name, lambda _: None, offered_qos(offered, depth), raw=True
+        )
 
     def _announce_first(self) -> None:
         for name in [name for name in self._unannounced if self.stats[name].first is not None]:
@@ -276,7 +299,7 @@ class Arguments:
     topics: list[str]
     once: list[str]
     announce: bool
-    queue: int
+    queue: int | None
     seconds: float | None
     out: pathlib.Path | None
     arrivals: pathlib.Path | None
@@ -290,7 +313,7 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
     parser.add_argument("--topic", action="append", default=[], help="monitor this one only (may be repeated)")
     parser.add_argument("--once", action="append", default=[], help="only until its first message (may be repeated)")
     parser.add_argument("--announce", action="store_true", help="print a JSON line for each topic's first message")
-    parser.add_argument("--queue", type=int, default=QUEUE_DEPTH, help="messages of a topic that may wait for it")
+    parser.add_argument("--queue", type=int, help="messages of a topic that may wait for it")
     parser.add_argument("--seconds", type=float, help="from the first message on; default: until stdin is closed")
     parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
     parser.add_argument("--arrivals", type=pathlib.Path, help="write the times of every message here (.npz)")
