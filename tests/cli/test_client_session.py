@@ -32,7 +32,9 @@ def session(monkeypatch: pytest.MonkeyPatch) -> ClientSession:
     return one
 
 
-CLIENT = SimpleNamespace(physics=SimpleNamespace(dt=0.01, time=12.5), tick=lambda: None)
+CLIENT = SimpleNamespace(
+    physics=SimpleNamespace(dt=0.01, time=12.5), tick=lambda: None, pace_limits=[], held=lambda: ""
+)
 
 
 def test_a_gpu_that_fails_under_the_plants_ends_the_client_in_one_line(session, monkeypatch):

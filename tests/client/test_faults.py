@@ -13,6 +13,7 @@ from vinesim.cli.client_session import status_line
 from vinesim.cli.robot_client import complete_report
 from vinesim.client.client import Client
 from vinesim.client.faults import DESCRIPTIONS
+from vinesim.client.pace import RealTime
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.sensing.robot_processes import loop_status, network_status
 from vinesim.client.status import Status
@@ -84,10 +85,10 @@ def test_diagnostics_warn_while_a_loop_is_behind_and_no_longer(client, monkeypat
 
 def test_a_loop_that_was_asked_to_run_slowly_is_not_behind(client, monkeypatch) -> None:
     """At a fifth of real time 20 steps are due in a second."""
-    loop = RateLoop(0.01, target_factor=0.2)
+    loop, pace = RateLoop(0.01, RealTime(0.2)), "0.20 of real time"
     status, now = Status(client, loop), 1.0
     monkeypatch.setattr(RateLoop, "elapsed", property(lambda _: now))
-    for now, loop.ticks, message in ((1.0, 20, "well"), (2.0, 30, "behind"), (3.0, 50, "well")):  # noqa: B007
+    for now, loop.ticks, message in ((1.0, 20, pace), (2.0, 30, f"behind, {pace}"), (3.0, 50, pace)):  # noqa: B007
         assert loop_status(status.current()).message == message
 
 

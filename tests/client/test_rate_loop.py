@@ -5,6 +5,7 @@ import pytest
 
 from tests.support.waiting import wait
 from vinesim.client import rate_loop as module
+from vinesim.client.pace import Limit, OwnPace, RealTime
 from vinesim.client.rate_loop import RateLoop
 
 
@@ -14,7 +15,7 @@ class FakeTime:
     def __init__(self):
         self.now = 100.0
 
-    def perf_counter(self):
+    def monotonic(self):
         return self.now
 
     def sleep(self, seconds):
@@ -28,6 +29,12 @@ def clock(monkeypatch):
     return fake
 
 
+def own_pace(clock):
+    loop = RateLoop(0.01, max_lag=1.0)
+    loop.clock = OwnPace("picker", clock.now, loop.report)
+    return loop
+
+
 def run(loop, clock, works):
     starts = []
     for work in works:
@@ -39,9 +46,10 @@ def run(loop, clock, works):
 
 
 def test_a_late_tick_does_not_shift_later_deadlines(clock):
+    """It is made up for at 200 steps a second."""
     loop = RateLoop(0.01)
     starts = run(loop, clock, [0.001, 0.025, 0.001, 0.001, 0.001, 0.001])
-    assert starts == pytest.approx([0.0, 0.01, 0.035, 0.036, 0.04, 0.05])
+    assert starts == pytest.approx([0.0, 0.01, 0.035, 0.04, 0.045, 0.05])
     assert loop.overruns == 1
     assert loop.dropped == 0
     assert loop.hz == pytest.approx(100.0)
@@ -57,11 +65,11 @@ def test_real_time_factor_is_simulated_over_wall_time(clock):
     assert slow.overruns == 20
 
 
-def test_a_lower_target_spaces_the_steps_and_their_deadlines(clock):
+def test_a_lower_factor_spaces_the_steps_and_their_deadlines(clock):
     """At a quarter of real time a step of 10 ms is due every 40 ms, and 25 ms of work are no overrun."""
-    loop = RateLoop(0.01, target_factor=0.25)
+    loop = RateLoop(0.01, RealTime(0.25))
     starts = run(loop, clock, [0.025, 0.1, 0.001, 0.001, 0.001])
-    assert starts == pytest.approx([0.0, 0.04, 0.14, 0.141, 0.16])
+    assert starts == pytest.approx([0.0, 0.04, 0.14, 0.145, 0.16])
     assert loop.overruns == 1
     run(loop, clock, [0.002] * 100)
     assert loop.real_time_factor == pytest.approx(0.25, rel=0.01)
@@ -73,11 +81,74 @@ def test_a_lower_target_spaces_the_steps_and_their_deadlines(clock):
     assert loop.dropped in (999, 1000)
 
 
-def test_deadlines_of_a_long_stall_are_dropped_and_counted(clock):
+def test_steps_of_a_long_stall_are_skipped_and_counted(clock):
     loop = RateLoop(0.01)
     starts = run(loop, clock, [0.001, 3.0] + [0.001] * 10)
     assert loop.dropped in (298, 299)
     assert np.diff(starts)[-5:] == pytest.approx([0.01] * 5)
+
+
+def test_a_client_alone_on_a_slow_machine_slows_its_time_and_skips_nothing(clock):
+    """Steps that take 25 ms of wall time follow each other evenly, at 0.36 of real time after two seconds."""
+    loop = own_pace(clock)
+    run(loop, clock, [0.025] * 400)
+    starts = run(loop, clock, [0.025] * 100)
+    assert loop.dropped == 0
+    assert loop.target_factor == pytest.approx(0.36, abs=0.01)
+    assert np.diff(starts) == pytest.approx(0.01 / loop.target_factor, abs=0.002)
+    assert loop.clock.cause == "picker: steps"
+
+
+def test_its_time_rises_again_slowly_and_does_not_swing(clock):
+    loop = own_pace(clock)
+    run(loop, clock, [0.025] * 100)
+    factors = []
+    for _ in range(2000):
+        run(loop, clock, [0.004])
+        factors.append(loop.target_factor)
+    assert factors[-1] == 1.0
+    assert (np.diff(factors)[100:] >= 0.0).all()
+    assert np.argmax(np.array(factors) > 0.9) * 0.01 > 2.0, "it rises over several seconds"
+
+
+def test_what_holds_a_step_slows_time_and_is_its_cause(clock):
+    """A part that lets a step begin only every 50 ms: time passes at a fifth, whatever the steps themselves take."""
+    loop, free = own_pace(clock), [clock.now]
+    loop.hold = lambda: "" if clock.now >= free[0] else "sensors"
+    for _ in range(200):
+        run(loop, clock, [0.001])
+        free[0] = max(free[0], clock.now - 0.05) + 0.05
+    assert loop.dropped == 0
+    assert loop.target_factor == pytest.approx(0.2, rel=0.15)
+    assert loop.clock.cause == "picker: sensors"
+
+
+def test_a_part_that_knows_its_limit_slows_time_before_it_holds_a_step(clock):
+    loop = own_pace(clock)
+    loop.meter.limits.append(lambda: Limit(0.5, "sensors"))
+    run(loop, clock, [0.001] * 300)
+    assert loop.target_factor == pytest.approx(0.5)
+
+
+def test_another_clock_is_followed_at_once_and_skips_nothing(clock):
+    """As when the server is heard for the first time after the first step."""
+    loop = RateLoop(0.01)
+    run(loop, clock, [0.001] * 3)
+    offset = 1.7e9
+    loop.clock.time = lambda now: now + offset
+    run(loop, clock, [0.001] * 3)
+    assert loop.dropped == 0
+    assert abs(loop.next_time - clock.now - offset) < 0.02
+
+
+def test_a_clock_that_is_set_back_a_little_slows_the_steps_until_it_has_come(clock):
+    loop = RateLoop(0.01)
+    run(loop, clock, [0.001] * 3)
+    behind = 2.0
+    loop.clock.time = lambda now: now - behind
+    starts = run(loop, clock, [0.001] * 3000)
+    assert np.diff(starts).max() < 0.03, "no stop"
+    assert loop.next_time - loop.clock.time(clock.now) < 0.06
 
 
 def test_percentiles_are_those_of_the_work_time(clock):
@@ -91,11 +162,11 @@ def test_percentiles_are_those_of_the_work_time(clock):
 def test_steps_run_at_100_hz_by_the_real_clock():
     """F91: never faster, and again on time whenever the machine lets it; deadlines that are dropped are counted."""
     loop = RateLoop(0.01)
-    start, late = time.perf_counter(), []
+    start, late = time.monotonic(), []
 
     def step() -> bool:
         loop.begin()
-        lateness = time.perf_counter() - start - 0.01 * (loop.ticks + loop.dropped)
+        lateness = time.monotonic() - start - 0.01 * (loop.ticks + loop.dropped)
         late.append(lateness)
         loop.end()
         return loop.ticks > 100 and lateness < 0.005

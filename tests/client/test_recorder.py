@@ -30,7 +30,7 @@ class World:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
         server.declare_queryable(
-            "clock", lambda payload: messages.encode_time(messages.decode_time(payload)[0], EPOCH + self.hub.time)
+            "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], EPOCH + self.hub.time)
         )
         record = RetainedRecord(object_id(ObjectKind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
         server.declare_queryable("snap/0/0", lambda _: messages.encode_records([record]))

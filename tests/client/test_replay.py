@@ -136,8 +136,10 @@ def test_a_recorded_actor_name_is_taken(original):
 
 def test_the_clock_is_that_of_the_recording(original):
     bus = ReplayBus(original, "viewer", start=0.5)
-    bus.query("clock", messages.encode_time(3.0))
-    assert messages.decode_time(bus.replies()[0].payload) == (3.0, pytest.approx(EPOCH + 0.6, abs=0.2), 1.0)
+    bus.query("clock/viewer", messages.encode_time(3.0))
+    reply = messages.decode_time(bus.replies()[0].payload)
+    assert (reply.asked, reply.factor) == (3.0, 1.0)
+    assert reply.world == pytest.approx(EPOCH + 0.6, abs=0.2)
 
 
 class ReplayNetwork:
@@ -147,7 +149,7 @@ class ReplayNetwork:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
         server.declare_queryable(
-            "clock", lambda payload: messages.encode_time(messages.decode_time(payload)[0], 5e8 + self.hub.time)
+            "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], 5e8 + self.hub.time)
         )  # fmt: skip
         self.kept: list[RetainedRecord] = []
         self.server = server

@@ -119,7 +119,7 @@ def robot_recording(tmp_path_factory) -> pathlib.Path:
     hub = MemoryHub(delay=0.004)
     clock = hub.bus("server", live=False)
     clock.declare_queryable(
-        "clock", lambda payload: messages.encode_time(messages.decode_time(payload)[0], 1e9 + hub.time)
+        "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], 1e9 + hub.time)
     )
     scene = load_scene("demo")
     model = generate(scene)

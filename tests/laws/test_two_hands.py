@@ -31,7 +31,7 @@ class TwoHands:
     def __init__(self, delay: float, *, jitter: float = 0.0, loss: float = 0.0) -> None:
         self.now, self.hub = 100.0, MemoryHub(delay=delay, jitter=jitter, loss=loss, seed=3)
         self.hub.bus("server").declare_queryable(
-            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
+            "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
         )
         scene = load_scene("demo")
         self.model, self.body, self.rest = bunch_scene(0.5)

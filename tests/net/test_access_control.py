@@ -103,7 +103,7 @@ def keys_received(certs, server, name, keys):
         for key in keys:
             writer.put(key, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
         # samples put before in this session have arrived when the reply to a query has
-        list(writer.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
+        list(writer.get(f"vs/1/vineyard/clock/{name}", payload=messages.encode_time(1.0)))
         end.put(b"end")
         wait(lambda: "vs/1/vineyard/own/9/9/ada" in received, "the end mark")
         return [key for key in received if key != "vs/1/vineyard/own/9/9/ada"]
@@ -114,7 +114,7 @@ def test_an_actor_writes_under_its_own_name_and_no_other(server, certs):
     others = [f"vs/1/vineyard/{key.format('bob')}" for key in WRITTEN if key != "force/bob/{}"]
     invalid = [
         "vs/1/vineyard/anything", "vs/1/vineyard/c/0/0/0/ada", "vs/1/vineyard/force/ada/bob",
-        "vs/1/vineyard/clock", "vs/1/vineyard/hello/bob",
+        "vs/1/vineyard/clock/ada", "vs/1/vineyard/hello/bob",
     ]  # fmt: skip
     assert keys_received(certs, server, "ada", [*others, *own, *invalid]) == own
 
@@ -203,7 +203,7 @@ def test_all_bus_functions_work_under_access_control(server, certs):
         answers: dict = {}
 
         def all_replied():
-            for key in ("hello/ada", "clock", "snap/0/0"):
+            for key in ("hello/ada", "clock/guest", "snap/0/0"):
                 guest.query(key, messages.encode_time(1.0))
             ada.query("hello/guest")
             time.sleep(0.02)
@@ -253,15 +253,15 @@ def test_liveliness_and_replies_of_another_name_are_blocked(server, certs):
     with session("ada", server, certs) as ada, bus("bob", server, certs) as bob:
         forged = ada.liveliness().declare_token("vs/1/vineyard/live/carl/1")
         served = ada.declare_queryable("vs/1/vineyard/hello/carl", lambda query: query.reply(str(query.key_expr), b"x"))
-        clock = ada.declare_queryable("vs/1/vineyard/clock", lambda query: query.reply(str(query.key_expr), b"x"))
+        clock = ada.declare_queryable("vs/1/vineyard/clock/*", lambda query: query.reply(str(query.key_expr), b"x"))
         own = ada.liveliness().declare_token("vs/1/vineyard/live/ada/1")
         wait(lambda: "ada" in bob.alive(), "ada herself")
         assert "carl" not in bob.alive()
         bob.query("hello/carl")
-        bob.query("clock", messages.encode_time(1.0))
+        bob.query("clock/bob", messages.encode_time(1.0))
         answers: list = []
         wait(lambda: answers.extend(bob.replies()) or answers, "the clock")
-        assert [answer.key for answer in answers] == ["clock"]
+        assert [answer.key for answer in answers] == ["clock/bob"]
         assert messages.decode_time(answers[0].payload)[0] == 1.0
         for each in (served, clock, forged, own):
             each.undeclare()
@@ -317,7 +317,7 @@ def test_linked_servers_check_names_of_their_own_actors(certs, protocol):
         event = ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: event.matching, "bob's subscription")
         impostor.put("vs/1/vineyard/own/0/0/bob", b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
-        list(impostor.get("vs/1/vineyard/clock", payload=messages.encode_time(1.0)))
+        list(impostor.get("vs/1/vineyard/clock/bob", payload=messages.encode_time(1.0)))
         event.put(b"event")
         received: list = []
         wait(lambda: received.extend(bob.poll()) or received, "the event")

@@ -61,8 +61,8 @@ def test_another_protocol_is_refused_with_both_versions():
     reason = AdmissionControl().decide("w", "ada", "s", bytes(hello), 0.0).refused
     assert "version 9" in reason
     assert f"version {messages.PROTOCOL}" in reason
-    inner = messages.encode_hello(msgspec.structs.replace(Hello("ada"), protocol=7))
-    assert "version 7" in AdmissionControl().decide("w", "ada", "s", inner, 0.0).refused
+    inner = messages.encode_hello(msgspec.structs.replace(Hello("ada"), protocol=messages.PROTOCOL + 1))
+    assert f"version {messages.PROTOCOL + 1}" in AdmissionControl().decide("w", "ada", "s", inner, 0.0).refused
 
 
 @pytest.mark.parametrize("payload", [b"", b"VS", b"nonsense", messages.encode_hello(Hello("ada"))[:-3], bytes(1 << 21)])

@@ -23,7 +23,7 @@ class World:
     def __init__(self) -> None:
         self.hub, self.server_offset = MemoryHub(delay=0.02), 1e6
         self.hub.bus("server").declare_queryable(
-            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.server_time)
+            "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.server_time)
         )
         model = tree_row(2)
         self.ada, self.bob = (

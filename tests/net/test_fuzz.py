@@ -256,7 +256,7 @@ def test_zenoh_sessions_and_the_server_survive_malformed_messages():
                 publisher = publishers.get(key) or publishers.setdefault(key, bus.publisher(key, reliable=True))
                 publisher.put(payload)
                 if number % 20 == 0:
-                    bus.query("clock", payload)
+                    bus.query(f"clock/{bus.name}", payload)
                     time.sleep(0.005)
             wait(
                 lambda: ada.command()["counters"]["malformed"] > before["malformed"] + 100,

@@ -26,7 +26,7 @@ KEYS = (
     "{key}", "*/{key}", "vineyard/**", "vineyard/*/*/*/" + ATTACKER, "other/{key}", "vineyard", "vineyard/fact",
     "vineyard/fact/*/*/" + ATTACKER, "vineyard/fact/0", "vineyard/own/0/0/ada", "vineyard/fact/0/0/ada",
     "vineyard/a/ada",
-    "vineyard/live/ada/1", "vineyard/join/ada/1", "vineyard/hello/ada", "vineyard/clock", "vineyard/snap/0/0",
+    "vineyard/live/ada/1", "vineyard/join/ada/1", "vineyard/hello/ada", "vineyard/clock/ada", "vineyard/snap/0/0",
     "vineyard/snap/*/x", "vineyard/" + "n/" * 500 + "n", "vineyard/" + "n" * 5000, "vineyard/fact/x/" + ATTACKER,
     "vineyard/force/ada/ada", "vineyard/voice/ada", "vineyard/mesh/0", "vineyard/offer/0",
 )  # fmt: skip

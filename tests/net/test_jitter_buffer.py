@@ -97,7 +97,7 @@ def test_a_buffered_robot_is_delayed_and_accurate():
         hub = MemoryHub(delay=0.05, jitter=0.04, seed=3)
         server = hub.bus("server")
         server.declare_queryable(
-            "clock", lambda payload: messages.encode_time(messages.decode_time(payload)[0], hub.time)
+            "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], hub.time)
         )
         model = tree_row(1)
         hello = Hello("bob", digest="fake_clients", joints=0)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from vinesim import frames
 from vinesim.net.codec import messages, rotation
 from vinesim.net.codec.messages import Hello, MessageError, TreeStates, WrongVersion
+from vinesim.net.pace import PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene import ids
 from vinesim.scene.values import LightPattern, Lights, RobotUpdate
@@ -288,7 +289,9 @@ def test_claims_are_decoded_and_invalid_ones_are_refused():
 
 
 def test_clock_messages_are_decoded():
-    assert messages.decode_time(messages.encode_time(1.5, 2.5, 0.2)) == (1.5, 2.5, 0.2)
+    report = PaceReport(7.0, 1.25, "sensors")
+    whole = messages.decode_time(messages.encode_time(1.5, 2.5, 0.2, 3.5, "ada: sensors", report))
+    assert whole == (1.5, 2.5, 0.2, 3.5, "ada: sensors", report)
     with pytest.raises(MessageError, match="finite"):
         messages.decode_time(messages.encode_time(float("nan")))
 

@@ -27,7 +27,7 @@ class RetainedServer(Server):
     def open(self) -> None:
         super().open()
         self.bus.declare_queryable(
-            "clock", lambda payload: messages.encode_time(messages.decode_time(payload)[0], self.hub.time)
+            "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], self.hub.time)
         )
 
 

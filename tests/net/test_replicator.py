@@ -186,7 +186,7 @@ def test_another_scene_or_protocol_is_refused_with_both_values(change):
     hub = MemoryHub()
     ada = Client(hub, "ada", 1.0)
     run(hub, [ada], 0.1)
-    cy = Client(hub, "cy", 2.0, **({"digest": "other"} if change == "digest" else {"protocol": 7}))
+    cy = Client(hub, "cy", 2.0, **({"digest": "other"} if change == "digest" else {"protocol": messages.PROTOCOL + 1}))
     expected = "'same'.*'other'|'other'.*'same'" if change == "digest" else "version"
     if change == "digest":
         with pytest.raises(WorldMismatch, match=expected):
@@ -199,11 +199,10 @@ def test_another_scene_or_protocol_is_refused_with_both_values(change):
 def test_a_protocol_mismatch_names_both_versions():
     hub = MemoryHub()
     old = hub.bus("old")
-    old.declare_queryable(
-        "hello/old", lambda _: control.pack(messages.MessageKind.HELLO, Hello("old", digest="same", protocol=7))
-    )
+    hello = Hello("old", digest="same", protocol=messages.PROTOCOL + 1)
+    old.declare_queryable("hello/old", lambda _: control.pack(messages.MessageKind.HELLO, hello))
     new = Client(hub, "new", 1.0)
-    with pytest.raises(WorldMismatch, match=f"'old' speaks protocol version 7, 'new' version {messages.PROTOCOL}"):
+    with pytest.raises(WorldMismatch, match=f"version {messages.PROTOCOL + 1}, 'new' version {messages.PROTOCOL}"):
         run(hub, [new], 0.2)
 
 
@@ -632,7 +631,7 @@ def test_the_clock_offset_to_the_server_is_estimated():
     server.declare_queryable(
         "hello/server", lambda _: messages.encode_hello(Hello("server", "spectator", digest="same"))
     )
-    server.declare_queryable("clock", lambda q: messages.encode_time(messages.decode_time(q)[0], hub.time + 1000.0))
+    server.declare_queryable("clock/*", lambda q: messages.encode_time(messages.decode_time(q)[0], hub.time + 1000.0))
     ada = Client(hub, "ada", 1.0)
     run(hub, [ada], 1.5)
     assert ada.replicator.offset == pytest.approx(1000.0, abs=0.012)

@@ -17,6 +17,7 @@ from tests.support.waiting import wait
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello, RetainedRecord, Welcome
 from vinesim.net.counters import Counters
+from vinesim.net.pace import PaceReport
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.server import retained_store
 from vinesim.net.server.admission import SceneId
@@ -64,13 +65,13 @@ def test_the_list_of_actors_follows_joins_and_leaves():
 
 def test_a_clock_query_returns_the_time_of_day():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
-        ada.query("clock", b"nonsense")
-        ada.query("clock", messages.encode_time(12.5))
+        ada.query("clock/ada", b"nonsense")
+        ada.query("clock/ada", messages.encode_time(12.5))
         answers: list = []
         wait(lambda: answers.extend(ada.replies()) or answers, "the time")
-        sent, server_time, factor = messages.decode_time(answers[0].payload)
-        assert (sent, factor) == (12.5, 1.0)
-        assert abs(server_time - time.time()) < 10.0
+        reply = messages.decode_time(answers[0].payload)
+        assert (reply.asked, reply.factor) == (12.5, 1.0)
+        assert abs(reply.world - time.time()) < 10.0
         assert (server.pings, server.malformed) == (1, 1)
 
 
@@ -78,7 +79,7 @@ def test_a_clock_query_returns_the_time_of_day():
 def test_a_step_of_the_time_of_day_does_not_move_the_network_time(monkeypatch, step):
     def server_minus_own_time(bus: ZenohBus) -> float:
         asked = time.monotonic()
-        bus.query("clock", messages.encode_time(asked))
+        bus.query(f"clock/{bus.name}", messages.encode_time(asked))
         answers: list = []
         wait(lambda: answers.extend(bus.replies()) or answers, "the time")
         return messages.decode_time(answers[0].payload)[1] - asked
@@ -459,7 +460,7 @@ def test_of_two_linked_servers_one_admits_and_stores_for_both(protocol):
             with pytest.raises(NameTaken):
                 ZenohBus("ada", connect=relay.endpoint)
             answers: list = []
-            bob.query("clock", messages.encode_time(1.0))
+            bob.query("clock/bob", messages.encode_time(1.0))
             wait(lambda: answers.extend(bob.replies()) or answers, "the time")
             assert (hub.pings, relay.pings) == (1, 0)
 
@@ -512,3 +513,35 @@ def test_the_documented_configuration_for_stock_routers_works():
             bob.join(hello("bob"))
             assert_connected(ada, bob)
         close_session(router)
+
+
+def test_only_actors_with_a_body_that_were_admitted_slow_their_own_world():
+    """A spectator, a stranger and an actor of another world report that they can follow a tenth of real time."""
+    slow = messages.encode_time(0.0, report=PaceReport(0.0, 0.1, "steps"))
+
+    def reported_by(bus: ZenohBus, factor_falls: bool) -> None:
+        answers: list = []
+
+        def told() -> bool:
+            bus.query(f"clock/{bus.name}", slow)
+            answers.extend(messages.decode_time(reply.payload) for reply in bus.replies())
+            return any(one.factor < 0.5 for one in answers) if factor_falls else len(answers) > 20
+
+        wait(told, "replies")
+        assert any(one.cause for one in answers) == factor_falls
+
+    with Server("tcp/127.0.0.1:0") as server, contextlib.ExitStack() as stack:
+        eve, kim, bob, far = (
+            stack.enter_context(ZenohBus(name, connect=server.endpoint, world=world))
+            for name, world in (("eve", "vineyard"), ("kim", "vineyard"), ("bob", "vineyard"), ("far", "row-2"))
+        )
+        eve.join(messages.encode_hello(Hello("eve", kind="spectator", scene="s", digest="1")))
+        bob.join(messages.encode_hello(Hello("bob", scene="s", digest="1")))
+        far.join(messages.encode_hello(Hello("far", scene="s", digest="1")))
+        wait(lambda: len(server.actors) == 4, "all")
+        for bus in (eve, kim):
+            reported_by(bus, factor_falls=False)
+        reported_by(far, factor_falls=True)
+        reported_by(kim, factor_falls=False)
+        reported_by(bob, factor_falls=True)
+        assert server.figures()["clocks"]["vineyard"]["cause"].startswith("bob: ")

@@ -520,7 +520,7 @@ def test_a_session_that_closes_under_the_real_time_loop_raises_nothing(server):
             assert not publisher.matching
             assert not publisher.put(b"lost")
         ada.subscribe("a/bob").close()
-        ada.query("clock")
+        ada.query("clock/ada")
         ada.poll()
         wait(lambda: ada.failures >= 4, "the failures to be counted")
 

@@ -22,8 +22,9 @@ from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.sensing.ros_process import HOLD_TIMEOUT, RosProcess
+from vinesim.client.sensing.ros_process import RosProcess
 from vinesim.client.sensing.ros_worker import QUEUE_CAPACITY
+from vinesim.client.sensing.worker_process import HOLD_TIMEOUT
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description

@@ -45,7 +45,7 @@ def record(path: pathlib.Path) -> tuple[Client, float]:
     hub = MemoryHub(delay=0.004)
     server = hub.bus("server", live=False)
     server.declare_queryable(
-        "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + hub.time)
+        "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + hub.time)
     )
     scene = load_scene("demo")
     client = Client(

@@ -25,7 +25,9 @@ def record_a_pick(path: pathlib.Path) -> int:
     """Write a recording of the scene ``demo``; the bunch that is picked."""
     hub, scene = MemoryHub(delay=0.004), load_scene("demo")
     clock = hub.bus("server", live=False)
-    clock.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e6 + hub.time))
+    clock.declare_queryable(
+        "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e6 + hub.time)
+    )
     model, start = generate(scene), spawn_pose(scene, 0)
     bunch = find_reachable_bunch(model, start)
     client = Client(

@@ -277,7 +277,7 @@ def run_storm(
     hub = MemoryHub(delay=0.005, seed=seed)
     hub.binds_names = binds_names
     server = hub.bus("server")
-    server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
+    server.declare_queryable("clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
     model = tree_row()
     ada, bob = (FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0)))
     evil = FakeClient((MemoryHub() if is_stranger else hub).bus(ATTACKER), model, (3.0, 0.0), kind=kind)

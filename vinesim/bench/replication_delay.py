@@ -77,7 +77,9 @@ class Pair:
         self.now = 100.0
         self.hub = MemoryHub(delay=delay, jitter=jitter * delay, loss=loss if delay else 0.0, seed=seed)
         server = self.hub.bus("server")
-        server.declare_queryable("clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now))
+        server.declare_queryable(
+            "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
+        )
         start = spawn_pose(self.scene, 0)
         self.bunch = find_reachable_bunch(self.model, start)
         self.tree = int(self.model.body_tree[self.model.bunch_body[self.bunch]])

@@ -90,7 +90,7 @@ def traffic() -> Iterator[Measurement]:
         hub = MemoryHub(delay=LAN, seed=1)
         server = hub.bus("server")
         server.declare_queryable(
-            "clock", lambda asked, hub=hub: messages.encode_time(messages.decode_time(asked)[0], hub.time)
+            "clock/*", lambda asked, hub=hub: messages.encode_time(messages.decode_time(asked)[0], hub.time)
         )
         fake_clients = place_actors(hub, model, places(model, share))
         for _ in range(round(SETTLE * 100)):

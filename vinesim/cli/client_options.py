@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Collection
 
 from vinesim.errors import UsageError
+from vinesim.scene.values import SensorMode
 
 ROLES = ("robot", "human", "spectator")
 
@@ -15,6 +16,7 @@ ROLES_OF_OPTION = {
     **dict.fromkeys(("walk", "reach", "into", "height", "gestures", "outfit"), ("human",)),
     "jitter_buffer": ("robot", "human"),
     "sensor_hz": ("robot", "spectator"),
+    **dict.fromkeys(("sensors", "least_sensor_hz"), ("robot",)),
     "renderer": ("robot", "spectator"),
 }
 """The roles that an option belongs to, by its name; all roles have the options that are not named here."""
@@ -81,8 +83,13 @@ class ClientOptions:
     """File of a person's own finger poses."""
     outfit: str | None = None
     """What a person wears, by name; None: what follows from its own name."""
-    real_time_factor: float = 1.0
-    """Simulated time over real time that the loop of a client without a server aims at; 1 at most."""
+    real_time_factor: float | None = None
+    """Simulated time over real time of a client without a server, 1 at most; None: as the client can follow."""
+    sensors: str | None = None
+    """Whether simulated time waits for cameras and lidars, a :class:`vinesim.scene.values.SensorMode`; None: as the
+    robot's file says."""
+    least_sensor_hz: float | None = None
+    """Least rate of live sensors in simulated time [Hz]; None: as the robot's file says."""
     world: str = DEFAULT_WORLD
     """Of the server's worlds; those in different ones do not meet."""
 
@@ -113,6 +120,8 @@ def check_status(status: str) -> None:
 def check_options(options: ClientOptions) -> None:
     """Refuse what can be refused before anything is built: :class:`UsageError`, or DeviceError for a missing device."""
     check_status(options.status)
+    if options.sensors is not None and options.sensors not in tuple(SensorMode):
+        raise UsageError(f"--sensors {options.sensors!r}: give {', '.join(SensorMode)}")
     if options.page_lan and options.page is None and not options.is_for_page:
         raise UsageError("--page-lan without a page: give --page PORT, too")
     if options.tls is not None and options.connect is None:
@@ -123,7 +132,7 @@ def check_options(options: ClientOptions) -> None:
         raise UsageError(
             f"--world {options.world} --tls {options.tls}: a server with certificates has one world; leave --world out"
         )
-    if options.real_time_factor != 1.0 and options.connect is not None:
+    if options.real_time_factor is not None and options.connect is not None:
         raise UsageError(
             f"--real-time-factor {options.real_time_factor:g} with --connect: a world runs as fast as its server says; "
             "give it to vinesim server"

@@ -9,6 +9,7 @@ import os
 import pathlib
 import sys
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
@@ -18,12 +19,14 @@ from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.cli.signals import stop_at_signals
 from vinesim.client.client import Client
+from vinesim.client.pace import OwnPace, RealTime, WorldPace
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
 from vinesim.errors import writing
 from vinesim.kernels.compilation import compile_kernels
+from vinesim.net.pace import describe
 from vinesim.net.transport.bus import Bus
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.plants.device_buffers import DeviceLost, device_fault
@@ -41,6 +44,8 @@ FIRST_STATUS = 0.1
 """Wall time from the first step to the first status line [s]: shows early that the client runs."""
 CLOCK_TIMEOUT = 2.0
 """How long the first step waits for the server's clock [s]."""
+MAX_LAG = 1.0
+"""Lag behind a clock that waits for slow clients, beyond which steps are skipped after all [s]."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -56,7 +61,8 @@ class ClientSession:
         # The loop releases the interpreter lock at every kernel launch and needs it back within a fraction of a step.
         sys.setswitchinterval(SWITCH_INTERVAL)
         self.options = options
-        self.name = options.name or f"{options.role}-{os.getpid()}"
+        # alone it has the same name in every run: names seed the noise of sensors
+        self.name = options.name or (options.role if options.connect is None else f"{options.role}-{os.getpid()}")
         self.scene = with_seed(load_scene(options.scene), options.seed)
         self.spawn = options.spawn
         """Index of the start pose in the scene."""
@@ -143,21 +149,13 @@ class ClientSession:
         self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
         sensors: Callable[[], dict[str, Any]] = dict, publish: Callable[[dict[str, Any]], Any] = lambda _: None,
     ) -> Status:  # fmt: skip
-        """Step at the asked real-time factor until a signal, the time limit or the end of the ``task``; returns the
-        final status.
+        """Step as the world's clock says until a signal, the time limit or the end of the ``task``; returns the final
+        status.
 
         ``sent`` counts the ROS messages by topic, ``sensors`` gives the status of sensors, ``publish`` takes every
         status for /diagnostics.
         """
-        loop = RateLoop(client.physics.dt, self.options.real_time_factor)
-        if self.options.connect is not None:
-            client.wait_for_clock(CLOCK_TIMEOUT)
-
-            def follow_world() -> None:
-                loop.target_factor = client.replicator.real_time_factor
-
-            follow_world()
-            client.between_steps.append(follow_world)
+        loop = self._loop(client)
         status = Status(client, loop, sent, task, sensors)
         reporter = threading.Thread(
             target=report_status, args=(status, publish, self.options.status, self._stop), name="status"
@@ -177,6 +175,25 @@ class ClientSession:
             with writing(self.options.tick_log):
                 loop.log().save(self.options.tick_log)
         return status
+
+    def _loop(self, client: Client) -> RateLoop:
+        """The loop of a client: it follows the clock of its server, or one of its own."""
+        dt, factor = client.physics.dt, self.options.real_time_factor
+        if self.options.connect is not None:
+            client.wait_for_clock(CLOCK_TIMEOUT)
+            loop = RateLoop(dt, WorldPace(client.replicator), max_lag=MAX_LAG)
+            client.step_time = lambda: loop.next_time
+            if client.slows_the_world:
+                client.replicator.report_pace(loop.report)
+        elif factor is not None:
+            loop = RateLoop(dt, RealTime(factor))
+        else:
+            loop = RateLoop(dt, max_lag=MAX_LAG)
+            loop.clock = OwnPace(client.name, time.monotonic(), loop.report)
+        loop.meter.limits += client.pace_limits
+        loop.hold = client.held
+        loop.is_stopping = self._stop.is_set
+        return loop
 
 
 def start_trace(client: Client, model: Model, bunch: int) -> Trace:
@@ -245,6 +262,8 @@ def status_line(values: dict[str, Any]) -> str:
         f"out {1e-3 * values['bytes_out']:.1f} kB",
         f"with {', '.join(values['others'])}" if values["others"] else "alone",
     ]
+    if pace := describe(values["target_real_time_factor"], values["pace_cause"]):
+        parts.insert(1, pace)
     if values["network"]:
         parts.append(f"NETWORK: {values['network']}")
     restarts = {"sensor processes": values["sensor_restarts"], "ROS processes": values["ros_restarts"]}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
+from vinesim.client.recording.state_digest import StateDigest
 from vinesim.client.sensing.robot_processes import RobotProcesses
 from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
@@ -20,6 +22,7 @@ from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.robot.tasks.task import Task
 from vinesim.ros.names import ros_name
+from vinesim.scene.values import SensorMode, SensorPacing
 
 
 def run(options: ClientOptions) -> int:
@@ -46,6 +49,9 @@ def run(options: ClientOptions) -> int:
             process.attach(client, client.robots[name])
         task = None if begin is None else begin(client.physics, client.robot)
         _add_behaviour(session, client, task, approach)
+        digest = StateDigest() if sensors[0].sensors.is_lockstep else None
+        if digest is not None:
+            client.post_step.append(digest)
         session.show_page(client)
         status = session.run(
             client, task=task, sent=sensors[0].sent_messages, sensors=lambda: _sensor_status(sensors),
@@ -53,10 +59,13 @@ def run(options: ClientOptions) -> int:
         )  # fmt: skip
         if options.out is not None:
             for process in sensors:
+                process.sensors.complete_counts()
                 process.close_ros()
             report = complete_report(status.report(), dict(zip(names, sensors, strict=True)))
             if task is not None:
                 report["job"] = task.report()
+            if digest is not None:
+                report["state_digest"] = digest.hexdigest()
             save_report(options.out, report)
             sensors[0].save_picture(options.out)
             if client.trace is not None:
@@ -76,10 +85,21 @@ def _start_sensors(
             name, session.scene, session.model, description, namespace="/".join(filter(None, parts)), ros=options.ros,
             keep_pictures=options.out is not None and i == 0, sensor_hz=options.sensor_hz,
             params_file=options.params_file, clock=i == 0, renderer=options.renderer, device=options.device,
+            pacing=_pacing(options, description),
             interest_radius=None if options.connect is None else options.interest_radius,
         )  # fmt: skip
         processes.append(session.enter(process))
     return processes
+
+
+def _pacing(options: ClientOptions, description: RobotDescription) -> SensorPacing:
+    """What the command line says of sensors and simulated time, and of the rest what the robot's file says."""
+    pacing = description.sensor_pacing
+    if options.sensors is not None:
+        pacing = dataclasses.replace(pacing, mode=SensorMode(options.sensors))
+    if options.least_sensor_hz is not None:
+        pacing = dataclasses.replace(pacing, least_rate=options.least_sensor_hz)
+    return pacing
 
 
 def complete_report(report: dict[str, Any], processes: Mapping[str, RobotProcesses]) -> dict[str, Any]:

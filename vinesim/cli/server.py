@@ -10,6 +10,7 @@ from typing import Any
 from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.cli.signals import stop_at_signals
 from vinesim.errors import UsageError
+from vinesim.net.pace import describe
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.retained_store import Quota
 from vinesim.net.server.server import Server
@@ -22,7 +23,7 @@ STATUS_PERIOD = 1.0
 def run(
     *, listen: list[str] | None, connect: list[str] | None, state_dir: pathlib.Path | None, scene: str | None,
     seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, insecure: bool,
-    status: str, spectators_speak_to: str = "people", real_time_factor: float = 1.0,
+    status: str, spectators_speak_to: str = "people", real_time_factor: float | None = None,
 ) -> int:  # fmt: skip
     """Carry messages until SIGINT or SIGTERM."""
     if status not in ("text", "json", "none"):
@@ -64,5 +65,8 @@ def _plan(scene: str, seed: int | None) -> SceneId:
 def _line(figures: dict[str, Any]) -> str:
     company = ", ".join(figures["actors"]) or "no actors"
     counts = ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in figures.items() if isinstance(value, int))
+    for world, clock in figures["clocks"].items():
+        if text := describe(clock["real_time_factor"], clock["cause"]):
+            counts += f", {world} at {text}"
     trouble = f"; {figures['trouble']}" if figures.get("trouble") else ""
     return f"{company}: {counts}{trouble}"

@@ -25,6 +25,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.allocator import release_free_memory
 from vinesim.avatar.local_human import LocalHuman
+from vinesim.client.pace import Limit
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.remote.mesh_exchange import MeshExchange
 from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
@@ -72,6 +73,8 @@ class Client:
 
     picking = True
     """Whether bunches and branches detach in this client's physics when they are pulled too hard."""
+    slows_the_world = True
+    """Whether the clock of its world waits for this client where its machine is slow."""
 
     def __init__(
         self,
@@ -145,6 +148,12 @@ class Client:
         self.interest_audit = InterestAudit()
         self.world_time = WorldTime(self.physics.dt)
         """Time of the world, in which ROS messages are stamped."""
+        self.step_time: Callable[[], float] | None = None
+        """Of a client whose steps follow the clock of its server: the world's time at the present step [s]."""
+        self.holds: list[Callable[[], str]] = []
+        """Each says why the next step has to wait, such as "sensors"; empty if it may begin."""
+        self.pace_limits: list[Callable[[], Limit]] = []
+        """Each says how fast a part that serves this client can follow."""
         self.clock = clock
         self.sound = SoundExchange(self)
         self._remote_trees: dict[int, TreeUpdate] = {}
@@ -255,7 +264,10 @@ class Client:
             self.steps_before_pause -= 1
         now = self.clock()
         self.receive(now)
-        if self.replicator.has_clock:
+        if self.step_time is not None:
+            if self.replicator.has_clock:
+                self.world_time.take(self.step_time() - self.physics.time)
+        elif self.replicator.has_clock:
             self.world_time.follow(self.physics.time, self.replicator.network_time(now))
         self.physics.wind_time_offset = self.world_time.offset
         self.control()
@@ -265,6 +277,10 @@ class Client:
         self.send(now)
         for callback in self.wake_readers:
             callback()
+
+    def held(self) -> str:
+        """Why the next step has to wait; empty if it may begin."""
+        return next((cause for hold in self.holds if (cause := hold())), "")
 
     def wait_for_clock(self, timeout: float) -> None:
         """Before the first step: wait up to ``timeout`` [s] for the server's clock, so that no stamp jumps later."""

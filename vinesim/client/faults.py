@@ -27,12 +27,12 @@ DESCRIPTIONS = {
     "meshes_not_taken": "meshes of robots here were not taken by the server: others see boxes in their place",
     "commands_refused": "commands from ROS were refused, as they contradict themselves or what the robot has",
     "page_messages_refused": "messages of pages were refused, as they were malformed or cannot be true",
-    "deadlines_dropped": "steps were skipped after the process had stood still",
+    "steps_skipped": "steps were skipped after the process had stood still",
 }
 """What each fault is, for a person."""
 
 
-def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
+def count_faults(client: Client, steps_skipped: int = 0) -> dict[str, int]:
     """How often each fault of :data:`DESCRIPTIONS` occurred; faults that did not are left out."""
     counters = [replicator.counters for replicator in client.replicators.values()]
     physics = client.physics.faults | {"couplings_refused": client.couplings.refused}
@@ -45,7 +45,7 @@ def count_faults(client: Client, deadlines_dropped: int = 0) -> dict[str, int]:
         "wrenches_refused": sum(one.wrenches_refused for one in counters),
         "meshes_refused": client.meshes.refused_count,
         "meshes_not_taken": client.meshes.refused_offers,
-        "deadlines_dropped": deadlines_dropped,
+        "steps_skipped": steps_skipped,
     })  # fmt: skip
     for others in client.faults_elsewhere:
         counts.update(others())

@@ -1,12 +1,19 @@
-"""A loop at a fixed rate: steps at absolute deadlines, with a record of how well they were kept."""
+"""A loop whose steps follow a clock: each begins when it is due, with a record of how well that was kept."""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import pathlib
 import time
+from collections.abc import Callable
 
 import numpy as np
+
+from vinesim.client.pace import PaceMeter, RealTime, StepClock
+from vinesim.net.pace import PaceReport
+
+log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,8 +26,8 @@ class TickLog:
     """[step] how long it took [s]."""
     dt: float
     """Simulated time of a step [s]."""
-    period: float
-    """From one deadline to the next [s]: longer than ``dt`` where the world is slower than real time."""
+    periods: np.ndarray
+    """[step] from one deadline to the next [s]: longer than ``dt`` where the world is slower than real time."""
 
     def between(self, since: float, until: float) -> dict[str, float]:
         """Rate, percentiles of the work, overruns and real-time factor of the steps that began in a span of time [s].
@@ -28,86 +35,150 @@ class TickLog:
         :class:`ValueError` if there are fewer than two.
         """
         part = slice(*np.searchsorted(self.begins, (since, until)))
-        begins, work = self.begins[part], self.work[part]
+        begins, work, periods = self.begins[part], self.work[part], self.periods[part]
         if len(begins) < 2:
             raise ValueError(f"{len(begins)} steps began between {since:.3f} and {until:.3f} s")
         hz = float((len(begins) - 1) / (begins[-1] - begins[0]))
         p50, p99 = (1e3 * float(value) for value in np.percentile(work, (50, 99)))
         return {
-            "tick_hz": hz, "tick_p50_ms": p50, "tick_p99_ms": p99, "overruns": int((work > self.period).sum()),
+            "tick_hz": hz, "tick_p50_ms": p50, "tick_p99_ms": p99, "overruns": int((work > periods).sum()),
             "real_time_factor": hz * self.dt,
         }  # fmt: skip
 
     def save(self, path: pathlib.Path) -> None:
         """Write it as a NumPy archive."""
-        np.savez(path, begins=self.begins, work=self.work, dt=self.dt, period=self.period)
+        np.savez(path, begins=self.begins, work=self.work, dt=self.dt, periods=self.periods)
 
     @classmethod
     def load(cls, path: pathlib.Path) -> TickLog:
         """Read what :meth:`save` wrote."""
         with np.load(path) as archive:
-            return cls(archive["begins"], archive["work"], float(archive["dt"]), float(archive["period"]))
+            return cls(archive["begins"], archive["work"], float(archive["dt"]), archive["periods"])
 
 
 class RateLoop:
-    """Waits for the next of a row of deadlines, and measures the work of each step of ``dt`` [s].
+    """Waits until a step of ``dt`` [s] is due by a clock and nothing holds it, and measures its work.
 
-    Deadlines are absolute, so a late step does not delay the ones after it. A process that fell far behind (it was
-    stopped, or the machine slept) does not race to catch up: the missed deadlines are dropped.
-
-    Simulated time passes ``target_factor`` times as fast as real time: deadlines are ``dt / target_factor`` apart.
+    Steps are due at the clock's times ``next_time``, ``dt`` apart, so a late step does not delay the ones after it. A
+    loop that is late makes at most 200 steps a second, so that it does not flood the subscribers of its messages. One
+    that is more than ``max_lag`` late (it was stopped, or the machine slept) skips the steps that it has missed.
     """
 
-    MAX_BACKLOG = 25
-    """Largest backlog that is caught up [steps]; a longer one is dropped and counted."""
+    MAX_LAG = 0.25
+    """Largest lag that is caught up, unless given [s]."""
+    LEAST_SPACING = 0.5
+    """Real time between the begins of two steps, as a share of ``dt``."""
+    MAX_LEAD = 5.0
+    """A clock that is further behind than this is another one, whose time is taken at once [s]."""
+    MAX_SKIP = 3600.0
+    """The same of a clock that is further ahead [s]: so is the first that a server tells."""
+    FREE_LEAD = 0.015
+    """A clock that is further behind than this was set back: steps go on at :data:`LEAD_RATE` until it has come [s]."""
+    LEAD_RATE = 0.9
+    LONGEST_SLEEP = 0.05
+    """The clock is looked after between two sleeps [s]."""
+    SHORTEST_SLEEP = 1e-6
+    """A step that is due so soon begins now [s]."""
+    HOLD_POLL = 0.001
+    """Time between two looks whether a step is still held [s]."""
 
-    def __init__(self, dt: float, target_factor: float = 1.0, capacity: int = 1 << 16) -> None:
-        self.dt = dt
-        self.target_factor = target_factor
-        """May be changed between steps."""
+    def __init__(
+        self, dt: float, clock: StepClock | None = None, *, max_lag: float = MAX_LAG, capacity: int = 1 << 16
+    ) -> None:
+        """``clock``: real time unless given. ``capacity``: steps whose times are kept."""
+        self.dt, self.clock, self.max_lag = dt, clock or RealTime(), max_lag
+        self.next_time = 0.0
+        """Time of the clock at which the next step is due [s]; from :meth:`begin` to :meth:`end`, the present step."""
+        self.hold: Callable[[], str] = lambda: ""
+        """Why the step that is due has to wait: "sensors"; empty if it may begin."""
+        self.is_stopping: Callable[[], bool] = lambda: False
+        """Whether not to wait any longer."""
+        self.meter = PaceMeter(dt)
         self.ticks = 0
         self.overruns = 0
         """Steps whose work took longer than the period."""
         self.dropped = 0
-        """Deadlines dropped after a stall."""
+        """Steps that were skipped after a stall."""
         # filled, not np.zeros: their pages are there from the start, and the memory of a run does not grow
         self._work = np.full(capacity, 0.0, np.float32)
         self._begins = np.full(capacity, 0.0)
-        self._began = self._start = self._deadline = 0.0
+        self._periods = np.full(capacity, dt, np.float32)
+        self._began = self._start = 0.0
+
+    @property
+    def target_factor(self) -> float:
+        """How many times as fast as real time the steps should follow each other now."""
+        return self.clock.factor
 
     @property
     def period(self) -> float:
-        """From one deadline to the next [s]."""
-        return self.dt / self.target_factor
+        """Real time from one deadline to the next [s]."""
+        return self.dt / self.clock.factor
+
+    def report(self) -> PaceReport:
+        """The time that the steps have reached, and how fast they could go on."""
+        return PaceReport(self.next_time, *self.meter.limit())
 
     def begin(self) -> None:
-        """Wait until the next step is due, then start measuring its work."""
-        now = time.perf_counter()
+        """Wait until the next step is due and nothing holds it, then start measuring its work."""
+        now = time.monotonic()
+        self.clock.keep(now)
         if self.ticks == 0:
-            self._start = self._deadline = now
-        else:
-            self._deadline += self.period
-            late = now - self._deadline
-            if late > self.MAX_BACKLOG * self.period:
-                skipped = int(late / self.period)
-                self.dropped += skipped
-                self._deadline += skipped * self.period
-            while (wait := self._deadline - time.perf_counter()) > 0.0:
-                time.sleep(wait)
-        self._began = time.perf_counter()
+            self._start = now
+            self.next_time = self.clock.time(now)
+            self.meter.begin(now)
+        while (wait := self._time_to_wait(now)) > self.SHORTEST_SLEEP and not self.is_stopping():
+            sleep = min(wait, self.LONGEST_SLEEP)
+            self.meter.idle(sleep)
+            time.sleep(sleep)
+            now = time.monotonic()
+            if wait > sleep:
+                self.clock.keep(now)
+        while (cause := self.hold()) and not self.is_stopping():
+            time.sleep(self.HOLD_POLL)
+            since, now = now, time.monotonic()
+            self.meter.hold(cause, now - since)
+            self.clock.keep(now)
+        self._skip_missed(now)
+        self._began = now
+
+    def _time_to_wait(self, now: float) -> float:
+        """Real time until the next step may begin [s]."""
+        lead = self.next_time - self.clock.time(now)
+        if not -self.MAX_SKIP <= lead <= self.MAX_LEAD:
+            log.info("another clock: its time is %+.1f s away", -lead)
+            self.next_time -= lead
+            lead = 0.0
+        if self.ticks == 0:
+            return 0.0
+        since = now - self._began
+        wait = lead / self.clock.factor
+        if lead > self.FREE_LEAD:
+            wait = min(wait, self.period / self.LEAD_RATE - since)
+        return max(wait, self.LEAST_SPACING * self.dt - since)
+
+    def _skip_missed(self, now: float) -> None:
+        lag = self.clock.time(now) - self.next_time
+        if lag > self.max_lag:
+            skipped = int(lag / self.dt)
+            self.dropped += skipped
+            self.next_time += skipped * self.dt
 
     def end(self) -> None:
         """End the measurement of this step's work."""
-        work = time.perf_counter() - self._began
-        self._work[self.ticks % len(self._work)] = work
-        self._begins[self.ticks % len(self._work)] = self._began
+        now = time.monotonic()
+        work, row = now - self._began, self.ticks % len(self._work)
+        self._work[row], self._begins[row], self._periods[row] = work, self._began, self.period
         self.overruns += work > self.period
         self.ticks += 1
+        is_ahead = self.next_time - self.clock.time(now) > self.FREE_LEAD
+        self.next_time += self.dt * (self.LEAD_RATE if is_ahead else 1.0)
+        self.meter.step(now)
 
     @property
     def elapsed(self) -> float:
         """Wall time since the first step began [s]."""
-        return time.perf_counter() - self._start if self.ticks else 0.0
+        return time.monotonic() - self._start if self.ticks else 0.0
 
     @property
     def hz(self) -> float:
@@ -124,7 +195,9 @@ class RateLoop:
     def log(self) -> TickLog:
         """When the last steps began and how long they took, as many as there was room for."""
         order = np.arange(max(self.ticks - len(self._work), 0), self.ticks) % len(self._work)
-        return TickLog(self._begins[order], self._work[order].astype(float), self.dt, self.period)
+        return TickLog(
+            self._begins[order], self._work[order].astype(float), self.dt, self._periods[order].astype(float)
+        )
 
     def work_ms(self, *percentiles: float) -> list[float]:
         """Percentiles (0 to 100) of the work of a step [ms]."""

@@ -49,6 +49,7 @@ class Spectator(Client):
     """A client that only watches. :attr:`pose` [7] is that of its eyes: x forward, z up; assign it to move."""
 
     picking = False  # the owners of plants report what detaches
+    slows_the_world = False
 
     def _add_own_actor(
         self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,

@@ -69,6 +69,8 @@ class Status:
             "real_time_factor": loop.real_time_factor,
             "recent_real_time_factor": recent_factor,
             "target_real_time_factor": loop.target_factor,
+            "pace_cause": loop.clock.cause,
+            "steps_skipped": loop.dropped,
             "awake": len(client.physics.plants.awake),
             "force": float(force),
             "displacement_mm": 1e3 * client.trace.displacement if client.trace is not None else 0.0,
@@ -100,7 +102,6 @@ class Status:
             "ticks_touching_when_far": client.interest_audit.ticks_touching,
             "malformed": client.replicator.counters.malformed,
             "network": client.replicator.counters.to_report(),
-            "deadlines_dropped": self.rate_loop.dropped,
         }
         if client.trace is not None:
             rows = client.trace.rows()

@@ -56,6 +56,11 @@ class WorldTime:
             self.offset += change
             self.offset = max(self.offset, clock - simulated - MAX_LAG)
 
+    def take(self, offset: float) -> None:
+        """Stamp steps with this ``offset`` [s], which a loop that follows the server's clock says."""
+        self.is_shared = True
+        self.offset = offset
+
 
 class OffsetHistory:
     """Offsets of the world's time at recent simulated times, for the stamps of what is ready later than it happened."""

@@ -7,6 +7,7 @@ due, from where it was at each of them, and delivers a revolution after its last
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -16,7 +17,7 @@ from vinesim.kernels.raster import lidar_raster, transform_primitives
 from vinesim.kernels.sensing import lidar_echoes
 from vinesim.physics.plants.sway import Sway
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, Snapshot
+from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, SensorMode, SensorPacing, Snapshot
 from vinesim.sensors.camera.camera import Camera, load_camera_kernels
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import SpinningScan
@@ -30,6 +31,13 @@ def load_kernels() -> None:
     for module in (transform_primitives, lidar_raster, lidar_echoes):
         wp.load_module(module, device="cpu")
 
+
+HEADROOM = 0.9
+"""Share of real time that rendering may take."""
+LEAST_RATE_MARGIN = 0.9
+"""Live sensors are taken so much more often than their least rate asks, since snapshots come at whole steps."""
+COST_GAIN = 0.3
+"""Share of the newest frame in the time that frames take."""
 
 DemandQuery = Callable[[], CameraOutput]
 """The outputs of a sensor that are wanted now; a lidar scans if there is any, exactly if it is exact depth alone."""
@@ -69,8 +77,10 @@ class SensorScheduler:
     """Renders the sensors of one robot, in the caller's thread."""
 
     def __init__(
-        self, model: Model, sensors: Sequence[ScheduledSensor], *, primitives: Primitives | None = None
-    ) -> None:
+        self, model: Model, sensors: Sequence[ScheduledSensor], *, primitives: Primitives | None = None,
+        pacing: SensorPacing = SensorPacing(), on_taken: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        """``on_taken`` is called when it is known what a snapshot is needed for, before that is rendered."""
         names = [m.name for m in sensors]
         if len(set(names)) != len(names):
             twice = next(n for n in names if names.count(n) > 1)
@@ -85,6 +95,13 @@ class SensorScheduler:
         self._is_first = dict.fromkeys(names, True)
         """Whether a sensor has delivered at most one frame since it became wanted; the first may take longer."""
         self._scans = {m.name: SpinningScan(m.sensor, m.rate) for m in sensors if isinstance(m.sensor, Lidar)}
+        self._pacing, self._on_taken = pacing, on_taken
+        self._taken: dict[str, float] = {}
+        """Simulated time of the newest snapshot that each wanted sensor has taken [s]."""
+        self._costs: dict[str, float] = {}
+        """Real time that a frame or revolution of each sensor takes, smoothed [s]."""
+        self._unfinished = dict.fromkeys(names, 0.0)
+        """Real time that the present revolution of each lidar has taken so far [s]."""
         self._sway = Sway(model)
         self._moved = np.zeros(len(model.tree_first), bool)
         """[tree] whether it moved since the primitives were posed."""
@@ -116,17 +133,63 @@ class SensorScheduler:
         """
         self._moved[snapshot.moved_trees] = True
         for name, scan in self._scans.items():
-            for time, then in (*earlier, (snapshot.time, poses)):
+            for moment, then in (*earlier, (snapshot.time, poses)):
                 if name in then:
-                    scan.pose_history.add(time, then[name])
+                    scan.pose_history.add(moment, then[name])
         due = [m for m in self.sensors if self._is_due(m, snapshot.time, poses)]
+        for scheduled in self.sensors:
+            if scheduled in due or (scheduled.name in self._scans and scheduled.name in self._taken):
+                self._taken[scheduled.name] = snapshot.time
+        self._on_taken()
         if not due:
             return
+        begun = time.perf_counter()
         seen = self._update_primitives(snapshot, poses)
         for scheduled in due:
+            count = 0
             for result in self._results(scheduled, seen, poses[scheduled.name]):
                 scheduled.deliver(result)
-                self.frames[scheduled.name] += 1
+                count += 1
+            self.frames[scheduled.name] += count
+            now = time.perf_counter()
+            self._note_cost(scheduled.name, now - begun, count)
+            begun = now
+
+    def _note_cost(self, name: str, seconds: float, count: int) -> None:
+        """Note the real time that a sensor took in one call, in which ``count`` frames were completed."""
+        self._unfinished[name] += seconds
+        if count:
+            cost = self._unfinished[name] / count
+            before = self._costs.get(name, cost)
+            self._costs[name] = before + COST_GAIN * (cost - before)
+            self._unfinished[name] = 0.0
+
+    def horizon(self) -> float:
+        """Simulated time [s] that the world must not pass before a newer snapshot is taken, or a wanted sensor falls
+        below the rate that its mode promises; infinite if none is wanted."""
+        return min(
+            (max(self._taken[one.name] + self._gap(one), self._due_time(one)) for one in self._wanted()), default=np.inf
+        )
+
+    def sustainable_factor(self) -> float:
+        """The largest real-time factor at which the wanted sensors keep the rate that their mode promises, by what
+        their frames took lately; infinite if none is wanted."""
+        load = sum(self._costs.get(one.name, 0.0) / self._gap(one) for one in self._wanted())
+        return HEADROOM / load if load > 0.0 else np.inf
+
+    def _wanted(self) -> list[ScheduledSensor]:
+        return [one for one in self.sensors if one.name in self._taken and one.wanted()]
+
+    def _gap(self, scheduled: ScheduledSensor) -> float:
+        """Longest simulated time between two snapshots that the mode allows a sensor to take [s]."""
+        is_live = self._pacing.mode is SensorMode.LIVE
+        if isinstance(scheduled.sensor, Lidar) and not is_live:
+            return 1.0 / scheduled.sensor.rate  # a revolution that is taken later than this is left out
+        return max(scheduled.period, LEAST_RATE_MARGIN / self._pacing.least_rate) if is_live else scheduled.period
+
+    def _due_time(self, scheduled: ScheduledSensor) -> float:
+        """When the next picture of a camera is due [s]: the world must get so far."""
+        return -np.inf if scheduled.name in self._scans else self._next_time[scheduled.name]
 
     def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> Snapshot:
         """Pose the primitives; the snapshot as it is drawn, good until the next call."""
@@ -162,9 +225,12 @@ class SensorScheduler:
         if name not in poses or not scheduled.wanted():
             self._next_time[name] = -np.inf  # a subscriber that returns gets a frame at once, and missed none
             self._is_first[name] = True
+            self._taken.pop(name, None)
             if name in self._scans:
                 self._scans[name].cancel(now)
+                self._unfinished[name] = 0.0
             return False
+        self._taken.setdefault(name, now)
         if name in self._scans:
             return self._scans[name].is_due(now)
         due, period = self._next_time[name], scheduled.period

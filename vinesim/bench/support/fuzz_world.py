@@ -111,7 +111,7 @@ class FuzzWorld:
         self._server = self.hub.bus("server", live=False)
         self._server.subscribe("fact/**", KEEP_ALL)
         self._server.declare_queryable(
-            "clock", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
+            "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
         )
         for x, y in CELLS:
             self._server.declare_queryable(

@@ -11,7 +11,7 @@ import typer
 from vinesim.cli.commands.options import Pose, RealTimeFactor, Renderer, Scene, Seconds, Seed, StatusFormat, World
 
 Role = Annotated[str, typer.Option(help="robot, human or spectator.")]
-Name = Annotated[str | None, typer.Option(help="The actor's unique name; ROLE-PID unless given.")]
+Name = Annotated[str | None, typer.Option(help="The actor's unique name; ROLE-PID unless given, alone ROLE.")]
 Server = Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")]
 Certificates = Annotated[
     pathlib.Path | None,
@@ -60,6 +60,18 @@ Out = Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, tra
 SensorRate = Annotated[
     float | None, typer.Option(min=0.1, help="Pictures and scans a second; each sensor's own rate unless given.")
 ]
+Sensors = Annotated[
+    str | None,
+    typer.Option(
+        help="Of a robot: live: cameras and lidars give what they can, but time waits below --least-sensor-hz. paced: "
+        "every frame at its rate in simulated time. lockstep: time waits for every frame, and two runs are equal to "
+        "the bit. As the robot's file says unless given, else live."
+    ),
+]
+LeastSensorRate = Annotated[
+    float | None,
+    typer.Option(min=0.01, max=1000.0, help="Of live sensors: least rate in simulated time [Hz]; 5 unless given."),
+]
 Page = Annotated[
     int | None,
     typer.Option(
@@ -103,9 +115,10 @@ def client(
     height: Height = 1.75, watch: Watch = None,
     interest_radius: InterestRadius = 5.0, jitter_buffer: JitterBuffer = 0.0, device: Device = "cpu",
     threads: Threads = 1, seconds: Seconds = None, out: Out = None, status: StatusFormat = "text",
-    sensor_hz: SensorRate = None, renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,
+    sensor_hz: SensorRate = None, sensors: Sensors = None, least_sensor_hz: LeastSensorRate = None,
+    renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,
     page_lan: PageLan = False, gestures: OwnGestures = None, outfit: Outfit = None,
-    real_time_factor: RealTimeFactor = 1.0, world: World = "vineyard",
+    real_time_factor: RealTimeFactor = None, world: World = "vineyard",
 ) -> None:  # fmt: skip
     """Join the vineyard as one actor, with a simulation of its own.
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Device, Seed
+from vinesim.cli.commands.options import Device, RealTimeFactor, Seed
 
 
 def demo(
@@ -29,6 +29,7 @@ def demo(
         str | None, typer.Option(help="A URDF file, or the name of one that ships; vinebot, or logistic to exchange.")
     ] = None,
     device: Device = "cpu",
+    real_time_factor: RealTimeFactor = None,
     headless: Annotated[bool, typer.Option(help="No live table; one line a second.")] = False,
     out: Annotated[pathlib.Path, typer.Option(help="Folder for pictures, plot and summary.json.")] = pathlib.Path(
         "out"
@@ -46,6 +47,7 @@ def demo(
       vinesim demo
       vinesim demo --seconds 30 --seed 3 --out /tmp/run
       vinesim demo --scene my-block.toml --robot my-robot.urdf --headless
+      vinesim demo --real-time-factor 0.5
       vinesim demo --job pick --seed 5
       vinesim demo --job exchange
       vinesim demo --job meet
@@ -55,12 +57,13 @@ def demo(
 
         code = run_push(
             seconds=seconds or 20.0, seed=seed, scene=scene or "demo", robot=robot or "vinebot", device=device,
-            headless=headless, out=out,
+            real_time_factor=real_time_factor, headless=headless, out=out,
         )  # fmt: skip
     else:
         from vinesim.cli.demo.task_demo import run_job
 
         code = run_job(
-            job, seconds=seconds, seed=seed, scene=scene, robot=robot, device=device, headless=headless, out=out
-        )
+            job, seconds=seconds, seed=seed, scene=scene, robot=robot, device=device,
+            real_time_factor=real_time_factor, headless=headless, out=out,
+        )  # fmt: skip
     raise typer.Exit(code)

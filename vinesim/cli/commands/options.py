@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Annotated
 
 import typer
@@ -18,12 +19,25 @@ ImageSize = Annotated[
 ]
 Seconds = Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")]
 StatusFormat = Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")]
+
+
+def _parse_factor(text: str) -> float | None:
+    """A real-time factor, or None for ``auto``."""
+    if text == "auto":
+        return None
+    with contextlib.suppress(ValueError):
+        if 0.01 <= (factor := float(text)) <= 1.0:
+            return factor
+    raise typer.BadParameter(f"{text!r}: give auto, or a number from 0.01 to 1")
+
+
 RealTimeFactor = Annotated[
-    float,
+    float | None,
     typer.Option(
-        min=0.01, max=1.0,
-        help="Simulated time passes so many times as fast as real time: below 1 for machines that cannot hold 100 "
-        "steps a second. In a world with a server, the server's.",
+        parser=_parse_factor,
+        metavar="auto|NUMBER",
+        help="Simulated time passes so many times as fast as real time. auto, unless given: as fast as every client "
+        "can follow, at most 1, so that no step is skipped on a slow machine. In a world with a server, the server's.",
     ),
 ]  # fmt: skip
 Insecure = Annotated[

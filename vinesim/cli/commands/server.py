@@ -45,7 +45,7 @@ def server(
         pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): all others are refused.")
     ] = None,
     insecure: Insecure = False,
-    real_time_factor: RealTimeFactor = 1.0,
+    real_time_factor: RealTimeFactor = None,
     status: StatusFormat = "none",
 ) -> None:
     """Route messages between clients, and keep the retained state. The server simulates nothing.

@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.table import Table
 
 from vinesim.client.processes.child_process import REPORT_TIMEOUT, Process
+from vinesim.net.pace import describe
 
 PICKER, VISITOR = "picker", "visitor"
 """The actors of a demo: the robot that touches or works, and the one that comes near."""
@@ -63,7 +64,7 @@ def status_line(status: dict[str, Any]) -> str:
     """The picker's status in one line."""
     common = (
         f"{status['time']:6.1f} s  {status['tick_hz']:6.2f} Hz  p99 {status['tick_p99_ms']:5.2f} ms  "
-        f"awake {status['awake']:3d}  force {status['force']:6.2f} N  "
+        f"awake {status['awake']:3d}  force {status['force']:6.2f} N  {pace(status)}"
     )
     if status["phase"]:
         return common + status["phase"]
@@ -71,6 +72,12 @@ def status_line(status: dict[str, Any]) -> str:
         f"moved {status['displacement_mm']:6.1f} mm  out {status['bytes_out']:7d} B  "
         f"env {status['environment_bytes_out']:6d} B"
     )
+
+
+def pace(status: dict[str, Any]) -> str:
+    """How fast time passes and what limits it, with two blanks behind; empty in real time."""
+    text = describe(status["target_real_time_factor"], status["pace_cause"])
+    return f"{text}  " if text else ""
 
 
 def status_table(newest: Statuses) -> Table:
@@ -81,7 +88,8 @@ def status_table(newest: Statuses) -> Table:
         table.add_column(name, justify="right", min_width=14)
     rows = (
         ("time [s]", "time", ".1f"), ("tick rate [Hz]", "tick_hz", ".2f"), ("tick p99 [ms]", "tick_p99_ms", ".2f"),
-        ("real-time factor", "real_time_factor", ".4f"), ("awake plants", "awake", "d"),
+        ("real-time factor", "target_real_time_factor", ".2f"),
+        ("limited by", "pace_cause", "s"), ("awake plants", "awake", "d"),
         ("contact force [N]", "force", ".2f"), ("bunch moved [mm]", "displacement_mm", ".1f"),
         ("bytes in", "bytes_in", "d"), ("bytes out", "bytes_out", "d"),
         ("of these environment", "environment_bytes_out", "d"),

@@ -49,8 +49,9 @@ class ListenedTopics:
 
 
 def run_push(
-    *, seconds: float, seed: int | None, scene: str, robot: str, device: str, headless: bool, out: pathlib.Path
-) -> int:
+    *, seconds: float, seed: int | None, scene: str, robot: str, device: str, real_time_factor: float | None,
+    headless: bool, out: pathlib.Path,
+) -> int:  # fmt: skip
     """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``; the exit code."""
     console = Console(stderr=True)
     begin = time.time()
@@ -67,7 +68,7 @@ def run_push(
     with process_group() as group:
         topics = listened_topics(description)
         listener = None if no_ros else RosListener(group, topics.always, topics.once, topics.events)
-        server, endpoint = group.start_server()
+        server, endpoint = group.start_server(real_time_factor)
         bunch, poses = choose_poses(plan, generate(plan))
         console.print(f"server on {endpoint}; {PICKER} will push bunch {bunch} for {seconds:.0f} s")
         common = ["--connect", endpoint, "--scene", scene, "--robot", robot, "--device", device]

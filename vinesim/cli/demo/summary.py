@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
+import re
 import shutil
 import time
 from collections.abc import Mapping
@@ -20,6 +21,10 @@ from vinesim.errors import writing
 
 SMALL_TOPICS = ("/clock", "/joint_states", "/tf")
 """Topics that every step publishes, and every ROS program needs."""
+PICTURES = r"(?!/visitor/).*/(rgb|depth)/image_raw"
+"""Topics of the picker's pictures with depth, as a regular expression."""
+SCANS = r"(?!/visitor/).*(?<!/depth)/points"
+"""The same of its scans."""
 LOOP_KEYS = ("tick_hz", "tick_p50_ms", "tick_p99_ms", "overruns", "real_time_factor")
 
 
@@ -78,14 +83,21 @@ def push_summary(
         "environment_bytes_out",
     )  # fmt: skip
     loops = {name: TickLog.load(out / name / "ticks.npz").between(window.since, window.until) for name in reports}
+    lost = lost_messages(received, reports[PICKER])
+    simulated = loops[PICKER]["real_time_factor"] * (window.until - window.since)
     return {
         "scene": scene, "seed": seed, "seconds": seconds, "bunch": bunch, "start_s": dict(starts),
-        **loops[PICKER], **{key: reports[PICKER][key] for key in touch_keys}, "loops": loops,
+        **loops[PICKER], "pace_cause": reports[PICKER]["pace_cause"],
+        "steps_skipped": sum(one["steps_skipped"] for one in reports.values()),
+        "lost": lost["count"],
+        "pictures_per_simulated_second": least_rate(received, PICTURES, simulated),
+        "scans_per_simulated_second": least_rate(received, SCANS, simulated),
+        **{key: reports[PICKER][key] for key in touch_keys}, "loops": loops,
         "remote_displacement_error_mm": remote_error(traces[PICKER], traces[VISITOR]),
         "ros": no_ros or "used",
         "ros_received": {topic: entry["count"] for topic, entry in sorted(received.items())},
         "ros_hz": {topic: entry["hz"] for topic, entry in sorted(received.items())},
-        "ros_lost": lost_messages(received, reports[PICKER]),
+        "ros_lost": lost,
         "ros_detail": received,
         "clients": reports,
     }  # fmt: skip
@@ -107,12 +119,20 @@ def lost_messages(received: Mapping[str, Mapping[str, Any]], report: Mapping[str
     }
     count = sum(sum(entry.values()) for entry in lost.values())
     total = count + sum(received[topic]["count"] for topic in topics)
-    return {"topics": lost, "share": count / total if total else None}
+    return {"topics": lost, "count": count, "share": count / total if total else None}
+
+
+def least_rate(received: Mapping[str, Mapping[str, Any]], pattern: str, simulated: float) -> float | None:
+    """Messages in each second of ``simulated`` time [Hz] on the topic that matches ``pattern`` and had the fewest; None
+    without such a topic."""
+    counts = [entry["count"] for topic, entry in received.items() if re.fullmatch(pattern, topic)]
+    return min(counts) / simulated if counts else None
 
 
 def push_table(summary: dict[str, Any]) -> Table:
     """The most important values of :func:`push_summary`, to print."""
     error, lost = summary["remote_displacement_error_mm"], summary["ros_lost"]["share"]
+    pictures, scans = (summary[f"{kind}_per_simulated_second"] for kind in ("pictures", "scans"))
     table = Table(title="what was measured", title_justify="left", show_header=False)
     for label, text in (
         ("ready", f"{summary['start_s']['ready']:.1f} s after the start"),
@@ -120,7 +140,14 @@ def push_table(summary: dict[str, Any]) -> Table:
             (f"tick rate of {name}", f"{loop['tick_hz']:.2f} Hz, p99 {loop['tick_p99_ms']:.2f} ms of 10")
             for name, loop in summary["loops"].items()
         ),
-        ("real-time factor", f"{summary['real_time_factor']:.4f}"),
+        ("real-time factor", f"{summary['real_time_factor']:.3f} {summary['pace_cause']}"),
+        ("steps skipped", f"{summary['steps_skipped']}"),
+        (
+            "pictures with depth, scans",
+            "none came"
+            if pictures is None or scans is None
+            else f"{pictures:.1f} and {scans:.1f} in each simulated second",
+        ),
         *(
             (topic, f"{entry['hz'] or 0.0:.1f} Hz, {entry['slowest_second']} in the slowest second")
             for topic, entry in summary["ros_detail"].items()

@@ -32,7 +32,7 @@ TIME_LIMIT = 120.0
 
 def run_job(
     job: str, *, seconds: float | None, seed: int | None, scene: str | None, robot: str | None, device: str,
-    headless: bool, out: pathlib.Path,
+    real_time_factor: float | None, headless: bool, out: pathlib.Path,
 ) -> int:  # fmt: skip
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
     if job not in JOBS:
@@ -47,7 +47,7 @@ def run_job(
         out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
     with process_group() as group:
-        server, endpoint = group.start_server()
+        server, endpoint = group.start_server(real_time_factor)
         console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
         client = ["-m", "vinesim", "client", "--connect", endpoint, "--scene", scene, "--seed", str(plan.seed)]
         client += ["--device", device, "--status", "json"]

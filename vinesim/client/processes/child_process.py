@@ -147,9 +147,13 @@ class ProcessGroup:
         self.processes.append(Process.start(name, *arguments, **self._environ))
         return self.processes[-1]
 
-    def start_server(self) -> tuple[Process, str]:
-        """Start a server on a free port of this machine; the process and its endpoint."""
-        server = self.start("server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0")
+    def start_server(self, real_time_factor: float | None = None) -> tuple[Process, str]:
+        """Start a server on a free port of this machine; the process and its endpoint. ``real_time_factor``: of its
+        world; None: as its clients can follow."""
+        factor = "auto" if real_time_factor is None else f"{real_time_factor:g}"
+        server = self.start(
+            "server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--real-time-factor", factor
+        )
         return server, server.next_line(START_TIMEOUT).removeprefix("listening on ")
 
 

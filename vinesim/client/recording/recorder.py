@@ -288,7 +288,7 @@ class Observer:
         self._network_clock.advance(now)
         self._network_clock.ping_if_due()
         for key, payload, age in self.bus.replies():
-            if key == "clock":
+            if key.partition("/")[0] == "clock":
                 self._network_clock.receive(payload, age)
         if now >= self._due:
             self._due = now + interest.POSE_LAYERS[0].every / interest.POSE_RATE

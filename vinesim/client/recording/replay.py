@@ -309,7 +309,7 @@ class Replay:
         self._network_clock.advance(now)
         self._network_clock.ping_if_due()
         for key, payload, age in self._bus.replies():
-            if key == "clock":
+            if key.partition("/")[0] == "clock":
                 self._network_clock.receive(payload, age)
         if not self._network_clock.is_settled:
             return

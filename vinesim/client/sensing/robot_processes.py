@@ -13,18 +13,22 @@ from vinesim.client.client import Client
 from vinesim.client.faults import RecentCounts
 from vinesim.client.sensing.ros_process import RosProcess
 from vinesim.client.sensing.sensor_process import SensorProcess
+from vinesim.net.pace import describe
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.ros import middleware
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
-from vinesim.scene.values import ComponentStatus
+from vinesim.scene.values import ComponentStatus, SensorPacing
 
 log = logging.getLogger(__name__)
 
 BEHIND = 0.95
 """A loop that has done a smaller share than this of the steps that were due since the last status is behind."""
-_LOOP_VALUES = ("tick_hz", "tick_p99_ms", "overruns", "real_time_factor", "awake", "unfinished_solves", "sound_dropped")
+_LOOP_VALUES = (
+    "tick_hz", "tick_p99_ms", "overruns", "steps_skipped", "real_time_factor", "target_real_time_factor", "pace_cause",
+    "awake", "unfinished_solves", "sound_dropped",
+)  # fmt: skip
 """Values of a client's status that /diagnostics shows with the loop."""
 _NETWORK_VALUES = ("others", "round_trip_ms", "bytes_in", "bytes_out")
 """The same with the network."""
@@ -37,7 +41,7 @@ class RobotProcesses:
         self, name: str, scene: Scene, model: Model, description: RobotDescription, *, namespace: str = "",
         params_file: pathlib.Path | None = None, interest_radius: float | None = None,
         ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
-        renderer: str = "warp", device: str = "cpu",
+        renderer: str = "warp", device: str = "cpu", pacing: SensorPacing | None = None,
     ) -> None:  # fmt: skip
         """``clock``: may publish /clock, as one node of a ROS domain does; ``params_file``: ROS parameters of the
         nodes; ``interest_radius``: see :class:`RosProcess`. For the others see :class:`SensorProcess`."""
@@ -48,7 +52,7 @@ class RobotProcesses:
             self.sensors = stack.enter_context(
                 SensorProcess(
                     name, scene, model, description, namespace=namespace, params_file=params_file, ros=ros,
-                    keep_pictures=keep_pictures, sensor_hz=sensor_hz, renderer=renderer, device=device,
+                    keep_pictures=keep_pictures, sensor_hz=sensor_hz, renderer=renderer, device=device, pacing=pacing,
                 )
             )  # fmt: skip
             self.ros = None
@@ -145,7 +149,9 @@ def loop_status(status: dict[str, Any]) -> ComponentStatus:
     trouble = ["behind"] * (status["recent_real_time_factor"] < BEHIND * status["target_real_time_factor"])
     trouble += [name.replace("_", " ") for name in status["recent_faults"]]
     values = {key: status[key] for key in _LOOP_VALUES} | status["faults"]
-    return ComponentStatus("simulation", "warning" if trouble else "ok", ", ".join(trouble) or "well", values)
+    pace = describe(status["target_real_time_factor"], status["pace_cause"])
+    text = ", ".join(trouble + [pace] * bool(pace)) or "well"
+    return ComponentStatus("simulation", "warning" if trouble else "ok", text, values)
 
 
 def network_status(status: dict[str, Any]) -> ComponentStatus:

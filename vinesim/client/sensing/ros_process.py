@@ -17,12 +17,13 @@ from vinesim import frames
 from vinesim.audio import opus
 from vinesim.avatar.local_human import LocalHuman
 from vinesim.client.client import Client
+from vinesim.client.pace import Limit
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, run_ros_worker
 from vinesim.client.sensing.spawned_process import ROS_MODULES
 from vinesim.client.sensing.step_record import StepRecords
-from vinesim.client.sensing.worker_process import IdleTime, Run, WorkerProcess
+from vinesim.client.sensing.worker_process import Hold, Run, WorkerProcess
 from vinesim.client.signals import GestureLog, IntentionLog
 from vinesim.client.sound.exchange import SoundStep
 from vinesim.client.sound.microphone_step import at_place
@@ -41,10 +42,10 @@ log = logging.getLogger(__name__)
 
 START_TIMEOUT = 120.0
 """How long the process may take to start; a first run builds message packages [s]."""
-HOLD_TIMEOUT = 3.0
-"""A process that has done nothing for so long, though it could, holds the loop no longer [s]."""
-IDLE_LOOK_PERIOD = 0.1
-"""Time between two looks at what a process does that holds the loop [s]."""
+FREE_BACKLOG = 0.2
+"""Share of the room for steps that may be taken before the world slows down."""
+RATE_PERIOD = 0.5
+"""Time over which the rate is measured at which the process takes steps [s]."""
 TRUTH_ORGANS = (Organ.BOX, Organ.BUNCH, Organ.HUMAN)
 """Rigid bodies whose true poses are published; robots have their own transforms."""
 
@@ -103,7 +104,10 @@ class RosProcess:
         body_sensors = {*config.imus, *config.wrenches}
         self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
         self._parameters = config.parameters
-        self._hold: _Hold | None = None
+        self._hold: Hold | None = None
+        self._taken = 0.0, 0, np.inf
+        """When the process's rate was last measured [s], how many steps it had taken then, and its rate as a factor of
+        real time."""
         self.worker = WorkerProcess(
             f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
             lambda context: RosChannel(config, context), self._receive,
@@ -118,6 +122,8 @@ class RosProcess:
         self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
+        client.holds.append(self.held)
+        client.pace_limits.append(self.limit)
         self.handler = RosCommandHandler(
             self.robot, self._take_commands, self._finish, client.world_time,
             lambda pcm: client.sound.play(self.robot.name, pcm),
@@ -146,22 +152,27 @@ class RosProcess:
             self._hold = None
             return ""
         if self._hold is None or self._hold.run is not run:
-            self._hold = _Hold(run)
-        if self._hold.is_over():
-            if not self._hold.is_logged:
-                self._hold.is_logged = True
-                log.warning(
-                    "%s has done nothing for %.0f s: until it goes on, its messages are lost, and counted",
-                    self.worker.title, HOLD_TIMEOUT,
-                )  # fmt: skip
-            return ""
-        return cause
+            self._hold = Hold(
+                run, self.worker.title, "its messages are lost, and counted",
+                lambda: int(run.shared.wanted["turns"][0]),
+            )  # fmt: skip
+        return "" if self._hold.is_over() else cause
 
     @property
     def backlog(self) -> float:
         """Share of the room for steps on the way to the process that is taken, 0 to 1."""
         steps = self.worker.current().shared.steps
         return steps.waiting_count / steps.capacity
+
+    def limit(self) -> Limit:
+        """The largest real-time factor at which the process takes every step; infinite unless steps pile up."""
+        now, steps = time.monotonic(), self.worker.current().shared.steps
+        since, before, factor = self._taken
+        if now - since >= RATE_PERIOD:
+            taken = steps.put_count - steps.waiting_count
+            factor = max(taken - before, 0) * self.client.physics.dt / (now - since)
+            self._taken = now, taken, factor
+        return Limit(factor if self.backlog > FREE_BACKLOG else np.inf, "ROS messages")
 
     def _control(self, time: float) -> None:
         """Apply commands; goals of a process that is gone end."""
@@ -327,27 +338,6 @@ def _cause_to_wait(channel: RosChannel) -> str:
     if channel.steps.waiting_count >= channel.steps.capacity:
         return "ROS messages"
     return "ROS subscribers" if channel.wanted["pause"][0] else ""
-
-
-class _Hold:
-    """A time in which one run of the process holds the loop."""
-
-    def __init__(self, run: Run[RosChannel]) -> None:
-        self.run = run
-        self.is_logged = False
-        self._idle = IdleTime(run.process.pid or 0)
-        self._turns = 0
-        self._next_look = 0.0
-
-    def is_over(self) -> bool:
-        """Whether the process has done nothing for :data:`HOLD_TIMEOUT`."""
-        if (turns := int(self.run.shared.wanted["turns"][0])) != self._turns:
-            self._turns = turns
-            self._idle.end()
-        elif time.monotonic() >= self._next_look:
-            self._next_look = time.monotonic() + IDLE_LOOK_PERIOD
-            self._idle.look()
-        return self._idle.seconds >= HOLD_TIMEOUT
 
 
 class _Microphone:

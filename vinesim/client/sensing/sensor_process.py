@@ -15,16 +15,18 @@ from typing import Any, Self
 import numpy as np
 
 from vinesim.client.client import Client
+from vinesim.client.pace import Limit
 from vinesim.client.sensing.rigid_visual_list import VisualListSender
 from vinesim.client.sensing.sensor_worker import POSE_HISTORY, SensorChannel, SensorConfig, run_sensor_worker
 from vinesim.client.sensing.spawned_process import SENSOR_REHEARSAL, sensor_modules
-from vinesim.client.sensing.worker_process import Run, WorkerProcess
+from vinesim.client.sensing.worker_process import Hold, Run, WorkerProcess, cpu_use
 from vinesim.errors import WriteError
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.ros import middleware
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
+from vinesim.scene.values import SensorMode, SensorPacing
 from vinesim.scene.wind import wind_of
 
 log = logging.getLogger(__name__)
@@ -33,6 +35,8 @@ SNAPSHOT_PERIOD = 2
 """Ticks between two snapshots: 50 Hz, faster than any camera here."""
 START_TIMEOUT = 300.0
 """How long the process may take to start; a first run compiles kernels [s]."""
+COUNT_TIMEOUT = 20.0
+"""How long the process may take to say what it has rendered [s]: it ends its present picture before."""
 SAVE_TIMEOUT = 60.0
 """How long the process may take to write its pictures [s]; on a busy machine it renders first."""
 
@@ -57,11 +61,13 @@ class SensorProcess:
         sensor_hz: float | None = None,
         renderer: str = "warp",
         device: str = "cpu",
+        pacing: SensorPacing | None = None,
     ) -> None:
         """Starts the process; :meth:`attach` connects it with a client.
 
         ``keep_pictures`` keeps the picture of the first camera with the highest ``Client.frame_score`` for
         :meth:`save_picture`, and renders it even without subscribers. ``sensor_hz`` replaces the sensors' own rates.
+        ``pacing``: whether simulated time waits for sensors; as the ``description`` says unless given.
         """
         self.name = name
         self.missed_snapshots = 0
@@ -80,8 +86,12 @@ class SensorProcess:
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
             name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer,
-            device, wind=wind_of(scene), params_file=params_file,
+            device, pacing=pacing or description.sensor_pacing, wind=wind_of(scene), params_file=params_file,
         )  # fmt: skip
+        self._pacing = config.pacing
+        self._digests: dict[str, str] = {}
+        self._counted = threading.Event()
+        self._hold: Hold | None = None
         self._frames = tuple(config.sensor_frames.values())
         self._parameters = config.parameters
         self.worker = WorkerProcess(
@@ -102,11 +112,50 @@ class SensorProcess:
         self._write(client)
         self._wake()
         self.worker.wait_until_ready(START_TIMEOUT)
+        client.holds.append(self.held)
+        client.pace_limits.append(self.limit)
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
         client.after_reset.append(self._begin_anew)
 
     # ------------------------------------------------------------------ in the loop
+
+    def held(self) -> str:
+        """Why the next step must wait: "sensors", which have not taken or, in lockstep, not sent what their mode
+        promises; empty when it may run.
+
+        A process that is not ready, or has done nothing for three seconds, holds only the steps of lockstep.
+        """
+        run, physics = self.worker.current(), self.client.physics
+        wanted = run.shared.wanted
+        if self.is_lockstep:
+            is_behind = not self.worker.is_ready or run is not self._run or wanted["shown"][0] != self._snapshot_count
+        else:
+            latest = wanted["horizon"][0] + SNAPSHOT_PERIOD * physics.dt + 1e-6
+            is_behind = self.worker.is_ready and physics.time + physics.dt > latest
+        if self._is_overdue and (is_behind or self.is_lockstep):
+            self._write(self.client)
+            self._wake()
+            is_behind = True
+        if not is_behind:
+            self._hold = None
+            return ""
+        if self._hold is None or self._hold.run is not run:
+            self._hold = Hold(
+                run, self.worker.title, "simulated time goes on without its pictures",
+                lambda: cpu_use(run.process.pid or 0)[0],
+            )  # fmt: skip
+        return "" if self._hold.is_over() and not self.is_lockstep else "sensors"
+
+    @property
+    def is_lockstep(self) -> bool:
+        """Whether simulated time waits for every frame."""
+        return self._pacing.mode is SensorMode.LOCKSTEP
+
+    def limit(self) -> Limit:
+        """The largest real-time factor at which the sensors keep what their mode promises."""
+        run = self.worker.current()
+        return Limit(float(run.shared.wanted["factor"][0]) if self.worker.is_ready else np.inf, "sensors")
 
     def _begin_anew(self) -> None:
         """After a reset: all plants are elsewhere, and the sensors are on the new robot."""
@@ -177,7 +226,10 @@ class SensorProcess:
             if value:
                 log.info("the sensors of %s are not ready, awaited: %s", self.name, ", ".join(value))
         elif kind == "statistics":
+            self._digests = value.pop("digests")
             self._counts = value
+        elif kind == "counted":
+            self._counted.set()
         elif kind == "parameters":
             self._parameters.update(value)
         elif kind == "restarted":
@@ -209,8 +261,10 @@ class SensorProcess:
         return self._total("ros_dropped")
 
     def report(self) -> dict[str, Any]:
-        """Frames delivered and dropped by sensor, snapshots that could not be shown or were late, restarts, device."""
-        return {
+        """Frames delivered and dropped by sensor, snapshots that could not be shown or were late, restarts, device;
+        in lockstep a digest of all frames of each sensor."""
+        digests = {"frame_digests": self._digests} if self.is_lockstep else {}
+        return digests | {
             "frames": self._total("frames"),
             "frames_dropped": self._total("frames_dropped"),
             "frames_skipped": self._total("frames_skipped").get("snapshots", 0),
@@ -218,6 +272,13 @@ class SensorProcess:
             "sensor_restarts": self.worker.restarts,
             "sensor_device": self._device,
         }
+
+    def complete_counts(self) -> None:
+        """Wait until the counts and digests are those of all frames so far; at most :data:`COUNT_TIMEOUT`."""
+        self._counted.clear()
+        if self.worker.is_ready:
+            self.worker.send("count")
+            self._counted.wait(COUNT_TIMEOUT)
 
     def save_picture(self, folder: pathlib.Path) -> None:
         """Write the kept picture: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and ``labels`` PNGs.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 import logging
 import pathlib
 import sys
@@ -28,7 +29,16 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
-from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, SegmentPoses, Snapshot, WindState
+from vinesim.scene.values import (
+    CameraFrame,
+    CameraOutput,
+    LidarScan,
+    SegmentPoses,
+    SensorMode,
+    SensorPacing,
+    Snapshot,
+    WindState,
+)
 from vinesim.scene.wind import Wind
 from vinesim.scene.wire_segments import wire_segments
 
@@ -41,6 +51,8 @@ log = logging.getLogger(__name__)
 
 STATISTICS_PERIOD = 0.2
 """Wall time between two reports to the client [s]."""
+SEND_POLL = 5e-4
+"""Time between two looks whether all messages were sent [s]."""
 POLL_PERIOD = 0.02
 """Longest time without a look at requests and subscribers [s]."""
 SWITCH_INTERVAL = 5e-4
@@ -52,6 +64,9 @@ POSE_HISTORY = 128
 """Poses of the sensors that are kept for lidars: of 2.5 s."""
 OFFSET_HISTORY = 512
 """Offsets of the world's time that are kept for the stamps of scans: of 10 s."""
+
+
+LIVE = SensorPacing()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,6 +89,7 @@ class SensorConfig:
     renderer: str = "warp"
     device: str = "cpu"
     """Where they compute; the CPU from the next start on if a GPU fails."""
+    pacing: SensorPacing = LIVE
     wind: Wind | None = None
     """That of the scene."""
     params_file: pathlib.Path | None = None
@@ -109,8 +125,13 @@ class SensorChannel:
             },
             context,
         )  # fmt: skip
-        self.wanted = SharedArrays({"world": ((1,), "?")})
-        """Whether snapshots of the world are wanted, written by the process."""
+        self.wanted = SharedArrays(
+            {"world": ((1,), "?"), "horizon": ((1,), "f8"), "factor": ((1,), "f8"), "shown": ((1,), "i8")}
+        )
+        """Whether snapshots of the world are wanted; which simulated time the world must not pass before another is
+        taken [s]; the largest real-time factor that the sensors can follow; number of the newest snapshot of which all
+        is rendered and sent. Written by the process."""
+        self.wanted["horizon"][0] = self.wanted["factor"][0] = np.inf
 
     def close(self) -> None:
         """Release the memory."""
@@ -147,6 +168,9 @@ class SensorWorker:
         self._last_number = 0
         self._pose_count = 0
         self._keeper = PictureKeeper() if config.keep_pictures else None
+        self._is_lockstep = config.pacing.mode is SensorMode.LOCKSTEP
+        self._digests = {name: hashlib.blake2b(digest_size=16) for name in config.sensor_frames}
+        """Of all that each sensor has delivered, in lockstep."""
         self._time = self._frame_score = 0.0  # of the newest snapshot
         self._next_statistics = 0.0
         self._awaits("kernels and scene")
@@ -208,7 +232,9 @@ class SensorWorker:
             present = self._present_rate(mount.name)
             sensors.append(ScheduledSensor(lidar, self._deliver_lidar, wanted, config.sensor_hz, present))
         primitives = Primitives(config.model, renderer=config.renderer, device=device)
-        return SensorScheduler(config.model, sensors, primitives=primitives)
+        return SensorScheduler(
+            config.model, sensors, primitives=primitives, pacing=config.pacing, on_taken=self._publish_pace
+        )
 
     def _working_device(self) -> str:
         """The device of the configuration, or the CPU if it cannot be used any more, which is logged and reported."""
@@ -225,6 +251,8 @@ class SensorWorker:
         node = self.node
 
         def demand() -> CameraOutput:
+            if self._is_lockstep:
+                return whole if node is None else whole | node.camera_outputs_wanted(name)
             is_kept = keeper is not None and keeper.wants(self._time, self._frame_score)
             wanted = CameraOutput.NONE if node is None else node.camera_outputs_wanted(name)
             return wanted | whole if is_kept else wanted
@@ -234,6 +262,8 @@ class SensorWorker:
     def _lidar_demand(self, name: str) -> Callable[[], CameraOutput]:
         """What the subscribers of a lidar need now."""
         node = self.node
+        if self._is_lockstep:
+            return lambda: CameraOutput.DEPTH
         return lambda: CameraOutput.NONE if node is None else node.lidar_outputs_wanted(name)
 
     # ------------------------------------------------------------------ loop
@@ -248,6 +278,8 @@ class SensorWorker:
                 poses = earlier.pop()[1]
                 if is_ready:
                     self.scheduler.advance(snapshot, poses, earlier)
+                    if self._is_lockstep:
+                        self._wait_until_sent()
                 else:
                     for name in self.scheduler.warm_up(snapshot, poses):
                         self._awaits(name)
@@ -255,12 +287,25 @@ class SensorWorker:
                     self._awaits()
                     report_ready(self.pipe, NICENESS)
                     allocator.release_free_memory()  # takes 0.1 s, which nothing has to wait for
+                self.channel.wanted["shown"][0] = self._last_number
             is_rendering = any(sensor.wanted() for sensor in self.scheduler.sensors)
             self.channel.wanted["world"][0] = is_rendering or self._keeper is not None
+            self._publish_pace()
             self._report_parameters()
             if time.monotonic() >= self._next_statistics:
                 self._next_statistics = time.monotonic() + STATISTICS_PERIOD
                 self.pipe.send(("statistics", self._statistics()))
+
+    def _publish_pace(self) -> None:
+        """Tell the client how far the world may go on, and how fast."""
+        wanted = self.channel.wanted
+        wanted["horizon"][0] = self.scheduler.horizon()
+        wanted["factor"][0] = self.scheduler.sustainable_factor()
+
+    def _wait_until_sent(self) -> None:
+        """Return when all messages of the frames that were delivered have been sent."""
+        while self.node is not None and self.node.has_pending:
+            time.sleep(SEND_POLL)
 
     def _report_parameters(self) -> None:
         """Tell the client which parameters were set, so that a further run starts with them."""
@@ -283,6 +328,9 @@ class SensorWorker:
                 self._visuals.take(value)
             elif kind == "save":
                 self._save_kept_frame(value)
+            elif kind == "count":
+                self.pipe.send(("statistics", self._statistics()))
+                self.pipe.send(("counted", None))
         return True
 
     def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
@@ -337,6 +385,7 @@ class SensorWorker:
             "frames": dict(self.scheduler.frames),
             "frames_dropped": dict(self.scheduler.dropped),
             "frames_skipped": {"snapshots": self.frames_skipped},
+            "digests": {name: digest.hexdigest() for name, digest in self._digests.items()},
         }
         if self.node is not None:
             statistics |= {"sent": self.node.sent, "ros_dropped": self.node.dropped}
@@ -344,6 +393,8 @@ class SensorWorker:
 
     def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
         assert isinstance(frame, CameraFrame)
+        if self._is_lockstep:
+            self._digest(frame.name, frame.time, frame.rgb, frame.depth, frame.labels)
         if self.node is not None:
             self.node.publish_camera(dataclasses.replace(frame, time=self._offsets.world_time(frame.time)))
         keeper = self._keeper if frame.name == self.scheduler.sensors[0].name else None
@@ -352,8 +403,16 @@ class SensorWorker:
 
     def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
         assert isinstance(scan, LidarScan)
+        if self._is_lockstep:
+            self._digest(scan.name, scan.time, scan.xyz, scan.intensity, scan.labels)
         if self.node is not None:
             self.node.publish_lidar(dataclasses.replace(scan, time=self._offsets.world_time(scan.time)))
+
+    def _digest(self, name: str, moment: float, *arrays: np.ndarray | None) -> None:
+        digest = self._digests[name]
+        digest.update(np.float64(moment).tobytes())
+        for array in arrays:
+            digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
 
     def _save_kept_frame(self, folder: pathlib.Path) -> None:
         failure = ""

@@ -40,6 +40,10 @@ client five times a second, unless it renders a picture or writes files. Time in
 count: to start it again would only load a busy machine more."""
 START_TIMEOUT = 300
 """The same for a process that is not ready: a first run may compile kernels [s]."""
+HOLD_TIMEOUT = 3.0
+"""A process that has done nothing for so long, though it could, holds the loop no longer [s]."""
+IDLE_LOOK_PERIOD = 0.1
+"""Time between two looks at what a process does that holds the loop [s]."""
 LONGEST_PAUSE = 60.0
 """Pauses double with every failure, up to this [s]."""
 
@@ -169,6 +173,38 @@ class Run(Generic[S]):
             self.process.kill()
             self.process.join()
         self.pipe.close()
+
+
+class Hold:
+    """A time in which one run of a process holds the client's steps."""
+
+    def __init__(self, run: Run[Any], title: str, consequence: str, progress: Callable[[], object]) -> None:
+        """``progress()`` changes whenever the process has done something. ``consequence``: what follows if it does
+        nothing for :data:`HOLD_TIMEOUT`, for the log."""
+        self.run = run
+        self._title, self._consequence, self._progress = title, consequence, progress
+        self._idle = IdleTime(run.process.pid or 0)
+        self._seen = progress()
+        self._next_look = 0.0
+        self._is_logged = False
+
+    def is_over(self) -> bool:
+        """Whether the process has done nothing for :data:`HOLD_TIMEOUT`; the first time that is logged."""
+        if (now := time.monotonic()) >= self._next_look:
+            self._next_look = now + IDLE_LOOK_PERIOD
+            if (progress := self._progress()) != self._seen:
+                self._seen = progress
+                self._idle.end()
+            else:
+                self._idle.look()
+        if self._idle.seconds < HOLD_TIMEOUT:
+            return False
+        if not self._is_logged:
+            self._is_logged = True
+            log.warning(
+                "%s has done nothing for %.0f s: until it goes on, %s", self._title, HOLD_TIMEOUT, self._consequence
+            )
+        return True
 
 
 class WorkerProcess(Generic[S]):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -22,14 +22,15 @@ from vinesim.net.codec.header import (
 from vinesim.net.codec.objects import check_object_id
 from vinesim.net.codec.robot import MAX_JOINTS
 from vinesim.net.codec.trees import MAX_BODIES, MAX_TREES
+from vinesim.net.pace import MIN_FACTOR, PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene.ids import LABEL_STRIDE
 
 MAX_RECORDS = 4096
 """Retained records in one message."""
 
-MIN_FACTOR = 0.01
-"""Smallest real-time factor of a world; the largest is 1."""
+MAX_CAUSE = 120
+"""Letters in the cause of a real-time factor: a name and some words."""
 
 HEIGHT_RANGE = (1.0, 2.5)
 """Shortest and tallest person [m]. GUESSED."""
@@ -235,20 +236,52 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
     return records
 
 
-def encode_time(sent: float, server: float = 0.0, factor: float = 1.0) -> bytes:
-    """Encode a clock query (own time ``sent`` [s]) or its reply, which repeats ``sent`` and adds the ``server``'s
-    time [s] and how many times as fast as real time it passes."""
-    return pack(MessageKind.CLOCK, (float(sent), float(server), float(factor)))
+class ClockMessage(NamedTuple):
+    """A question for the server's clock, or its reply."""
+
+    asked: float
+    """Real time of the client's clock when it asked [s]; the reply repeats it."""
+    world: float = 0.0
+    """Time of the world when the server replied [s]."""
+    factor: float = 1.0
+    """How many times as fast as real time the world's time passes then."""
+    real: float = 0.0
+    """Real time of the server's clock when it replied [s]."""
+    cause: str = ""
+    """What limits the factor; empty if nothing does."""
+    report: PaceReport | None = None
+    """In a question: how fast the client can follow; None of a client that slows no world."""
 
 
-def decode_time(payload: bytes) -> tuple[float, float, float]:
-    """Own time of the query [s], the server's time of the reply [s] and its real-time factor, all finite."""
-    sent, server, factor = unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
-    if not (math.isfinite(sent) and math.isfinite(server)):
-        raise MessageError(f"clock message ({sent}, {server}) that is not finite")
+def encode_time(
+    asked: float, world: float = 0.0, factor: float = 1.0, real: float | None = None, cause: str = "",
+    report: PaceReport | None = None,
+) -> bytes:  # fmt: skip
+    """Encode a :class:`ClockMessage`. ``real``: the ``world``'s time unless given, as in a world that runs in real
+    time."""
+    real = world if real is None else real
+    return pack(
+        MessageKind.CLOCK,
+        (float(asked), float(world), float(factor), float(real), cause[:MAX_CAUSE], report and _plain(report)),
+    )
+
+
+def _plain(report: PaceReport) -> tuple[float, float, str]:
+    return float(report.time), float(report.factor), report.cause[:MAX_CAUSE]
+
+
+def decode_time(payload: bytes) -> ClockMessage:
+    """Decode a question or a reply of the clock; all numbers are finite, and factors possible."""
+    asked, world, factor, real, cause, report = unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
+    if not all(map(math.isfinite, (asked, world, real, *(report or ())[:2]))):
+        raise MessageError(f"clock message ({asked}, {world}, {real}) that is not finite")
     if not MIN_FACTOR <= factor <= 1.0:
         raise MessageError(f"clock message with the real-time factor {factor}, from {MIN_FACTOR:g} to 1")
-    return sent, server, factor
+    if report is not None and report[1] < 0.0:
+        raise MessageError(f"clock message of a client that follows the real-time factor {report[1]}, which is below 0")
+    if max(len(cause), len(report[2]) if report else 0) > MAX_CAUSE:
+        raise MessageError(f"clock message with a cause of more than {MAX_CAUSE} letters")
+    return ClockMessage(asked, world, factor, real, cause, None if report is None else PaceReport(*report))
 
 
 _encoder = msgspec.msgpack.Encoder()
@@ -261,4 +294,4 @@ _claims_decoder = msgspec.msgpack.Decoder(list[tuple[int, int, int, str, bool]])
 
 _records_decoder = msgspec.msgpack.Decoder(list[RetainedRecord])
 
-_time_decoder = msgspec.msgpack.Decoder(tuple[float, float, float])
+_time_decoder = msgspec.msgpack.Decoder(tuple[float, float, float, float, str, tuple[float, float, str] | None])

@@ -12,7 +12,7 @@ import enum
 import math
 import struct
 
-PROTOCOL = 6
+PROTOCOL = 7
 """Version of the wire format. Messages of any other version are refused."""
 
 MAGIC = b"VS"

@@ -8,7 +8,7 @@ rare messages in msgpack.
 from __future__ import annotations
 
 from vinesim.net.codec.control import MAX_RECORDS as MAX_RECORDS
-from vinesim.net.codec.control import MIN_FACTOR as MIN_FACTOR
+from vinesim.net.codec.control import ClockMessage as ClockMessage
 from vinesim.net.codec.control import Hello as Hello
 from vinesim.net.codec.control import RetainedRecord as RetainedRecord
 from vinesim.net.codec.control import Welcome as Welcome

@@ -1,61 +1,82 @@
-"""Network time of one client: its own clock plus an offset that pings of the server estimate.
+"""Network time of one client: the world's time, as the server's replies let the client know it at every moment.
 
-Key: the query ``clock``, whose reply repeats the time of the query and adds the server's time and real-time factor. In
-a world that runs slower than real time the own clock runs at that factor as well, so that the offset stays constant.
+Pings measure the offset between two real-time clocks, the client's and the server's; whatever the factor of the
+world, that offset stays constant. Each reply also says which time the world has at which time of the server's clock,
+and how fast it passes. From both follows the world's time now. Own time runs at the factor of the world and is slewed
+towards it.
+
+Key: the query ``clock/<actor>``, which also reports how fast the actor's client can follow (:mod:`vinesim.net.pace`).
 """
 
 from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 
 from vinesim.net.codec import messages
-from vinesim.net.replication.clock_sync import PING_WINDOW, ClockEstimate, Ping
+from vinesim.net.pace import PaceReport
+from vinesim.net.replication.clock_sync import PING_WINDOW, STEP_THRESHOLD, ClockEstimate, Ping
 from vinesim.net.transport.bus import Bus
 
 log = logging.getLogger(__name__)
 
-PING_PERIOD = (0.05, 2.0)
+PING_PERIOD = (0.05, 0.2)
 """Real time between pings [s]: until twice the window is filled, and later."""
 
 SETTLE_TIMEOUT = 2.0
 """A server that does not reply within this real time is not waited for any longer [s]."""
 
+MAX_REPLY_AGE = 2.0
+"""A reply to an older question says nothing of how fast the world runs now [s]."""
+
+SLEW_TIME = 0.5
+"""Time constant with which own time approaches the world's time [s]."""
+
+MAX_SLEW = 0.25
+"""Largest share by which own time runs faster or slower for that."""
+
 
 class NetworkClock:
-    """Pings the server's clock over a bus and slews the offset.
+    """Pings the server's clock over a bus, and follows the time of its world.
 
     ``now`` is real time, of any monotonic clock [s]; own time is the same in a world that runs in real time.
     """
 
     def __init__(self, bus: Bus, now: float | None = None, offset: float = 0.0) -> None:
         """``now``: real time [s], if known; ``offset``: first estimate of network time minus own time [s]."""
-        self.estimate = ClockEstimate(offset=offset)
+        self.estimate = ClockEstimate()
+        """Server's real time minus the client's."""
         self.factor = 1.0
         """How many times as fast as real time the world's time passes, by the server's last reply."""
+        self.cause = ""
+        """What limits that factor, by the same reply; empty if nothing does."""
+        self.offset = offset
+        """Network time minus own time [s]."""
+        self.report: Callable[[], PaceReport | None] = lambda: None
+        """How fast this client can follow, to be sent with the next ping; None: it slows no world."""
         self._bus, self._now, self._started = bus, now, now
         self._own = 0.0 if now is None else now
+        self._rate = 1.0
+        """How fast own time passes, with slewing."""
+        self._known: tuple[float, float] | None = None
+        """Real time of the server's clock, and the world's time then [s], by its last reply."""
         self._pinged, self._ping_count = -math.inf, 0
-
-    @property
-    def offset(self) -> float:
-        """Network time minus own time [s]."""
-        return self.estimate.offset
 
     @property
     def time(self) -> float:
         """Network time [s] at the last :meth:`advance`."""
         assert self._now is not None
-        return self._own + self.estimate.offset
+        return self._own + self.offset
 
     def own(self, now: float) -> float:
         """Own time [s] at real time ``now`` [s]."""
-        return now if self._now is None else self._own + self.factor * (now - self._now)
+        return now if self._now is None else self._own + self._rate * (now - self._now)
 
     @property
     def round_trip(self) -> float | None:
-        """Shortest of the last pings to the server and back, in real time [s]; None without a reply."""
-        return min((ping.round_trip / self.factor for ping in self.estimate.pings), default=None)
+        """Shortest of the last pings to the server and back [s]; None without a reply."""
+        return min((ping.round_trip for ping in self.estimate.pings), default=None)
 
     @property
     def is_settled(self) -> bool:
@@ -65,11 +86,12 @@ class NetworkClock:
         return bool(self.estimate.pings) or self._now - self._started > SETTLE_TIMEOUT
 
     def advance(self, now: float) -> float:
-        """Go on to real time ``now`` [s] and slew the offset; the own time then [s]."""
+        """Go on to real time ``now`` [s]; the own time then [s]."""
         own = self.own(now)
-        self.estimate = self.estimate.advanced(own - self._own if self._now is not None else 0.0)
+        self.estimate = self.estimate.advanced(now - self._now if self._now is not None else 0.0)
         self._now, self._own = now, own
         self._started = now if self._started is None else self._started
+        self._slew()
         return own
 
     def ping_if_due(self) -> None:
@@ -77,22 +99,41 @@ class NetworkClock:
         assert self._now is not None
         if self._now - self._pinged >= PING_PERIOD[self._ping_count >= 2 * PING_WINDOW]:
             self._pinged, self._ping_count = self._now, self._ping_count + 1
-            self._bus.query("clock", messages.encode_time(self._own))
+            self._bus.query(f"clock/{self._bus.name}", messages.encode_time(self._now, report=self.report()))
 
     def receive(self, payload: bytes, age: float) -> None:
         """Take a reply that arrived ``age`` [s] of real time ago; :class:`MessageError` if it cannot be decoded."""
         assert self._now is not None
-        asked, server, factor = messages.decode_time(payload)
-        if factor != self.factor:
-            self._change_factor(factor, server + factor * age)
+        reply = messages.decode_time(payload)
+        received = self._now - age
+        if reply.asked > received:
             return
-        received = self._own - factor * age
-        if asked <= received:
-            self.estimate = self.estimate.with_ping(Ping(asked, server, received))
+        is_first = not self.estimate.pings
+        self.estimate = self.estimate.with_ping(Ping(reply.asked, reply.real, received))
+        is_other = len(self.estimate.pings) == 1 and not is_first
+        """Whether another server has replied, or one whose clock was set."""
+        if not (is_first or is_other) and (
+            self._now - reply.asked > MAX_REPLY_AGE or (self._known is not None and reply.real < self._known[0])
+        ):
+            return
+        self._known = reply.real, reply.world
+        self.factor, self.cause = reply.factor, reply.cause
+        if is_first:
+            self.offset += self._away()
+        self._slew()
 
-    def _change_factor(self, factor: float, server: float) -> None:
-        """Run at another ``factor`` from now on, where network time is about ``server`` [s]: pings until now were
-        measured by a clock that ran differently."""
-        log.info("the world runs at %g times real time", factor)
-        self.factor, self.estimate = factor, ClockEstimate(offset=server - self._own)
-        self._pinged, self._ping_count = -math.inf, 0
+    def _away(self) -> float:
+        """The world's time, as far as it is known, minus network time [s]."""
+        if self._known is None:
+            return 0.0
+        assert self._now is not None
+        real, world = self._known
+        return world + self.factor * (self._now + self.estimate.offset - real) - self.time
+
+    def _slew(self) -> None:
+        """Run faster or slower until network time is the world's time; what is farther away is another clock."""
+        away = self._away()
+        if abs(away) >= STEP_THRESHOLD:
+            self.offset, away = self.offset + away, 0.0
+        share = away / (SLEW_TIME * self.factor)
+        self._rate = self.factor * (1.0 + min(max(share, -MAX_SLEW), MAX_SLEW))

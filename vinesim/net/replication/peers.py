@@ -2,7 +2,7 @@
 
 Keys: ``a/<actor>/far``, ``a/<actor>/mid``, ``a/<actor>/near`` and ``a/<actor>`` share the poses of an actor: the nearer
 a peer, the more of them it receives (:data:`vinesim.net.replication.interest.POSE_LAYERS`). And the queries
-``hello/<actor>`` and ``clock``.
+``hello/<actor>`` and ``clock/<actor>``.
 """
 
 from __future__ import annotations
@@ -61,6 +61,8 @@ class PeerRegistry:
         self._queried: dict[str, float] = {}
         self._rejected: set[str] = set()
         self._warned: set[str] = set()
+        self._unread: tuple[Reply, ...] = ()
+        """Replies that came while only the clock was read."""
         self._layers = [bus.publisher(f"a/{hello.name}{layer.suffix}") for layer in interest.POSE_LAYERS]
         bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_LAST_1)
         self._pose_number: int | None = None
@@ -107,16 +109,34 @@ class PeerRegistry:
         self.clock.ping_if_due()
         return gone
 
+    def keep_clock(self, now: float) -> None:
+        """Between steps that are far apart: go on to real time ``now`` [s], ping the clock when due and take its
+        replies; other replies wait for :meth:`process_replies`."""
+        self.clock.advance(now)
+        self.clock.ping_if_due()
+        others: list[Reply] = []
+        for answer in self.bus.replies():
+            if answer.key.partition("/")[0] == "clock":
+                self.counters.control.count_in(answer.payload)
+                try:
+                    self.clock.receive(answer.payload, answer.age)
+                except MessageError as error:
+                    self.count_malformed("the clock", error)
+            else:
+                others.append(answer)
+        self._unread += tuple(others)
+
     def process_replies(self) -> tuple[list[Hello], list[Reply]]:
         """Take hellos and clock replies; the peers that joined, and the other replies."""
         joined: list[Hello] = []
         others: list[Reply] = []
-        for answer in self.bus.replies():
+        answers, self._unread = (*self._unread, *self.bus.replies()), ()
+        for answer in answers:
             key, payload, age = answer
             self.counters.control.count_in(payload)
             family, _, name = key.partition("/")
             try:
-                if key == "clock":
+                if family == "clock":
                     self.clock.receive(payload, age)
                 elif family != "hello":
                     others.append(answer)

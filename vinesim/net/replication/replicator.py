@@ -9,7 +9,7 @@ Keys: ``a/<actor>`` poses, ``tree/<x>/<y>/<actor>`` and ``near/<x>/<y>/<actor>``
 ``c/<x>/<y>/<actor>`` those of boxes and bunches, ``own/<x>/<y>/<actor>`` claims and
 states at rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, ``voice/<actor>``
 frames of sound, and the queries
-``snap/<x>/<y>`` (records of a cell), ``hello/<actor>`` and ``clock``.
+``snap/<x>/<y>`` (records of a cell), ``hello/<actor>`` and ``clock/<actor>``.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 
 from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.counters import Counters
+from vinesim.net.pace import PaceReport
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.clock_sync import STEP_THRESHOLD
@@ -129,6 +130,21 @@ class Replicator:
     def real_time_factor(self) -> float:
         """How many times as fast as real time the world's time passes; 1 unless a server says otherwise."""
         return self._state.peers.clock.factor
+
+    @property
+    def pace_cause(self) -> str:
+        """Which client limits the world's real-time factor, and by what: "picker: sensors"; empty if none does."""
+        return self._state.peers.clock.cause
+
+    def report_pace(self, report: Callable[[], PaceReport | None]) -> None:
+        """Tell the server with every ping how fast this client can follow: what ``report`` returns."""
+        self._state.peers.clock.report = report
+
+    def keep_clock(self, now: float) -> None:
+        """Ping the clock when due and take its replies, while no step is made: network time goes on, and the server
+        knows that this client lives."""
+        self._state.peers.keep_clock(now)
+        self._follow_clock()
 
     def network_time(self, now: float) -> float:
         """Network time [s] at the time ``now`` [s] of the client's clock."""

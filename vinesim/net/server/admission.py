@@ -56,6 +56,15 @@ class AdmissionControl:
         """Whether an actor has been admitted and has not left."""
         return (world, name) in self._admitted
 
+    def may_slow(self, world: str, name: str) -> bool:
+        """Whether the world waits for an actor: one that was admitted, is live, and simulates with a body."""
+        actor = (world, name)
+        return actor in self._admitted and actor not in self._spectators and self.is_live(world, name)
+
+    def has_actors(self, world: str) -> bool:
+        """Whether any session is live in a world."""
+        return any(there == world for there, _ in self._alive)
+
     def is_live(self, world: str, name: str) -> bool:
         """Whether a session with this name is live."""
         return bool(self._alive.get((world, name)))

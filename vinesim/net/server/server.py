@@ -18,8 +18,10 @@ import zenoh
 
 from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.errors import UsageError
+from vinesim.net import pace
 from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MessageError
+from vinesim.net.codec.messages import MessageError, is_valid_name
+from vinesim.net.pace import MIN_FACTOR, WorldClock
 from vinesim.net.replication.interest import Cell
 from vinesim.net.server.admission import AdmissionControl, SceneId
 from vinesim.net.server.mesh_store import MeshStore
@@ -49,6 +51,10 @@ link went (Zenoh 1.10). If the next router is there sooner, they do not tell it 
 5 to 15 % of restarts, in none of 180 after 0.15 s or more. A process that is started again takes longer."""
 
 
+MAX_EMPTY_WORLDS = 64
+"""Worlds without actors whose clocks go on."""
+
+
 class PortTaken(BusError):
     """The server cannot listen on the endpoint."""
 
@@ -75,7 +81,7 @@ class Server:
         quota: Quota = Quota(),
         certificates: pathlib.Path | None = None,
         world: str = WORLD,
-        real_time_factor: float = 1.0,
+        real_time_factor: float | None = None,
     ) -> None:
         """Listen on endpoints like ``tcp/0.0.0.0:7447``; port 0 chooses a free one, see :attr:`endpoint`.
 
@@ -84,7 +90,8 @@ class Server:
         server. ``scene``: the only one allowed. ``max_actors``: at a time. ``spectators_speak_to``:
         who hears them. ``certificates``: folder of a server, see
         :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate. It is read
-        again when its files change. ``real_time_factor``: how many times as fast as real time its worlds run.
+        again when its files change. ``real_time_factor``: how many times as fast as real time its worlds run; None:
+        each as fast as its clients can follow, at most 1.
 
         Raises :class:`PortTaken`, :class:`vinesim.errors.UsageError` for an invalid endpoint or combination,
         :class:`vinesim.net.server.journal.JournalError` and
@@ -93,9 +100,9 @@ class Server:
         listen = (listen,) if isinstance(listen, str) else listen
         is_secured = certificates is not None
         linked = [endpoints.parse(text, secured=is_secured) for text in connect]
-        if not messages.MIN_FACTOR <= real_time_factor <= 1.0:
-            raise UsageError(f"the real-time factor is {real_time_factor:g}: give {messages.MIN_FACTOR:g} to 1")
-        if linked and (state_folder, scene, max_actors, real_time_factor) != (None, None, None, 1.0):
+        if real_time_factor is not None and not MIN_FACTOR <= real_time_factor <= 1.0:
+            raise UsageError(f"the real-time factor is {real_time_factor:g}: give auto, or {MIN_FACTOR:g} to 1")
+        if linked and (state_folder, scene, max_actors, real_time_factor) != (None, None, None, None):
             raise UsageError(
                 f"a server linked to {linked[0]} only carries: give --state-dir, --scene, --max-clients and "
                 "--real-time-factor to the one server that connects to no other"
@@ -109,10 +116,12 @@ class Server:
             self.endpoints = endpoints.resolve_ports(listen, secured=is_secured)
         except OSError as error:
             raise PortTaken(listen[0], str(error.strerror)) from error
-        self.real_time_factor = real_time_factor
-        self._clock_origin = time.time() - real_time_factor * time.monotonic()
-        """Worlds' time [s] at the origin of the monotonic clock. It begins with the time of day, a later step of which
-        moves no world."""
+        self._fixed_factor = real_time_factor
+        self._start = time.monotonic(), time.time()
+        """Real time, and the time at which all worlds begin [s]: the time of day, a later step of which moves no
+        world."""
+        self._clocks: dict[str, WorldClock] = {}
+        """The clock of each world."""
         self.pings = 0
         """Queries of the clock."""
         self.foreign = 0
@@ -137,6 +146,7 @@ class Server:
         self._declared = self._declare(self._root)
         if self._watcher is not None:
             self._watcher.start()
+        threading.Thread(target=self._run_clocks, name="clocks of the worlds", daemon=True).start()
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
 
     def _access_settings(self) -> dict[str, Any]:
@@ -158,7 +168,7 @@ class Server:
         if self.store is not None:
             declared += [  # join first: an actor that reconnects joins before it publishes
                 session.declare_queryable(f"{root}/join/*/*", self._on_join_query),
-                session.declare_queryable(f"{root}/clock", self._on_clock_query),
+                session.declare_queryable(f"{root}/clock/*", self._on_clock_query),
                 session.declare_queryable(f"{root}/snap/*/*", self._on_snapshot_query),
                 session.declare_subscriber(f"{root}/fact/**", self._on_record),
                 session.declare_queryable(f"{root}/offer/*", self._on_mesh_offer),
@@ -187,10 +197,31 @@ class Server:
         """Messages and queries that could not be decoded."""
         return self._malformed + (self.store.counters.malformed if self.store is not None else 0)
 
+    def _clock(self, world: str) -> WorldClock:
+        """The clock of a world, kept from the first question of an actor that is live there; call it under the lock."""
+        if (clock := self._clocks.get(world)) is not None:
+            return clock
+        now, (real, begin) = time.monotonic(), self._start
+        clock = WorldClock(now, begin + (now - real) * (self._fixed_factor or 1.0), self._fixed_factor)
+        if self._admission.has_actors(world):
+            for name in [name for name in self._clocks if not self._admission.has_actors(name)][:-MAX_EMPTY_WORLDS]:
+                del self._clocks[name]
+            self._clocks[world] = clock
+        return clock
+
     @property
     def time(self) -> float:
-        """The time of its worlds now [s]."""
-        return self._clock_origin + self.real_time_factor * time.monotonic()
+        """The time of the default world now [s]."""
+        with self._lock:
+            return self._clock(WORLD).time(time.monotonic())
+
+    def _run_clocks(self) -> None:
+        """Body of the thread that adapts the factors of all worlds."""
+        while not self._stop.wait(pace.STEP):
+            now = time.monotonic()
+            with self._lock:
+                for clock in self._clocks.values():
+                    clock.advance(now)
 
     def figures(self) -> dict[str, Any]:
         """Content of a status line: live actors, links, and counters since the start."""
@@ -203,6 +234,7 @@ class Server:
             "pings": self.pings,
             "malformed": self.malformed,
             "foreign": self.foreign,
+            "clocks": self._clock_figures(),
         }
         if self.store is not None:
             counters = self.store.counters
@@ -220,6 +252,14 @@ class Server:
                 "trouble": self.store.status_message,
             }
         return figures
+
+    def _clock_figures(self) -> dict[str, dict[str, Any]]:
+        """Factor of each world, what limits it, and who is left behind."""
+        with self._lock:
+            return {
+                world: {"real_time_factor": one.factor, "cause": one.cause, "left_behind": one.left_behind}
+                for world, one in sorted(self._clocks.items())
+            }
 
     def _link_count(self) -> int:
         with self._session_lock:
@@ -304,6 +344,8 @@ class Server:
         with self._lock:
             (self._admission.on_join if is_live else self._admission.on_leave)(world, name, session)
             has_left = not self._admission.is_live(world, name)
+            if has_left and world in self._clocks:
+                self._clocks[world].forget(name)
         if has_left:
             self.meshes.release((world, name))
         log.info("%s/%s %s", world, name, "came" if is_live else "left")
@@ -326,16 +368,24 @@ class Server:
 
     def _on_clock_query(self, query: zenoh.Query) -> None:
         with query:
+            key = _strip_root(query.key_expr)
+            world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
             try:
-                asked, *_ = messages.decode_time(_query_payload(query))
+                if "*" in key or not is_valid_name(name):
+                    raise MessageError("the question names no world, or not the actor that asks")
+                question = messages.decode_time(_query_payload(query))
             except MessageError as error:
-                self._count_malformed(f"{_strip_root(query.key_expr)}", error)
-                return
-            if "*" in str(query.key_expr):
-                self._count_malformed(_strip_root(query.key_expr), MessageError("the question names no world"))
+                self._count_malformed(key, error)
                 return
             self.pings += 1
-            query.reply(str(query.key_expr), messages.encode_time(asked, self.time, self.real_time_factor))
+            with self._lock:
+                now, clock = time.monotonic(), self._clock(world)
+                if question.report is not None and self._admission.may_slow(world, name):
+                    clock.report(name, now, question.report)
+                world_time, factor, cause = clock.time(now), clock.factor, clock.cause
+            query.reply(
+                str(query.key_expr), messages.encode_time(question.asked, world_time, factor, real=now, cause=cause)
+            )
 
     def _on_join_query(self, query: zenoh.Query) -> None:
         with query:

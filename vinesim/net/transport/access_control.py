@@ -86,7 +86,7 @@ def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
 def server_answers_config(root: str) -> dict[str, Any]:
     """Access control of a server without certificates under ``root`` (like ``vs/1``): what actors ask the server, no
     other program that connects to it answers."""
-    questions = [f"{root}/*/{question}" for question in ("clock", "join/**", "snap/**")]
+    questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "snap/**")]
     rule = {
         "id": "answers of the server", "permission": "deny", "flows": ["ingress"],
         "messages": ["declare_queryable", "reply"], "key_exprs": questions,
@@ -116,7 +116,7 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         rule(
             "subscribe", "ingress", ["declare_subscriber", "liveliness_query", "declare_liveliness_subscriber"], world
         ),
-        rule("query", "ingress", ["query"], f"{root}/hello/*", f"{root}/clock", f"{root}/snap/*/*", f"{root}/mesh/*"),
+        rule("query", "ingress", ["query"], f"{root}/hello/*", f"{root}/snap/*/*", f"{root}/mesh/*"),
         rule("be queried", "egress", ["query"], f"{root}/hello/*"),
         # without the declarations of subscribers a publisher would never match and never send
         rule("see queryables", "egress", ["declare_queryable"], world),
@@ -130,7 +130,10 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
             rule(
                 f"{name} is there", "ingress", ["liveliness_token", "declare_queryable", "reply"], *about_itself
             ),
-            rule(f"{name} asks to be let in", "ingress", ["query"], f"{root}/join/{name}/*"),
+            rule(
+                f"{name} asks to be let in, and the time", "ingress", ["query"],
+                f"{root}/join/{name}/*", f"{root}/clock/{name}",
+            ),
         ]  # fmt: skip
         if role == Role.ROBOT:
             own.append(rule(f"{name} offers its meshes", "ingress", ["query"], f"{root}/offer/{name}"))

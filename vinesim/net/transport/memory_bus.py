@@ -116,12 +116,13 @@ class MemoryHub:
                 self._schedule(functools.partial(reply, bus.name, served_key, answer))
 
         def reply(replier: str, served_key: str, answer: bytes) -> None:
-            if not self.down and not self._is_foreign(sender, replier, served_key):
-                sender.pending_replies.append((served_key, answer, self.time))
+            answered_key = key if "*" in served_key else served_key
+            if not self.down and not self._is_foreign(sender, replier, answered_key):
+                sender.pending_replies.append((answered_key, answer, self.time))
 
         for name in sorted(self._members):
             for served_key in sorted(self._members[name].queryables):
-                if matches(key, served_key) and name != sender.name:
+                if name != sender.name and (matches(key, served_key) or matches(served_key, key)):
                     self._schedule(functools.partial(respond, self._members[name], served_key))
 
     def fetch(self, sender: str, key: str, payload: bytes) -> list[bytes]:

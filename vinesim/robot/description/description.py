@@ -11,7 +11,7 @@ import numpy as np
 from vinesim import frames
 from vinesim.robot.description.kinematics import MovingJoints
 from vinesim.robot.description.sidecar import BaseLimits, CameraMount, Cutter, JointGroup, SensorMount
-from vinesim.scene.values import ControllerSpec, Drive, RobotSpec
+from vinesim.scene.values import ControllerSpec, Drive, RobotSpec, SensorPacing
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +41,7 @@ class RobotDescription:
     lidars: tuple[SensorMount, ...]
     imus: tuple[SensorMount, ...]
     wrenches: tuple[SensorMount, ...]
+    sensor_pacing: SensorPacing
     cutters: tuple[Cutter, ...]
     controllers: tuple[ControllerSpec, ...]
     """What ROS may command, by which interface; sorted by name."""

@@ -48,6 +48,7 @@ from vinesim.robot.description.urdf_reader import (
     set_friction,
 )
 from vinesim.scene import data_files
+from vinesim.scene.values import SensorPacing
 
 log = logging.getLogger(__name__)
 
@@ -157,6 +158,7 @@ def _assemble(
         link_anchors=anchors,
         cameras=sidecar.cameras or (),
         lidars=sidecar.lidars or (),
+        sensor_pacing=SensorPacing(sidecar.sensors.mode, sidecar.sensors.least_rate),
         imus=sidecar.imus,
         wrenches=sidecar.wrenches,
         cutters=sidecar.cutters,

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from vinesim.robot.description.errors import description_error
-from vinesim.scene.values import ControllerKind
+from vinesim.scene.values import ControllerKind, SensorMode, SensorPacing
 
 
 class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -85,6 +85,14 @@ class CameraMount(SensorMount, frozen=True, forbid_unknown_fields=True):
     """Pictures a second [Hz]; the camera's own unless given."""
 
 
+class SensorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Whether simulated time waits for the robot's cameras and lidars: :class:`vinesim.scene.values.SensorPacing`."""
+
+    mode: SensorMode = SensorMode.LIVE
+    least_rate: float = SensorPacing().least_rate
+    """[Hz]"""
+
+
 class Cutter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The space between two blades: x along the blades, y from one to the other, z across their plane."""
 
@@ -117,6 +125,7 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     groups: dict[str, JointGroup] = {}
     cameras: tuple[CameraMount, ...] | None = None
     lidars: tuple[SensorMount, ...] | None = None
+    sensors: SensorTable = SensorTable()
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
     cutters: tuple[Cutter, ...] = ()
@@ -188,6 +197,9 @@ def check_sidecar(sidecar: Sidecar, driven: Container[str], links: Container[str
     for mount in mounts:
         if mount.frame not in links:
             raise description_error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
+    if not 0.01 <= sidecar.sensors.least_rate <= 1000.0:
+        found = f"sensors have the least_rate {sidecar.sensors.least_rate}"
+        raise description_error(file, found, "give 0.01 to 1000 Hz")
     for camera in sidecar.cameras or ():
         if camera.size is not None and not all(MIN_CAMERA_SIZE <= n <= MAX_CAMERA_SIZE for n in camera.size):
             bounds = f"give width and height from {MIN_CAMERA_SIZE} to {MAX_CAMERA_SIZE} px"

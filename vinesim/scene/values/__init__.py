@@ -31,6 +31,8 @@ from vinesim.scene.values.sensors import (
     CameraOutput,
     LevelLaser,
     LidarScan,
+    SensorMode,
+    SensorPacing,
 )
 from vinesim.scene.values.signals import INTENTIONS, TONE_LEVEL, HandGestures, Intention, LightPattern, Lights
 from vinesim.scene.values.status import ComponentStatus
@@ -79,6 +81,8 @@ __all__ = [
     "RobotSpec",
     "RobotUpdate",
     "SegmentPoses",
+    "SensorMode",
+    "SensorPacing",
     "Shape",
     "Snapshot",
     "TreeUpdate",

@@ -32,6 +32,27 @@ class CameraInfo:
     """Coefficients of the lens (:mod:`vinesim.scene.lens_distortion`), 5 or 8; none: a pinhole."""
 
 
+class SensorMode(enum.StrEnum):
+    """Whether simulated time waits for cameras and lidars."""
+
+    LIVE = "live"
+    """They give what they can up to their rates, and time waits only below a least rate."""
+    PACED = "paced"
+    """Every frame comes at its rate in simulated time, as in Gazebo."""
+    LOCKSTEP = "lockstep"
+    """Every frame is of exactly its step: time waits until it is rendered and sent, and two runs are equal to the
+    bit. All sensors render always."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class SensorPacing:
+    """How cameras and lidars of one robot and simulated time wait for each other."""
+
+    mode: SensorMode = SensorMode.LIVE
+    least_rate: float = 5.0
+    """Of live sensors [Hz] of simulated time; a sensor whose own rate is lower keeps that."""
+
+
 class CameraOutput(enum.Flag):
     """Parts of a :class:`CameraFrame`: a camera makes only those that are asked for."""
 

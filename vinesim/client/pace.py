@@ -1,0 +1,174 @@
+"""Which clock the steps of a client follow, and how fast this client could follow it at most."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from vinesim.net.pace import PaceReport, WorldClock
+from vinesim.net.replication.replicator import Replicator
+
+HEADROOM = 0.9
+"""Share of a core's time that steps may take: the rest is for what comes seldom."""
+WINDOW = 0.5
+"""Real time over which work is measured [s]; the last two such spans count."""
+HELD_SHARE = 0.1
+"""A client whose steps are held for more than this share of the time can follow only as fast as it does now."""
+REPORT_PERIOD = 0.05
+"""Real time between two reports to a clock of its own [s]."""
+
+
+class StepClock(Protocol):
+    """A clock whose time says when a step is due. ``now`` is ``time.monotonic()`` [s]."""
+
+    @property
+    def factor(self) -> float:
+        """How many times as fast as real time its time passes now."""
+        ...
+
+    @property
+    def cause(self) -> str:
+        """What limits the factor; empty if nothing does."""
+        ...
+
+    def time(self, now: float) -> float:
+        """Its time at ``now`` [s]."""
+        ...
+
+    def keep(self, now: float) -> None:
+        """Called several times a second, also while no step is made."""
+
+
+class RealTime:
+    """Real time, or a fixed multiple of it."""
+
+    cause = ""
+
+    def __init__(self, factor: float = 1.0) -> None:
+        self.factor = factor
+
+    def time(self, now: float) -> float:
+        return self.factor * now
+
+    def keep(self, now: float) -> None:
+        pass
+
+
+class OwnPace:
+    """The clock of a client without a server: it passes as fast as this client can follow."""
+
+    def __init__(self, name: str, now: float, report: Callable[[], PaceReport]) -> None:
+        self._name, self._report = name, report
+        self._clock, self._next_report = WorldClock(now), now
+
+    @property
+    def factor(self) -> float:
+        return self._clock.factor
+
+    @property
+    def cause(self) -> str:
+        return self._clock.cause
+
+    def time(self, now: float) -> float:
+        return self._clock.time(now)
+
+    def keep(self, now: float) -> None:
+        self._clock.advance(now)
+        if now >= self._next_report:
+            self._next_report = now + REPORT_PERIOD
+            self._clock.report(self._name, now, self._report())
+
+
+class WorldPace:
+    """The clock of the world that a client shares, as its replicator knows it."""
+
+    def __init__(self, replicator: Replicator) -> None:
+        self._replicator = replicator
+
+    @property
+    def factor(self) -> float:
+        return self._replicator.real_time_factor
+
+    @property
+    def cause(self) -> str:
+        return self._replicator.pace_cause
+
+    def time(self, now: float) -> float:
+        return self._replicator.network_time(now)
+
+    def keep(self, now: float) -> None:
+        self._replicator.keep_clock(now)
+
+
+class Limit(NamedTuple):
+    """The largest real-time factor that a part of a client can follow, and the name of the part."""
+
+    factor: float
+    cause: str
+
+
+class _Span:
+    """What a loop did in a span of real time."""
+
+    def __init__(self, begun: float) -> None:
+        self.begun, self.ended = begun, begun
+        self.steps = 0
+        self.idle = 0.0
+        """Time for which nothing was due [s]."""
+        self.held: dict[str, float] = {}
+        """Time for which a due step was held, by cause [s]."""
+
+
+class PaceMeter:
+    """Measures how fast a loop could make steps of ``dt`` [s], by its idle time: work that waits for a core counts."""
+
+    def __init__(self, dt: float) -> None:
+        self.limits: list[Callable[[], Limit]] = []
+        """Other parts of the client, which know what they can follow."""
+        self._dt = dt
+        self._spans: deque[_Span] = deque(maxlen=2)
+        self._span: _Span | None = None
+        self._measured = Limit(1.0, "")
+
+    def begin(self, now: float) -> None:
+        """Start measuring at ``now`` [s]."""
+        self._span = _Span(now)
+
+    def idle(self, seconds: float) -> None:
+        """The loop was going to sleep for so long; what it overslept counts as work."""
+        if self._span is not None:
+            self._span.idle += seconds
+
+    def hold(self, cause: str, seconds: float) -> None:
+        """A step that was due waited for so long, because of ``cause``."""
+        if self._span is not None:
+            self._span.held[cause] = self._span.held.get(cause, 0.0) + seconds
+
+    def step(self, now: float) -> None:
+        """A step ended at ``now`` [s]."""
+        if (span := self._span) is None:
+            return
+        span.steps += 1
+        if now - span.begun >= WINDOW:
+            self._close(span, now)
+
+    def _close(self, span: _Span, now: float) -> None:
+        span.ended = now
+        self._spans.append(span)
+        self._span = _Span(now)
+        elapsed = sum(one.ended - one.begun for one in self._spans)
+        simulated = self._dt * sum(one.steps for one in self._spans)
+        held: dict[str, float] = {}
+        for one in self._spans:
+            for cause, seconds in one.held.items():
+                held[cause] = held.get(cause, 0.0) + seconds
+        busy = elapsed - sum(one.idle for one in self._spans) - sum(held.values())
+        self._measured = Limit(HEADROOM * simulated / max(busy, 1e-6), "steps")
+        if sum(held.values()) > HELD_SHARE * elapsed:
+            longest = max(sorted(held), key=lambda cause: held[cause])
+            self._measured = min(self._measured, Limit(simulated / elapsed, longest))
+
+    def limit(self) -> Limit:
+        """The largest real-time factor that the client can follow, and what limits it."""
+        return min([self._measured, *(limit() for limit in self.limits)])

@@ -1,0 +1,23 @@
+"""A digest of all states that a client has stepped through: equal digests mean equal runs, to the bit."""
+
+from __future__ import annotations
+
+import hashlib
+
+from vinesim.client.client import Client
+
+
+class StateDigest:
+    """Joints of plants and of rigid bodies after every step; call it after each."""
+
+    def __init__(self) -> None:
+        self._digest = hashlib.blake2b(digest_size=16)
+
+    def __call__(self, client: Client) -> None:
+        physics = client.physics
+        for array in (physics.state.joint_q, physics.state.joint_qd, physics.rigid.mj_data.qpos):
+            self._digest.update(array.tobytes())
+
+    def hexdigest(self) -> str:
+        """The digest so far."""
+        return self._digest.hexdigest()

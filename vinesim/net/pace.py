@@ -1,0 +1,152 @@
+"""Time of a world: it passes as fast as all clients that simulate can follow, and at most in real time; pure.
+
+Clients report the time that their steps have reached, and the largest real-time factor that they could follow. The
+factor of the world falls at once to the smallest of these, and rises slowly. A client that falls behind nevertheless
+brakes the clock within half a second of simulated time, so that it has to skip no step. One that reports nothing for
+:data:`SILENCE` is left behind: it slows the others no longer, until it has caught up.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from typing import NamedTuple
+
+log = logging.getLogger(__name__)
+
+MIN_FACTOR = 0.01
+"""Smallest real-time factor of a world; the largest is 1."""
+FALL_TIME = 0.3
+"""Time constant with which the factor falls to what the slowest client can follow [s]."""
+RISE_TIME = 4.0
+"""Time constant with which it rises [s]; so that a client that can only just follow does not make it swing."""
+LEAST_RISE = 0.04
+"""The factor rises at least by this much a second."""
+FREE_LAG = 0.15
+"""A client that is less than this behind brakes nothing [s of the world]: messages take some time."""
+STOP_LAG = 0.5
+"""The clock stands, at :data:`MIN_FACTOR`, for a client that is this far behind [s of the world]."""
+OVERDUE = 0.6
+"""A client that has reported nothing for this long is taken to have stopped [s]; it reports five times a second."""
+SILENCE = 3.0
+"""A client that has reported nothing for this long is left behind [s]."""
+STEP = 0.05
+"""Longest real time for which the clock runs at one factor [s]."""
+
+
+SHOWN_FACTOR = 0.995
+"""A real-time factor from here on is shown as real time."""
+
+
+def describe(factor: float, cause: str) -> str:
+    """A real-time factor and what limits it, for a status line: "0.43 of real time (picker: sensors)"; empty for real
+    time."""
+    if factor >= SHOWN_FACTOR:
+        return ""
+    return f"{factor:.2f} of real time" + (f" ({cause})" if cause else "")
+
+
+class PaceReport(NamedTuple):
+    """What one client tells the clock of its world."""
+
+    time: float
+    """Time of the world that its steps have reached [s]."""
+    factor: float
+    """Largest real-time factor that it can follow; may be above 1."""
+    cause: str = ""
+    """What limits this factor: "steps", "sensors", "ROS messages"."""
+
+
+@dataclasses.dataclass
+class _Client:
+    report: PaceReport
+    arrived: float
+    """Real time of its last report [s]."""
+    lag: float
+    """How far it is behind [s of the world]."""
+    is_left_behind: bool = False
+
+
+class WorldClock:
+    """The clock of one world. ``now`` is real time, of any monotonic clock [s]."""
+
+    def __init__(self, now: float, time: float = 0.0, factor: float | None = None) -> None:
+        """The world begins at ``time`` [s]. ``factor``: a fixed real-time factor; None: as the clients can follow."""
+        self.is_fixed = factor is not None
+        self.factor = 1.0 if factor is None else factor
+        """How many times as fast as real time the world's time passes now."""
+        self.cause = ""
+        """Which client limits the factor, and by what: "picker: sensors"; empty while nothing does."""
+        self._time, self._now = time, now
+        self._pace = self.factor
+        """The factor before the brake for those who are behind."""
+        self._clients: dict[str, _Client] = {}
+
+    @property
+    def left_behind(self) -> list[str]:
+        """Clients that are left behind, sorted."""
+        return sorted(name for name, one in self._clients.items() if one.is_left_behind)
+
+    def time(self, now: float) -> float:
+        """Time of the world at ``now`` [s], not earlier than the last :meth:`advance`."""
+        return self._time + self.factor * (now - self._now)
+
+    def report(self, name: str, now: float, report: PaceReport) -> None:
+        """Take a report of a client that arrived at ``now`` [s]."""
+        self.advance(now)
+        lag = max(self._time - report.time, 0.0)
+        before = self._clients.get(name)
+        stays_behind = before is not None and before.is_left_behind and lag >= STOP_LAG
+        if before is not None and before.is_left_behind and not stays_behind:
+            log.info("%s follows the world's clock again", name)
+        self._clients[name] = _Client(report, now, lag, stays_behind)
+
+    def forget(self, name: str) -> None:
+        """A client has left."""
+        self._clients.pop(name, None)
+
+    def advance(self, now: float) -> None:
+        """Go on to real time ``now`` [s]; call it several times a second."""
+        while self._now < now:
+            step = min(STEP, now - self._now)
+            self._time += self.factor * step
+            self._now += step
+            for name, client in sorted(self._clients.items()):
+                self._watch(name, client, step)
+            if not self.is_fixed:
+                self._adapt(step)
+
+    def _watch(self, name: str, client: _Client, step: float) -> None:
+        """Note how far a client without a report is behind now, and leave it behind in the end."""
+        silent = self._now - client.arrived
+        if silent > OVERDUE:
+            client.lag += self.factor * step
+        if silent > SILENCE and not client.is_left_behind:
+            client.is_left_behind = True
+            log.warning("%s has not answered for %.0f s: the world goes on without waiting for it", name, SILENCE)
+
+    def _adapt(self, step: float) -> None:
+        """Choose the factor for the next time step, and note its cause."""
+        limit, brake = 1.0, 1.0
+        limited_by = braked_by = ""
+        for name, client in sorted(self._clients.items()):
+            if client.is_left_behind:
+                continue
+            if client.report.factor < limit:
+                limit, limited_by = client.report.factor, f"{name}: {client.report.cause}"
+            free = min(max((STOP_LAG - client.lag) / (STOP_LAG - FREE_LAG), 0.0), 1.0)
+            if free < brake:
+                brake, braked_by = free, f"{name}: behind"
+        if limit < self._pace:
+            self._pace += (limit - self._pace) * -math.expm1(-step / FALL_TIME)
+        else:
+            rise = max((limit - self._pace) * -math.expm1(-step / RISE_TIME), LEAST_RISE * step)
+            self._pace = min(self._pace + rise, limit)
+        self.factor = max(self._pace * brake, MIN_FACTOR)
+        if brake < 1.0 and brake * self._pace < 0.9 * limit:
+            self.cause = braked_by
+        elif self._pace < SHOWN_FACTOR:
+            self.cause = limited_by or self.cause
+        else:
+            self.cause = ""
