@@ -25,9 +25,9 @@ from typing import IO
 
 import numpy as np
 
+from vinesim.progress import ProgressLine
+
 log = logging.getLogger(__name__)
-progress = logging.getLogger("vinesim.progress")
-"""What is worth a line on the terminal because it takes longer than a second."""
 
 MAX_SIZE = 1 << 30
 """Size of all entries [bytes]; those that were not used for longest are deleted."""
@@ -189,26 +189,34 @@ def exclusive(name: str, timeout: float | None = None, waiting_for: str = "") ->
     after ``timeout`` [s], :data:`LOCK_TIMEOUT` unless given. ``waiting_for``: logged after a second of waiting.
     """
     timeout = LOCK_TIMEOUT if timeout is None else timeout
+    start, waited = time.monotonic(), False
+    with ProgressLine() as line:
+        while (lock := try_exclusive(name)) is None:
+            waited = True
+            line.show(f"waiting for {waiting_for or f'another process that makes {name}'}")
+            if time.monotonic() > start + timeout:
+                log.warning("another process has held %s for %.0f s; going on without it", name, timeout)
+                lock = contextlib.ExitStack()
+                break
+            time.sleep(_POLL_PERIOD)
+    with lock:
+        yield waited
+
+
+def try_exclusive(name: str) -> contextlib.ExitStack | None:
+    """The lock of :func:`exclusive`, held until it is closed; None if another process has it."""
+    lock = contextlib.ExitStack()
     try:
         path = folder() / f"{name}.lock"
         path.parent.mkdir(parents=True, exist_ok=True)
-        file = open(path, "ab")  # noqa: SIM115 closed below
+        file = lock.enter_context(open(path, "ab"))  # noqa: SIM115 entered
     except (OSError, RuntimeError) as error:
         _warn(error)
-        yield False
-        return
-    with file:
-        start, waited, told = time.monotonic(), False, False
-        while not _try_lock(file):
-            waited = True
-            if not told and time.monotonic() > start + 1.0:
-                progress.info("waiting for %s", waiting_for or f"another process that makes {name}")
-                told = True
-            if time.monotonic() > start + timeout:
-                log.warning("another process has held %s for %.0f s; going on without it", path, timeout)
-                break
-            time.sleep(_POLL_PERIOD)
-        yield waited
+        return lock
+    if _try_lock(file):
+        return lock
+    lock.close()
+    return None
 
 
 if sys.platform == "win32":

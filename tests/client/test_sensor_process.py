@@ -201,6 +201,26 @@ def test_a_process_that_cannot_start_is_an_error_in_one_line(tmp_path):
         assert "\n" not in str(caught.value)
 
 
+def test_without_waiting_the_client_steps_and_the_sensors_join_it():
+    one = Robot()
+    with one.sensors:
+        one.sensors.attach(one.client, wait=False)
+        one.client.tick()
+        assert one.sensors.awaited()
+        one.run_for_pictures(1)
+        assert one.sensors.awaited() == []
+
+
+def test_without_waiting_the_error_of_a_process_that_cannot_start_ends_the_steps():
+    scene, vinebot = load_scene("demo"), load_description("vinebot")
+    model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+    client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
+    with SensorProcess("robot", scene, model, vinebot, ros=False, renderer="pencil") as sensors:
+        sensors.attach(client, wait=False)
+        with pytest.raises(WorkerError, match=r"the sensor process of robot failed: .*pencil"):
+            wait(lambda: client.tick(), "the failure")
+
+
 def test_the_kept_picture_is_written(robot, tmp_path):
     robot.run_for_pictures(1)
     robot.sensors.save_picture(tmp_path)

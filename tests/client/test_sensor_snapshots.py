@@ -69,7 +69,11 @@ class OneProcess:
         self.config, self.channel = config, open_channel(multiprocessing.get_context("spawn"))
         run = types.SimpleNamespace(shared=self.channel, send=lambda kind, value: pipe.send((kind, value)))
         return types.SimpleNamespace(
-            is_ready=True, current=lambda: run, wait_until_ready=lambda _timeout: None, close=self.channel.close
+            is_ready=True,
+            current=lambda: run,
+            wait_until_ready=lambda _timeout: None,
+            raise_failure=lambda: None,
+            close=self.channel.close,
         )
 
     def render(self) -> None:

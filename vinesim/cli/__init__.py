@@ -21,7 +21,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim import allocator
+from vinesim import allocator, progress
 from vinesim.cli.commands.client import client
 from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, render, scene_import_plant, scene_show
@@ -58,11 +58,7 @@ def configure_logging(
     """Log level for every command."""
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
-    progress = logging.getLogger("vinesim.progress")
-    lines = logging.StreamHandler(sys.stderr)
-    lines.setFormatter(logging.Formatter("vinesim: %(message)s"))
-    progress.handlers, progress.propagate = [lines], False
-    progress.setLevel(logging.INFO)
+    progress.show_on(sys.stderr)
 
 
 def main() -> None:

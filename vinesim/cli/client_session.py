@@ -25,7 +25,7 @@ from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
 from vinesim.errors import writing
-from vinesim.kernels.compilation import compile_kernels
+from vinesim.kernels.compilation import PHYSICS_PACKAGES, SENSOR_PACKAGES, compile_kernels
 from vinesim.net.pace import describe
 from vinesim.net.transport.bus import Bus
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -68,7 +68,9 @@ class ClientSession:
         """Index of the start pose in the scene."""
         if options.pose is not None:
             self.scene, self.spawn = with_start_pose(self.scene, *options.pose), 0
-        compile_kernels(device=options.device)
+        # those of cameras and lidars are compiled while the loop runs already; the sensor processes wait for them
+        sensors = SENSOR_PACKAGES if options.role == "robot" else ()
+        compile_kernels(PHYSICS_PACKAGES, options.device, then=sensors)
         self.model = generate(self.scene)
         self._hub = MemoryHub()
         self._stack = contextlib.ExitStack()

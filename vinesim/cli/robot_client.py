@@ -46,7 +46,8 @@ def run(options: ClientOptions) -> int:
         sensors = _start_sensors(session, names, descriptions)
         client = _build_client(session, names, descriptions, start, approach)
         for name, process in zip(names, sensors, strict=True):
-            process.attach(client, client.robots[name])
+            # a run of given length is seen from its beginning; others begin at once, and their sensors join them
+            process.attach(client, client.robots[name], wait_for_sensors=options.seconds is not None)
         task = None if begin is None else begin(client.physics, client.robot)
         _add_behaviour(session, client, task, approach)
         digest = StateDigest() if sensors[0].sensors.is_lockstep else None

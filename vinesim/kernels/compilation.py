@@ -1,116 +1,314 @@
-"""Compilation of all kernels before they are needed: by one process at a time, on all cores, with progress.
+"""Compilation of kernels before they are needed: each module once, by processes on all cores, with progress.
 
 Warp compiles a module at its first launch and keeps the result on disk. Processes that start together would each
-compile the same modules, in silence and one after the other. :func:`compile_kernels` compiles them once; others wait for it.
+compile the same modules, in silence and one after the other. With :func:`compile_kernels` the first of them starts
+compilers, and each of them waits only for the modules that it needs.
 """
 
+from __future__ import annotations
+
+import collections
 import concurrent.futures
 import contextlib
+import functools
 import hashlib
 import importlib
+import json
+import logging
 import os
 import pathlib
-import pkgutil
+import re
+import shutil
+import subprocess
 import sys
-import types
+import threading
+import time
+from collections.abc import Sequence
 
 import warp as wp
 
 import vinesim.kernels
-from vinesim import disk_cache
+from vinesim import disk_cache, progress
+from vinesim.kernels.launch import usable_cores
+from vinesim.progress import ProgressLine
 
+log = logging.getLogger(__name__)
+
+PHYSICS_PACKAGES = (
+    "shared_launch",
+    "articulation",
+    "contact",
+    "joint_servos",
+    "inverse_kinematics",
+    "human_kinematics",
+)
+"""Kernels that a step needs."""
 SENSOR_PACKAGES = ("raster", "sensing", "shading")
-"""Kernels of cameras and lidars; the others are those of physics."""
+"""Kernels of cameras and lidars."""
 TIMEOUT = 600.0
-"""How long another process may take to compile, before this one compiles as well [s]."""
+"""How long other processes may take to compile, before this one compiles as well [s]."""
+MAX_COMPILERS = 12
+"""More would wait for the longest module."""
+NICENESS = 10
+"""Of compilers of what is not waited for: loops of clients that run already come first."""
+ATTEMPTS = 2
+"""A module is given to so many compilers in turn if they die of it."""
+POLL_PERIOD = 0.05
+"""Between two looks at what other processes have compiled [s]."""
+LEFTOVER_AGE = 3600.0
+"""Age from which a folder that a compiler works in belongs to one that was killed [s]."""
+_PREFIX = "vinesim.kernels."
+_KERNEL = re.compile(rb"^@wp\.kernel|_kernel\(__name__,", re.MULTILINE)
+"""What defines a kernel."""
 _CUDA_ONLY = (
-    "vinesim.kernels.articulation.lean_prediction",
-    "vinesim.kernels.contact.tree_islands",
-    "vinesim.kernels.raster.cuda_raster",
+    "articulation.lean_prediction",
+    "contact.tree_delassus",
+    "contact.tree_islands",
+    "contact.tree_narrowphase",
+    "raster.cuda_raster",
 )
 _CPU_ONLY = (
-    "vinesim.kernels.articulation.eight_trees",
-    "vinesim.kernels.contact.delassus",
-    "vinesim.kernels.contact.forces",
-    "vinesim.kernels.contact.islands",
-    "vinesim.kernels.contact.jacobians",
-    "vinesim.kernels.contact.narrowphase_plants",
-    "vinesim.kernels.contact.narrowphase_rigid",
-    "vinesim.kernels.contact.projected_gauss_seidel",
-    "vinesim.kernels.contact.sleeping_trees",
-    "vinesim.kernels.contact.sweep_order",
-    "vinesim.kernels.contact.wire_contacts",
-    "vinesim.kernels.contact.wire_shapes",
-    "vinesim.kernels.joint_servos",
+    "articulation.eight_trees",
+    "contact.delassus",
+    "contact.forces",
+    "contact.islands",
+    "contact.jacobians",
+    "contact.narrowphase_plants",
+    "contact.narrowphase_rigid",
+    "contact.projected_gauss_seidel",
+    "contact.sleeping_trees",
+    "contact.sweep_order",
+    "contact.wire_contacts",
+    "contact.wire_shapes",
+    "joint_servos",
 )
 """Modules whose kernels are never launched on a GPU; some have vectors of a CPU in native code."""
 
 
-def compile_kernels(packages: tuple[str, ...] = (), device: str = "cpu") -> int:
-    """Compile the kernels of some ``packages`` of :mod:`vinesim.kernels`, all unless given.
+def compile_kernels(packages: Sequence[str] = (), device: str = "cpu", *, then: Sequence[str] = ()) -> int:
+    """Return when the kernels of some ``packages`` of :mod:`vinesim.kernels` are compiled, of all unless given.
 
     For the CPU always, and for ``device`` (``"cpu"``, ``"cuda"``, ``"cuda:N"``; it must be there). Returns how many
-    modules were compiled for the CPU: 0 where all are in Warp's cache, which takes a millisecond to find.
+    modules this process had compiled for the CPU meanwhile: 0 where others compile, and where all are in Warp's cache,
+    which takes a few milliseconds to find. If it starts compilers, those also compile the packages in ``then``, after
+    the others and without being waited for, as long as this process runs.
+
+    A module that cannot be compiled is logged; Warp tries again at its first launch, and raises what is wrong with it.
     """
     if device != "cpu":
         with disk_cache.exclusive("kernels-cuda", TIMEOUT, waiting_for="another process that compiles kernels"):
-            _compile(_modules(packages, without=_CPU_ONLY), device)
-    stamp = _stamp(packages)
-    if _is_valid(stamp):
+            _compile_for_gpu(module_names(packages, without=_CPU_ONLY), device)
+    names = module_names(packages)
+    later = [name for name in module_names(then) if name not in names] if then else []
+    compiled = CompiledModules()
+    if not compiled.missing([*names, *later]):
         return 0
-    with disk_cache.exclusive("kernels", TIMEOUT, waiting_for="another process that compiles kernels"):
-        if _is_valid(stamp):
-            return 0
-        if not os.access(wp.config.kernel_cache_dir, os.W_OK):
-            vinesim.kernels.use_temporary_cache(f"{wp.config.kernel_cache_dir} is read-only")
-        modules = _modules(packages)
-        folders = [os.path.join(wp.config.kernel_cache_dir, m.get_module_identifier(1)) for m in modules]
-        missing = [m for m, folder in zip(modules, folders, strict=True) if not os.path.isdir(folder)]
-        _compile(missing, "cpu")
+    if not os.access(wp.config.kernel_cache_dir, os.W_OK):
+        vinesim.kernels.use_temporary_cache(f"{wp.config.kernel_cache_dir} is read-only")
+        compiled = CompiledModules()
+    compilers: Compilers | None = None
+    deadline = time.monotonic() + TIMEOUT
+    with ProgressLine() as line:
+        while (missing := compiled.missing(names)) or (compilers is None and later):
+            if compilers is None:
+                lock = disk_cache.try_exclusive("kernels")
+                if lock is None and missing and time.monotonic() > deadline:
+                    log.warning("other processes have compiled kernels for %.0f s; compiling them here too", TIMEOUT)
+                    lock = contextlib.ExitStack()
+                if lock is not None:
+                    missing = compiled.missing(names)
+                    compilers = Compilers(missing, compiled.missing(later), compiled, lock)
+                elif not missing:  # others compile what comes later
+                    break
+            if compilers is not None and not compilers.awaited(missing):
+                break
+            line.show(f"compiling kernels, only once: {len(names) - len(missing)} of {len(names)} done")
+            time.sleep(POLL_PERIOD)
+    return 0 if compilers is None else compilers.count(names)
+
+
+class CompiledModules:
+    """Which modules of this version of the kernels are in Warp's cache: each has a file there that names its folder."""
+
+    def __init__(self) -> None:
+        self._cache = pathlib.Path(wp.config.kernel_cache_dir)
+        h = hashlib.blake2b(wp.get_cpu_kernel_cache_key().encode(), digest_size=8)
+        for name, source in _sources().items():
+            h.update(name.encode() + source)
+        self._folder = self._cache / f"vinesim-{h.hexdigest()}"
+
+    def missing(self, names: Sequence[str]) -> list[str]:
+        """Those of some modules that are not there, in their order."""
+        return [name for name in names if not self._is_there(name)]
+
+    def _is_there(self, name: str) -> bool:
+        try:
+            return (self._cache / (self._folder / name).read_text()).is_dir()
+        except OSError:
+            return False
+
+    def add(self, name: str, folder: str) -> None:
+        """Say that a module is in a ``folder`` of Warp's cache."""
         with contextlib.suppress(OSError):  # then the next start looks again
-            _stamp(packages).write_text("\n".join(folders))
-    return len(missing)
+            self._folder.mkdir(exist_ok=True)
+            draft = self._folder / f"{name}.{os.getpid()}.part"
+            draft.write_text(folder)
+            draft.replace(self._folder / name)
+
+    def delete_leftovers(self) -> None:
+        """Delete the folders of compilers that were killed while they compiled."""
+        for folder in self._cache.glob(f"wp_{_PREFIX}*_p[0-9]*_t[0-9]*"):
+            with contextlib.suppress(OSError):
+                if time.time() - folder.stat().st_mtime > LEFTOVER_AGE:
+                    shutil.rmtree(folder)
 
 
-def _compile(modules: list[wp.Module], device: str) -> None:
-    """Compile modules, or load them if they are, on all cores; the compiler works without the interpreter lock."""
+class Compilers:
+    """Processes that compile modules, one after the other each, in threads of this process that feed them."""
 
-    def compile_one(number: int) -> None:
-        name = modules[number].name.removeprefix("vinesim.kernels.")
-        disk_cache.progress.info("compiling kernels for %s: %s (%d of %d)", device, name, number + 1, len(modules))
-        wp.force_load(device, [modules[number]], max_workers=0)
+    def __init__(
+        self, names: Sequence[str], later: Sequence[str], compiled: CompiledModules, lock: contextlib.ExitStack
+    ) -> None:
+        """Starts with the modules ``names`` in their order, then those of ``later``, while loops may run already; the
+        ``lock`` is held until all are done."""
+        self._compiled = compiled
+        names = [*names, *later]
+        self._queue = collections.deque(names)
+        self._later = frozenset(later)
+        self._awaited = set(names)
+        self._done: set[str] = set()
+        self._deaths: collections.Counter[str] = collections.Counter()
+        self._state = threading.Lock()
+        self._held = lock
+        compiled.delete_leftovers()
+        self._threads = min(usable_cores(), len(names), MAX_COMPILERS)
+        if not names:
+            lock.close()
+        for number in range(self._threads):
+            threading.Thread(target=self._feed, name=f"compiler {number}", daemon=True).start()
 
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        for _ in pool.map(compile_one, range(len(modules))):
-            pass
+    def awaited(self, names: Sequence[str]) -> list[str]:
+        """Those of some modules that are yet to be compiled; the others are there, or have failed."""
+        with self._state:
+            return [name for name in names if name in self._awaited]
+
+    def count(self, names: Sequence[str]) -> int:
+        """How many of some modules were compiled."""
+        with self._state:
+            return len(self._done.intersection(names))
+
+    def _feed(self) -> None:
+        """Let one process compile what is next until nothing is left; start another one if it dies."""
+        process = None
+        try:
+            while (name := self._next()) is not None:
+                process = process or _start_compiler()
+                if name in self._later and hasattr(os, "setpriority"):
+                    with contextlib.suppress(OSError):  # it has just died
+                        os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+                answer = _ask(process, name)
+                if answer is None:
+                    code = process.wait()
+                    process = None
+                    self._take_back(name, f"the compiler ended with exit code {code}")
+                elif "failure" in answer:
+                    self._end(name, answer["failure"])
+                else:
+                    self._compiled.add(name, answer["folder"])
+                    self._end(name)
+        except OSError as error:  # no process could be started
+            log.warning("kernels cannot be compiled beforehand: %s", error)
+        finally:
+            if process is not None:
+                _close(process)
+            with self._state:
+                self._threads -= 1
+                if self._threads == 0:
+                    self._awaited.clear()
+                    self._held.close()
+
+    def _next(self) -> str | None:
+        with self._state:
+            return self._queue.popleft() if self._queue else None
+
+    def _take_back(self, name: str, reason: str) -> None:
+        with self._state:
+            self._deaths[name] += 1
+            again = self._deaths[name] < ATTEMPTS
+            if again:
+                self._queue.appendleft(name)
+        if not again:
+            self._end(name, reason)
+
+    def _end(self, name: str, failure: str = "") -> None:
+        if failure:
+            log.warning("%s was not compiled beforehand: %s", name, failure)
+        with self._state:
+            self._awaited.discard(name)
+            if not failure:
+                self._done.add(name)
 
 
-def _modules(packages: tuple[str, ...], without: tuple[str, ...] = _CUDA_ONLY) -> list[wp.Module]:
-    """All Warp modules of the packages that have kernels, long ones first."""
-    found = []
-    for info in pkgutil.walk_packages(vinesim.kernels.__path__, "vinesim.kernels."):
-        part = info.name.split(".")[2]
-        if info.ispkg or info.name in without or (packages and part not in packages):
-            continue
-        python: types.ModuleType = importlib.import_module(info.name)
-        module = wp.get_module(python.__name__)
-        if module.kernels:
-            found.append(module)
-    # those that take longest first, by and large, so that no core waits for the last one
-    return sorted(found, key=lambda module: -os.path.getsize(sys.modules[module.name].__file__ or ""))
+def _start_compiler() -> subprocess.Popen[str]:
+    """A process that runs :mod:`vinesim.kernels.compiler_process`, in a group of its own: Ctrl-C is for this process."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    return subprocess.Popen(
+        [sys.executable, "-P", "-m", "vinesim.kernels.compiler_process"], stdin=subprocess.PIPE, text=True,
+        stdout=subprocess.PIPE, env=environment, **({"process_group": 0} if os.name == "posix" else {}),
+    )  # fmt: skip
 
 
-def _stamp(packages: tuple[str, ...]) -> pathlib.Path:
-    """A file in Warp's cache that lists the compiled modules of this version of the kernels."""
-    h = hashlib.blake2b(repr((packages, wp.config.version, wp.config.cpu_compiler_flags)).encode(), digest_size=8)
-    for file in sorted(pathlib.Path(vinesim.kernels.__path__[0]).rglob("*.py")):
-        h.update(file.name.encode() + file.read_bytes())
-    return pathlib.Path(wp.config.kernel_cache_dir) / f"vinesim-{h.hexdigest()}"
-
-
-def _is_valid(stamp: pathlib.Path) -> bool:
-    """Whether all modules that a stamp lists are still there."""
+def _ask(process: subprocess.Popen[str], name: str) -> dict[str, str] | None:
+    """The answer of a compiler for a module; None if it has died."""
+    assert process.stdin is not None
+    assert process.stdout is not None
     try:
-        return all(map(os.path.isdir, stamp.read_text().split("\n")))
-    except OSError:
-        return False
+        process.stdin.write(_PREFIX + name + "\n")
+        process.stdin.flush()
+        return json.loads(process.stdout.readline())
+    except (BrokenPipeError, ValueError):
+        return None
+
+
+def _close(process: subprocess.Popen[str]) -> None:
+    with contextlib.suppress(OSError):
+        process.communicate()
+
+
+def _compile_for_gpu(names: Sequence[str], device: str) -> None:
+    """Compile modules, or load them if they are compiled, on all cores; the compiler works without the interpreter lock."""
+    modules = [wp.get_module(importlib.import_module(_PREFIX + name).__name__) for name in names]
+    with ProgressLine() as line, concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
+        works = [pool.submit(wp.force_load, device, [module], max_workers=0) for module in modules]
+        for number, work in enumerate(concurrent.futures.as_completed(works)):
+            work.result()
+            line.show(f"compiling kernels for {device}: {number + 1} of {len(names)} done")
+
+
+def module_names(packages: Sequence[str] = (), without: Sequence[str] = _CUDA_ONLY) -> list[str]:
+    """All modules of some packages that define kernels, below :mod:`vinesim.kernels`, all unless given.
+
+    Long ones first, by and large, so that no core waits for the last one.
+    """
+    found = {
+        name: len(source)
+        for name, source in _sources().items()
+        if _KERNEL.search(source)
+        if name not in without
+        if not packages or name.split(".")[0] in packages
+    }
+    return sorted(found, key=lambda name: -found[name])
+
+
+@functools.cache
+def _sources() -> dict[str, bytes]:
+    """The source of each module of the package, by its name below it."""
+    root = pathlib.Path(vinesim.kernels.__path__[0])
+    return {
+        ".".join(file.relative_to(root).with_suffix("").parts): file.read_bytes() for file in sorted(root.rglob("*.py"))
+    }
+
+
+if __name__ == "__main__":  # all, for tools/setup
+    progress.show_on(sys.stderr)
+    compile_kernels()

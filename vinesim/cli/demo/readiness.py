@@ -15,6 +15,8 @@ from vinesim.client.processes.ros_listener import RosListener
 
 POLL_PERIOD = 0.05
 """Wall time between two looks at what is still missing [s]."""
+PROGRESS_MARK = "vinesim: "
+"""Before what a process says of its progress."""
 LINE_PERIOD = 5.0
 """Wall time between two lines where no line can be updated [s]."""
 
@@ -48,14 +50,25 @@ def wait_until_ready(
             waited = time.monotonic() - begin
             if waited > timeout:
                 raise ProcessFailed(f"not ready after {timeout:.0f} s: {', '.join(missing)}")
-            show(f"waiting for: {', '.join(missing)} ({waited:.0f} s){_newest_progress(clients)}")
+            doing = progress_of(clients, newest)
+            show(f"{waited:3.0f} s: waiting for {', '.join(missing)}{f' ({doing})' if doing else ''}")
             time.sleep(POLL_PERIOD)
 
 
-def _newest_progress(clients: Mapping[str, Process]) -> str:
-    """What each client that is not ready says of its progress, such as the kernel that it compiles, or waits for."""
-    lines = (f"; {name}: {process.stderr_tail[-1]}" for name, process in clients.items() if process.stderr_tail)
-    return "".join(lines)
+def progress_of(clients: Mapping[str, Process], newest: Statuses) -> str:
+    """What the first client that waits for something says of it, such as how many kernels are compiled.
+
+    All clients wait for the same kernels. What else they print, such as warnings, is not for one who waits.
+    """
+    for name, process in clients.items():
+        if name in newest:  # it steps, and its sensors are to join
+            awaited = newest[name].get("sensors_awaited", [])
+            lines = [text for text in awaited if "compiling" in text]
+        else:
+            lines = [line for line in process.stderr_tail if line.startswith(PROGRESS_MARK)]
+        if lines:
+            return lines[-1].removeprefix(PROGRESS_MARK)
+    return ""
 
 
 @contextlib.contextmanager

@@ -65,9 +65,12 @@ class RobotProcesses:
             self._stack = stack.pop_all()
         self._restarts = RecentCounts()
 
-    def attach(self, client: Client, robot: Robot | None = None) -> None:
-        """Connect the processes with a robot of the client, its first unless given; waits until they are ready."""
-        self.sensors.attach(client, robot)
+    def attach(self, client: Client, robot: Robot | None = None, *, wait_for_sensors: bool = True) -> None:
+        """Connect the processes with a robot of the client, its first unless given.
+
+        Waits until the ROS node is ready, and unless otherwise asked the sensors; see :meth:`SensorProcess.attach`.
+        """
+        self.sensors.attach(client, robot, wait=wait_for_sensors)
         if self.ros is not None:
             self.ros.attach(client, robot)
 

@@ -103,15 +103,17 @@ class SensorProcess:
         self._visuals = VisualListSender()
         self._snapshot_count = self._pose_count = 0
 
-    def attach(self, client: Client, robot: Robot | None = None) -> None:
+    def attach(self, client: Client, robot: Robot | None = None, *, wait: bool = True) -> None:
         """Show the process the client's world from now on, as seen by its first robot unless ``robot`` is given.
 
-        Waits until the process has rendered a first picture of every sensor; :class:`WorkerError` if it fails.
+        Waits until the process has rendered a first picture of every sensor; :class:`WorkerError` if it fails. Without
+        ``wait`` the client may step meanwhile, and the error comes from the step after the failure.
         """
         self.client, self.robot = client, robot or client.robot
         self._write(client)
         self._wake()
-        self.worker.wait_until_ready(START_TIMEOUT)
+        if wait:
+            self.worker.wait_until_ready(START_TIMEOUT)
         client.holds.append(self.held)
         client.pace_limits.append(self.limit)
         client.post_step.append(self._after_step)
@@ -164,6 +166,7 @@ class SensorProcess:
 
     def _after_step(self, client: Client) -> None:
         """Write the next snapshot if it is due."""
+        self.worker.raise_failure()
         physics = client.physics
         self._moved_trees[physics.plants.awake] = self._moved_trees[physics.remotely_posed] = True
         if physics.tick % SNAPSHOT_PERIOD == 0 or self._is_overdue:

@@ -10,7 +10,7 @@ import pathlib
 import sys
 import time
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinesim import allocator
+from vinesim import allocator, progress
 from vinesim.client.sensing.picture_keeper import PictureKeeper
 from vinesim.client.sensing.rigid_visual_list import VisualListMessage, VisualListReceiver
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.worker_process import report_ready, serve
 from vinesim.client.world_time import OffsetHistory
+from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.physics.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
@@ -181,6 +182,18 @@ class SensorWorker:
     def _awaits(self, *parts: str) -> None:
         self.pipe.send(("awaited", parts))
 
+    @contextlib.contextmanager
+    def _awaiting_progress(self) -> Iterator[None]:
+        """Tell the client how far this process is with what takes long, which also shows that it does not hang."""
+        handler = logging.Handler()
+        handler.emit = lambda record: self._awaits(record.getMessage()) if record.getMessage() else None
+        progress.log.setLevel(logging.INFO)
+        progress.log.addHandler(handler)
+        try:
+            yield
+        finally:
+            progress.log.removeHandler(handler)
+
     # ------------------------------------------------------------------ construction
 
     def _open_node(self, stack: contextlib.ExitStack) -> SensorNode:
@@ -215,6 +228,9 @@ class SensorWorker:
         from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
 
         device = self._working_device()
+        with self._awaiting_progress():
+            compile_kernels(SENSOR_PACKAGES, device)
+        self._awaits("kernels and scene")
         if device == "cpu":
             load_kernels()
         config, sensors = self.config, []

@@ -276,6 +276,10 @@ class WorkerProcess(Generic[S]):
         """Wait for the first run to be ready; :class:`WorkerError` if it fails, or after ``timeout`` [s]."""
         if not self._first_result.wait(timeout):
             raise WorkerError(f"{self.title} was not ready within {timeout:.0f} s")
+        self.raise_failure()
+
+    def raise_failure(self) -> None:
+        """:class:`WorkerError` if the first run failed before it was ready; none follows it then. Waits for nothing."""
         if self._failure:
             raise WorkerError(f"{self.title} failed: {self._failure}")
 

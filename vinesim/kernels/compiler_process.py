@@ -1,0 +1,56 @@
+"""A process that compiles kernel modules for the CPU: it reads names of modules from its input, and answers each.
+
+Warp generates code and compiles it under locks, so that threads of one process compile one module at a time for most of
+the time. The process ends with its input, also while it compiles: none outlives the process that started it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import queue
+import shutil
+import sys
+import tempfile
+import threading
+
+
+def main() -> None:
+    """Answer each line, the name of a module, with a line of JSON: the folder of the compiled module, or the failure."""
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what else is printed goes to standard error
+    # of its own, so that what the compiler leaves there is deleted however the process ends
+    tempfile.tempdir = tempfile.mkdtemp(prefix="vinesim-compiler-")
+    names: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(names,), daemon=True).start()
+    while True:
+        name = names.get()
+        try:
+            answer = {"folder": _compile(name)}
+        except Exception as error:
+            answer = {"failure": f"{type(error).__name__}: {' '.join(str(error).split())}"}
+        with contextlib.suppress(BrokenPipeError):  # then the input has ended too
+            print(json.dumps(answer), file=answers, flush=True)
+
+
+def _read(names: queue.SimpleQueue[str]) -> None:
+    """Queue the lines of the input; end the process with it."""
+    for line in sys.stdin:
+        names.put(line.strip())
+    shutil.rmtree(tempfile.gettempdir(), ignore_errors=True)
+    os._exit(0)
+
+
+def _compile(name: str) -> str:
+    """Compile a module unless it is compiled already; its folder in Warp's cache."""
+    import warp as wp
+
+    module = wp.get_module(importlib.import_module(name).__name__)
+    wp.force_load("cpu", [module], max_workers=0)
+    return module.get_module_identifier(1)
+
+
+if __name__ == "__main__":
+    main()
