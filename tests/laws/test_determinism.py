@@ -10,6 +10,7 @@ import sys
 
 import numpy as np
 
+from tests.support.waiting import deadline
 from vinesim.bench import scenes as scenes
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
@@ -86,7 +87,7 @@ def test_two_runs_in_two_processes() -> None:
     path = os.pathsep.join([str(HERE.parents[2]), os.environ.get("PYTHONPATH", "")])
     runs = [
         subprocess.run(
-            [sys.executable, str(HERE)], capture_output=True, text=True, check=True, timeout=120,
+            [sys.executable, str(HERE)], capture_output=True, text=True, check=True, timeout=deadline(120.0),
             env=os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": path},
         ).stdout.splitlines()[-1]
         for seed in ("1", "2")

@@ -13,6 +13,7 @@ import pytest
 import zenoh
 
 from tests.support.live_server import ServerProcess, wait
+from tests.support.waiting import deadline
 from vinesim.bench import message_fuzz
 from vinesim.bench.message_fuzz import ATTACKER, storm
 from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, tree_row
@@ -318,6 +319,6 @@ for say in (b"GET / HTTP/1.1\\r\\n\\r\\n", os.urandom(4000), b"", b"\\xff" * 700
 """
     with ServerProcess("tcp/127.0.0.1:0") as server:
         host, port = server.endpoint.removeprefix("tcp/").split(":")
-        subprocess.run([sys.executable, "-c", code, host, port], check=True, timeout=300)
+        subprocess.run([sys.executable, "-c", code, host, port], check=True, timeout=deadline(300.0))
         with FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:
             assert ada.command()["trouble"] == ""

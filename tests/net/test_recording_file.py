@@ -18,7 +18,7 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
-from tests.support.waiting import TIMEOUT
+from tests.support.waiting import deadline
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import encode_human
 from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
@@ -58,7 +58,7 @@ def test_written_messages_are_read_bit_for_bit(tmp_path_factory, entries):
 
 def until(condition) -> None:
     """Wait for the writer thread."""
-    end = time.monotonic() + TIMEOUT
+    end = time.monotonic() + deadline()
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.support.waiting import deadline
+
 DEMO = [sys.executable, "-m", "vinesim", "demo", "--headless"]
 
 
@@ -31,7 +33,9 @@ def children_of(marker):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    done = subprocess.run([*DEMO, "--seconds", "20", "--out", str(out)], capture_output=True, text=True, timeout=900)
+    done = subprocess.run(
+        [*DEMO, "--seconds", "20", "--out", str(out)], capture_output=True, text=True, timeout=deadline(900.0)
+    )
     assert done.returncode == 0, done.stderr
     return out, json.loads((out / "summary.json").read_text())
 
@@ -128,7 +132,7 @@ def test_ctrl_c_ends_all_processes_of_a_background_demo(tmp_path):
         watchdog.cancel()
         assert children_of(str(out))
         demo.send_signal(signal.SIGINT)
-        _, rest = demo.communicate(timeout=120)
+        _, rest = demo.communicate(timeout=deadline())
     finally:
         demo.kill()
     assert demo.returncode == 130

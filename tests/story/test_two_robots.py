@@ -10,6 +10,8 @@ import threading
 import numpy as np
 import pytest
 
+from tests.support import programs
+from tests.support.waiting import deadline
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import QUEUE_SPACING, bunch_centres, find_reachable_bunch, spawn_pose, start_pose
@@ -20,7 +22,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
 DT = 0.01
-PROCESS_TIMEOUT = 300.0
+PROCESS_TIMEOUT = deadline(300.0)
 """Limit for a process to start or to end [s]; reached only by a failure."""
 
 
@@ -129,7 +131,7 @@ def test_each_robot_publishes_under_its_prefix():
     with contextlib.ExitStack() as stack:
         monitor, client = (
             stack.enter_context(
-                subprocess.Popen(
+                programs.Popen(
                     [sys.executable, "-m", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE, text=True,
                 )

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from tests.support.waiting import deadline
+
 TESTS = """
 import pytest
 
@@ -38,7 +40,7 @@ def test_tests_that_share_a_fixture_run_in_one_process(tmp_path: Path) -> None:
         "no:cacheprovider",
         str(tmp_path),
     ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=deadline(300.0))
     workers = re.findall(r"\[(gw\d)\] .* PASSED", done.stdout)
     assert len(workers) == 6, done.stdout + done.stderr
     assert len(set(workers)) == 1
