@@ -88,7 +88,24 @@ class NetworkTestbed:
             ),
             "all trees to rest",
         )  # fmt: skip
-        time.sleep(0.3)
+        self.wait_until_quiet()
+
+    def wait_until_quiet(self) -> None:
+        """What was on its way has arrived: no client sends or receives plants or events in ten ticks of each."""
+        last: dict[str, dict] = {}
+
+        def is_quiet() -> bool:
+            now = {name: client.command() for name, client in self.clients.items()}
+            if not last:
+                last.update(now)
+            if min(now[name]["ticks"] - last[name]["ticks"] for name in now) < 10:
+                return False
+            families = ("environment", "event")
+            same = all(now[name]["counters"][f] == last[name]["counters"][f] for name in now for f in families)
+            last.update(now)
+            return same
+
+        wait(is_quiet, "silence")
 
     def count(self) -> Window:
         """Count one window."""
@@ -196,10 +213,10 @@ def test_puts_without_subscribers_cost_nothing():
 def test_branch_touched_far_from_all_peers_costs_nothing(world):
     world.settle()
     world.command("ada", place=[55.0, 0.0])  # 25 m from cleo, 53 m from bob
-    time.sleep(0.3)
+    world.wait_until_quiet()
     idle, reads = world.count_idle(), world.command("ada")["reads"]
     world.command("ada", touch=list(range(50, 60)), swing=[49])
-    time.sleep(0.1)
+    wait(lambda: world.command("ada")["owner"].get("54") == "ada", "ada to own the tree")
     world.check_idle(idle, *world.clients)
     ada = world.command("ada")
     assert ada["owner"]["54"] == "ada"
@@ -241,7 +258,7 @@ def test_a_swinging_branch_is_received_and_a_resting_one_is_not(world):
     world.count_until(lambda window: window["bob"][1] > 700)
     world.command("ada", swing=[])
     wait(lambda: world.command("bob")["owner"]["0"] is None, "bob to receive the end of motion")
-    time.sleep(0.2)
+    world.wait_until_quiet()
     world.check_idle(idle, *world.clients)
 
 
@@ -318,7 +335,7 @@ def test_a_free_bunch_from_cut_to_ground_to_hand_to_box(world):
         before = {name: world.command(name) for name in world.clients}
         world.command("ada", lay={BUNCH: parent})
         wait(lambda: not world.command("bob")["facts"][str(BUNCH)]["moving"], "bob to receive the rest record")
-        time.sleep(0.2)
+        world.wait_until_quiet()
         resting = {name: world.command(name) for name in world.clients}
         assert resting["bob"]["facts"][str(BUNCH)]["parent"] == parent
         assert retained_count(before["ada"], resting["ada"], "messages_out") == 1
@@ -349,7 +366,7 @@ def test_a_carried_box_is_one_stream_and_a_box_on_a_robot_is_none(world):
         lambda: world.command("bob")["facts"].get(str(BOX), {}).get("parent") == "ada/base_link",
         "bob to receive the support",
     )
-    time.sleep(0.2)
+    world.wait_until_quiet()
     for step in range(5):  # the robot drives 2.5 m
         world.command("ada", place=[1.0, 0.5 * step])
         assert world.count()["bob"][1] == 0

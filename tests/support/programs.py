@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import functools
 import json
 import os
 import selectors
@@ -47,11 +46,17 @@ class _Server:
         self._process.wait()
 
 
-@functools.cache
+_starting = threading.Lock()
+_started: list[_Server] = []
+
+
 def _server() -> _Server:
-    server = _Server()
-    atexit.register(server.close)
-    return server
+    """The server of this process, which starts with the first program."""
+    with _starting:
+        if not _started:
+            _started.append(_Server())
+            atexit.register(_started[0].close)
+        return _started[0]
 
 
 class Popen:
