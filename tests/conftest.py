@@ -18,23 +18,9 @@ SKIPS_FAIL = bool(os.environ.get("CI"))
 skipped."""
 
 
-SLOW = (
-    "tests/cli/test_", "tests/docs/", "tests/laws/", "tests/story/", "tests/bench/", "tests/client/test_humans.py",
-    "tests/client/test_domain_randomizer.py", "tests/client/test_task_registry.py", "tests/net/test_replicator.py",
-    "tests/net/test_faults.py", "tests/net/test_replication_laws.py", "tests/net/test_wire.py",
-    "tests/net/test_zenoh_bus.py", "tests/robot/test_pick.py", "tests/robot/test_push.py",
-    "tests/robot/test_swap_boxes.py", "tests/scene/test_vineyard.py", "tests/sensors/test_camera_raster.py",
-    "tests/sensors/test_cuda_rasterizer.py", "tests/sensors/test_dataset.py",
-    "tests/sensors/test_taichi_rasterizer.py", "tests/test_examples.py",
-)  # fmt: skip
-"""Files and folders that ``make check`` leaves out: each takes more than about ten seconds."""
-
-
 @pytest.hookimpl(wrapper=True)  # else xdist reads the groups before they are there
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> Generator[None]:
     for item in items:
-        if item.nodeid.startswith(SLOW):
-            item.add_marker("slow")
         if item.get_closest_marker("xdist_group"):
             continue
         fixtures = item._fixtureinfo.name2fixturedefs.values()

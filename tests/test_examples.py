@@ -10,6 +10,8 @@ import pytest
 from tests.support import programs
 from tests.support.waiting import deadline
 
+pytestmark = pytest.mark.slow
+
 ROOT = pathlib.Path(__file__).parents[1]
 FILES = sorted((ROOT / "examples").glob("*.py"))
 MAX_LINES = 40

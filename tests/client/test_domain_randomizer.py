@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.support import sensor_scenes
 from vinesim.client.composition.domain_randomizer import FOOTPRINT_RADIUS, SceneRandomizer, random_composition
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
+
+pytestmark = pytest.mark.slow
 
 
 def test_placed_objects_do_not_overlap() -> None:

@@ -35,6 +35,8 @@ from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitives import Primitives
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
 FOREARM = np.array([0.2, 0.36, 0.885])
 """A point of vinebot's left forearm, at the origin with its arms at home."""

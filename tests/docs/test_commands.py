@@ -18,6 +18,8 @@ from vinesim.cli import app
 from vinesim.cli.bench import BENCHES
 from vinesim.tune import Experiment, load_specimen, measure
 
+pytestmark = pytest.mark.slow
+
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.S | re.M)
@@ -124,7 +126,6 @@ def pages_that_run() -> list:
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", pages_that_run())
 def test_the_short_commands_of_a_page_run(page, tmp_path):
     """In their order, in a folder that has the examples and the files that a reader brings along."""

@@ -16,6 +16,8 @@ from vinesim.scene.builder import TreeBuilder, assemble, solve_rest_pose
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
+pytestmark = pytest.mark.slow
+
 SHOOT, MASS = 0.5, 0.05
 """A shoot here: a rod [m] of a mass [kg] that stands on a joint with a spring; far up a tie holds it to a post."""
 STIFFNESS = np.array([15.0, 20.0, 20.0])

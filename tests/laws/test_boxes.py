@@ -14,6 +14,8 @@ from vinesim.physics.step import Physics
 from vinesim.scene.builder import GRAVITY, assemble
 from vinesim.scene.values import Drive, RobotSpec
 
+pytestmark = pytest.mark.slow
+
 WEIGHT = -GRAVITY[2]
 SIZE = (0.6, 0.4, 0.3)
 MASSES = (2.0, 3.0, 1.5, 2.5)

@@ -12,6 +12,8 @@ from vinesim.bench.mujoco_reference import MujocoScene
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 
+pytestmark = pytest.mark.slow
+
 FINGERS = ("left", "right")
 
 

@@ -15,6 +15,8 @@ from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Drive
 
+pytestmark = pytest.mark.slow
+
 
 def energy(physics: Physics) -> float:
     """Kinetic energy, weight and springs of all plants [J]."""

@@ -9,12 +9,15 @@ import subprocess
 import sys
 
 import numpy as np
+import pytest
 
 from tests.support.waiting import deadline
 from vinesim.bench import scenes as scenes
 from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
+
+pytestmark = pytest.mark.slow
 
 HERE = pathlib.Path(__file__)
 

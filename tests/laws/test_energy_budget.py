@@ -12,6 +12,8 @@ from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
+pytestmark = pytest.mark.slow
+
 G = 9.81
 
 

@@ -14,6 +14,8 @@ from vinesim.physics.plants.rollout import Rollout, Trajectory
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 
+pytestmark = pytest.mark.slow
+
 
 def forked() -> Model:
     """A cane that forks in space, a bunch on one arm; at the origin, where single precision is finest."""

@@ -17,6 +17,8 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
+pytestmark = pytest.mark.slow
+
 G = 9.81
 
 

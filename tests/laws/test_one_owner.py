@@ -16,6 +16,8 @@ from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import is_tree
 from vinesim.scene.values import RobotUpdate
 
+pytestmark = pytest.mark.slow
+
 TICK = 0.01
 DELAY, JITTER = 0.03, 0.02
 RTT = 2.0 * (DELAY + JITTER)

@@ -12,6 +12,8 @@ from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
 
+pytestmark = pytest.mark.slow
+
 RADIUS = 0.0014
 """[m] of a wire."""
 G = 9.81

@@ -15,6 +15,8 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 
+pytestmark = pytest.mark.slow
+
 MASS = 0.4
 
 

@@ -31,6 +31,8 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.scene.primitives import Primitives
 
+pytestmark = pytest.mark.slow
+
 G = 9.81
 BEYOND = 0.3
 """[m] from the tips of the shoots to their wire: no robot that presses on it is near them."""

@@ -16,6 +16,8 @@ from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
+pytestmark = pytest.mark.slow
+
 PIECES = 32
 SECOND_MOMENT = np.pi * 0.004**4 / 4
 

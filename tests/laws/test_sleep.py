@@ -18,6 +18,8 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 
+pytestmark = pytest.mark.slow
+
 WOOD = 8e9, 700.0
 
 

@@ -13,6 +13,8 @@ from vinesim.physics.parameters import PhysicsParameters
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import GRAVITY, assemble
 
+pytestmark = pytest.mark.slow
+
 MASSES = 0.4 + 0.03 * np.arange(10)
 CRATE = 2.0
 

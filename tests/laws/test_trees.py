@@ -17,6 +17,8 @@ from vinesim.scene.builder import GRAVITY, RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
 
 

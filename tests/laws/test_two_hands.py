@@ -17,6 +17,8 @@ from vinesim.physics.rigid.human_shapes import HAND_HALF_THICKNESS
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanPose
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
 RADIUS = 0.04
 """Of the bunch [m]."""

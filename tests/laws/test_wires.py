@@ -18,6 +18,8 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 
+pytestmark = pytest.mark.slow
+
 ARM, MASS, SPRING = 0.5, 0.05, 4.0
 """A shoot here: a rod [m] of a mass [kg] that leans on a joint [N m/rad]; its tip is tied to the wire."""
 LENGTH, TENSION = 2.0, 900.0

@@ -18,6 +18,8 @@ from tests.support import programs
 from tests.support.live_server import ServerProcess, wait
 from vinesim.bench.support.fake_client import FakeClientProcess
 
+pytestmark = pytest.mark.slow
+
 PLACES = {"ada": 1.0, "bob": 2.0, "cleo": 3.0, "dan": 2.5}
 SKEWS = {"ada": 2.0, "bob": -2.0}
 LEAVE_TIMEOUT = 2.5

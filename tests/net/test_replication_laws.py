@@ -15,6 +15,8 @@ from vinesim.net.replication import interest
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 
+pytestmark = pytest.mark.slow
+
 TICK = 0.01
 PLACES = {"ada": 1.0, "bob": 2.0, "cleo": 3.0, "dan": 2.5}
 BUNCHES = [object_id(ObjectKind.BUNCH, index) for index in range(3)]

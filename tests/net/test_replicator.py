@@ -24,6 +24,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate, TreeUpdate
 
+pytestmark = pytest.mark.slow
+
 TICK = 0.01
 TREES = 12
 """One tree a metre, from x = 0.5 m on."""

@@ -17,6 +17,8 @@ from vinesim.bench.support.fake_client import FakeClientProcess
 from vinesim.bench.support.network_emulator import Count, Link, NetworkEmulator
 from vinesim.scene.ids import ObjectKind, object_id
 
+pytestmark = pytest.mark.slow
+
 WINDOW = 1.0
 """Length of a counting window [s]."""
 

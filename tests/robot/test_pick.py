@@ -23,6 +23,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.spec import with_seed
 
+pytestmark = pytest.mark.slow
+
 GRAVITY = 9.81
 
 

@@ -17,6 +17,8 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene as load_scene
 
+pytestmark = pytest.mark.slow
+
 
 @functools.cache
 def yard() -> tuple[Model, SwapPlan]:

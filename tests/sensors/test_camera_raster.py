@@ -10,6 +10,8 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.export.images import look_at
 
+pytestmark = pytest.mark.slow
+
 SKEW = frames.normalize(np.array([0.3, 0.2, -0.4, 0.8]))
 
 

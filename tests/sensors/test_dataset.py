@@ -33,6 +33,8 @@ from vinesim.sensors.export import annotations, dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.spec_file import SensorError
 
+pytestmark = pytest.mark.slow
+
 IMAGES = 6  # of two vineyards
 LIFE = SceneRandomizer(0.5)
 SCENE = """
@@ -109,7 +111,6 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
     assert _files(out) == _files(whole)
 
 
-@pytest.mark.slow
 def test_a_killed_worker_is_one_line_and_the_same_command_goes_on(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:

@@ -12,6 +12,8 @@ from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.primitive_arrays import KINDS
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("taichi", reason="Taichi, the extra 'taichi', is not installed")
 taichi_rasterizer = pytest.importorskip("vinesim.sensors.raster.taichi_rasterizer")
 NEAR_PLANE = {

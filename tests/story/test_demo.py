@@ -13,6 +13,8 @@ import pytest
 
 from tests.support.waiting import deadline
 
+pytestmark = pytest.mark.slow
+
 DEMO = [sys.executable, "-m", "vinesim", "demo", "--headless"]
 
 
@@ -40,7 +42,6 @@ def run(tmp_path_factory):
     return out, json.loads((out / "summary.json").read_text())
 
 
-@pytest.mark.slow
 @pytest.mark.ros
 class TestDemo:
     def test_the_bunch_moves_within_one_tick_of_the_touch(self, run):
@@ -115,7 +116,6 @@ class TestDemo:
         assert children_of(str(out)) == []
 
 
-@pytest.mark.slow
 def test_ctrl_c_ends_all_processes_of_a_background_demo(tmp_path):
     out = tmp_path / "interrupted"
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for "vinesim demo &"; children inherit it

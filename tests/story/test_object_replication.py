@@ -23,6 +23,8 @@ from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.ids import ObjectKind, Organ, parse_object_name
 from vinesim.scene.values import HumanPose
 
+pytestmark = pytest.mark.slow
+
 
 def drive(client: Client, speed: float) -> None:
     client.pre_step[:] = [lambda time: client.robot.command_base(speed, 0.0, time)]

@@ -29,6 +29,8 @@ from vinesim.net.transport.access_control import Role
 from vinesim.net.transport.certificates import create as new_certificate
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
+pytestmark = pytest.mark.slow
+
 
 def command(*arguments: str) -> programs.Popen:
     return programs.Popen(

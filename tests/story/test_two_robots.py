@@ -21,6 +21,8 @@ from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
 PROCESS_TIMEOUT = deadline(300.0)
 """Limit for a process to start or to end [s]; reached only by a failure."""
@@ -118,7 +120,6 @@ def test_robots_of_one_client_start_side_by_side_then_in_a_queue():
     assert min(distances) > 1.1
 
 
-@pytest.mark.slow
 @pytest.mark.ros
 def test_each_robot_publishes_under_its_prefix():
     """A stock ROS node receives the topics of both, each under its own prefix, and one clock."""
