@@ -14,8 +14,8 @@ demo:
 test: lint # lint, types and the tests of every claim
 	@$(PYTEST)
 
-test-long: setup # what make test leaves out: more seeds, soaks, notebooks, more pages in a browser
-	@$(PYTEST) -m long
+test-long: setup # what make test leaves out: more seeds and examples, soaks, notebooks, more pages in a browser
+	@$(PYTEST) -m "long or hypothesis" --hypothesis-profile test-long
 
 check: lint # lint, types, structure and the fast tests
 	@$(PYTEST) -m "not slow and not long"

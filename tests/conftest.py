@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Generator
 
+import hypothesis
 import pytest
 
 if "PYTEST_XDIST_WORKER" in os.environ or "ROS_DOMAIN_ID" not in os.environ:
@@ -12,6 +13,10 @@ if "PYTEST_XDIST_WORKER" in os.environ or "ROS_DOMAIN_ID" not in os.environ:
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+hypothesis.settings.register_profile("test", max_examples=25, deadline=None)
+hypothesis.settings.register_profile("test-long", max_examples=300, deadline=None)
+hypothesis.settings.load_profile("test")
 
 SKIPS_FAIL = bool(os.environ.get("CI"))
 """In CI everything that tests need is installed, so a skip hides a missing part. Tests marked ``gpu`` may be

@@ -208,10 +208,11 @@ def energy_of_box(physics: Physics) -> float:
 
 
 @pytest.mark.parametrize(("radius", "mass"), [(0.004, 0.1), (0.0005, 0.1), *long((0.004, 0.2), (0.004, 1.0))])
-def test_a_crate_that_falls_beside_the_bases_of_canes_gains_no_energy(radius, mass):
+@pytest.mark.parametrize("seeds", [range(4), *long(range(4, 12))])
+def test_a_crate_that_falls_beside_the_bases_of_canes_gains_no_energy(radius, mass, seeds):
     """The ground lets go of a light crate that canes push, and the crate slides on it: neither holds it in place."""
     bases, gain = ((0.12, 0.0), (-0.1, 0.1), (0.0, -0.12)), []
-    for seed in range(12):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         canes = [upright(x + 0.01 * rng.normal(), y + 0.01 * rng.normal(), radius) for x, y in bases]
         at = frames.pose([0.02 * rng.normal(), 0.02 * rng.normal(), 0.02], frames.from_yaw(rng.normal()))

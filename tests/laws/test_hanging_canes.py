@@ -79,6 +79,7 @@ def test_what_hangs_from_a_tie_falls_asleep(pieces: int, tied: tuple[int, ...]) 
     raise AssertionError("still awake after 30 s")
 
 
+@pytest.mark.long
 def test_cut_shoots_of_the_demo_that_hang_from_ties_calm_down() -> None:
     """64 of its shoots are cut at a random joint: 30 s later nothing that hangs turns faster than ``sleep_rate``, and
     three in five of what hangs are asleep."""

@@ -7,7 +7,7 @@ import functools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim import frames
@@ -552,7 +552,6 @@ actions = st.lists(
 
 
 @given(actions, st.integers(0, 2**31), st.sampled_from([0.0, 0.02, 0.3]))
-@settings(max_examples=25, deadline=None)
 def test_any_sequence_of_actions_on_any_network_ends_with_one_owner(scenario, seed, loss):
     hub = MemoryHub(delay=0.03, jitter=0.02, loss=loss, seed=seed)
     clients = {name: Client(hub, name, x) for name, x in (("ada", 1.0), ("bob", 2.0), ("cleo", 3.0))}

@@ -283,7 +283,7 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
         robot.node.destroy_subscription(one)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_goals_from_another_process_end_as_they_should(robot: StockNode) -> None:
     """A small version of ``vinesim bench ros``: one goal to its end, one cancelled, one preempted; none is kept."""
     done = subprocess.run(
@@ -299,7 +299,7 @@ def test_goals_from_another_process_end_as_they_should(robot: StockNode) -> None
         assert row.ratio is None or row.ratio >= 1.0, row
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_resets_from_another_process_leave_nothing_behind(robot: StockNode) -> None:
     """A small version of the resets of ``vinesim bench ros``: spawned, driven and commanded before each."""
     done = subprocess.run(

@@ -62,6 +62,7 @@ def test_the_example_of_the_docs_fuses_pictures(folder: pathlib.Path, monkeypatc
     _assert_surface(names["mesh"].vertex.positions.numpy(), folder, 8.0 * VOXEL)  # Open3D's own
 
 
+@pytest.mark.long
 @pytest.mark.skipif(o3d.__version__ == "0.20.0", reason="its ScalableTSDFVolume integrates nothing")
 def test_the_older_volume_of_the_pinned_version_fuses_pictures(folder: pathlib.Path) -> None:
     volume = o3d.pipelines.integration.ScalableTSDFVolume(

@@ -70,6 +70,7 @@ def test_every_kind_is_seen(scene, raster) -> None:
     assert found == set(np.unique(scene.shapes.kind.numpy())) == set(KINDS.values())
 
 
+@pytest.mark.long
 def test_two_passes_find_what_one_finds(scene, raster) -> None:
     """As on a GPU without 64-bit atomics: depth first, then whose it is."""
     phased = taichi_rasterizer.TaichiRasterizer()
