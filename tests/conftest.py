@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import multiprocessing.forkserver
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 
 import hypothesis
 import pytest
@@ -41,6 +43,21 @@ def pytest_collection_modifyitems(items: list[pytest.Function]) -> Generator[Non
             if "ros" in item.keywords:
                 item.add_marker(skip)
     yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def processes_share_their_imports() -> Iterator[None]:
+    """The processes that a client starts are forked from one that has imported what they need: 1 to 2 s less each.
+
+    Real starts are the subject of tests/client/test_spawned_process.py, and clients of the command line have them.
+    """
+    from vinesim.client.sensing import spawned_process, worker_process
+
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([*spawned_process.sensor_modules(ros=False), spawned_process.SENSOR_REHEARSAL])
+    spawned_process.CONTEXT = worker_process.CONTEXT = context
+    yield
+    multiprocessing.forkserver._forkserver._stop()
 
 
 def _fail_if_skipped(report: pytest.TestReport | pytest.CollectReport) -> None:

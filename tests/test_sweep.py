@@ -49,7 +49,7 @@ def test_a_killed_process_loses_nothing(tmp_path, caplog):
     assert "died" in caplog.text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dask_workers_give_the_bits_of_local_processes_though_one_is_killed(tmp_path):
     """Two worker processes on the loopback, of which one is killed half-way through the third of eight tasks."""
     distributed = pytest.importorskip("distributed", reason="Dask is an extra (dask)")

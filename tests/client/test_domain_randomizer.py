@@ -40,6 +40,7 @@ def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
     assert results[0] == results[1] != results[2]
 
 
+@pytest.mark.long
 def test_wind_moves_the_plants() -> None:
     """Some leaves move by centimetres in wind, and none without."""
     model = sensor_scenes.demo()

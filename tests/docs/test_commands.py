@@ -27,6 +27,8 @@ RUNS = ("certs ", "experiment ", "render ", "replay run.mcap --out ", "replay ru
 """How commands begin that end by themselves, in seconds."""
 ELSEWHERE = {"docs/gradients.md", "docs/sensors.md", "README.md"}
 """Pages whose Python other tests run: test_gradients, test_reconstruction, test_docs."""
+LONG = {"docs/tuning.md", "docs/tutorials/research.md"}
+"""Pages whose commands compute for long; tests/tune has the same in short."""
 
 
 def shell_lines(page: pathlib.Path) -> list[str]:
@@ -122,7 +124,10 @@ def pages_that_run() -> list:
         lines = [line for line in commands_of(page) if line.startswith(RUNS)]
         marks = [pytest.mark.ros] if any("--ros" in line for line in lines) else []
         if lines:
-            found.append(pytest.param(page, id=str(page.relative_to(ROOT)), marks=marks))
+            name = str(page.relative_to(ROOT))
+            if name in LONG:
+                marks.append(pytest.mark.long)
+            found.append(pytest.param(page, id=name, marks=marks))
     return found
 
 
@@ -164,6 +169,7 @@ def python_pages() -> list[pathlib.Path]:
     ]  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", python_pages(), ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_python_of_a_page_runs(page, tmp_path):
     (tmp_path / "examples").symlink_to(ROOT / "examples")

@@ -14,6 +14,7 @@ import zenoh
 
 from tests.support import programs
 from tests.support.live_server import ServerProcess, wait
+from tests.support.long_rows import long
 from tests.support.waiting import deadline
 from vinesim.bench import message_fuzz
 from vinesim.bench.message_fuzz import ATTACKER, storm
@@ -133,7 +134,7 @@ def robot_client(hub: MemoryHub, now: list[float]) -> tuple[Client, np.ndarray]:
     return client, pose
 
 
-@pytest.mark.parametrize("kind", ["robot", "human"])
+@pytest.mark.parametrize("kind", ["human", *long("robot")])
 def test_a_client_with_physics_survives_malformed_messages(kind):
     """Valid messages may still be absurd (trees turned inside out, boxes in the sky): the state stays finite."""
     hub, now = MemoryHub(), [10.0]

@@ -7,9 +7,10 @@ import functools
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.examples import share
 from vinesim import frames
 from vinesim.net.codec import control, messages
 from vinesim.net.codec.messages import Hello
@@ -551,6 +552,7 @@ actions = st.lists(
 )  # fmt: skip
 
 
+@settings(max_examples=share(0.3))
 @given(actions, st.integers(0, 2**31), st.sampled_from([0.0, 0.02, 0.3]))
 def test_any_sequence_of_actions_on_any_network_ends_with_one_owner(scenario, seed, loss):
     hub = MemoryHub(delay=0.03, jitter=0.02, loss=loss, seed=seed)

@@ -41,6 +41,7 @@ def tick(task: SwapBoxes) -> None:
     task.physics.step()
 
 
+@pytest.mark.long
 def test_a_full_box_is_exchanged_for_an_empty_one():
     task = start_task()
     model, swap = yard()

@@ -111,6 +111,7 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
     assert _files(out) == _files(whole)
 
 
+@pytest.mark.long
 def test_a_killed_worker_is_one_line_and_the_same_command_goes_on(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:

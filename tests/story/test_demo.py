@@ -116,6 +116,7 @@ class TestDemo:
         assert children_of(str(out)) == []
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_all_processes_of_a_background_demo(tmp_path):
     out = tmp_path / "interrupted"
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for "vinesim demo &"; children inherit it

@@ -371,6 +371,7 @@ def test_a_box_stays_when_the_robot_that_carries_it_leaves():
     np.testing.assert_allclose(record.pose[:2], deck[:2], atol=0.1)
 
 
+@pytest.mark.long
 def test_a_bunch_pulled_off_carried_and_dropped_by_a_human_is_replicated():
     """F74, F76 by hand: pulled off, replicated while it is carried, falls when a still hand opens."""
     weak = vineyard.__wrapped__()

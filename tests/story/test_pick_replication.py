@@ -24,6 +24,7 @@ DT = 0.01
 GRAVITY = 9.81
 
 
+@pytest.mark.long
 def test_a_picked_bunch_is_in_the_box_with_its_weight_on_the_other_client():
     now = [100.0]
     scene = with_seed(load_scene("harvest"), 7)

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.support.waiting import deadline
 
 TESTS = """
@@ -22,6 +24,7 @@ def test_that_shares(costly, i):
 """
 
 
+@pytest.mark.long
 def test_tests_that_share_a_fixture_run_in_one_process(tmp_path: Path) -> None:
     """pytest 9.2 ignored the groups that pytest-xdist 3.8 sets, without a word."""
     conftest = (Path(__file__).parents[1] / "conftest.py").read_text()

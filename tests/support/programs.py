@@ -139,13 +139,17 @@ class Popen:
         self.send_signal(signal.SIGKILL)
 
     def communicate(self, input: str | None = None, timeout: float | None = None) -> tuple[str | None, str | None]:
-        """All output, after the end. :raises subprocess.TimeoutExpired: if it runs longer than ``timeout`` [s]."""
+        """All output that was not read yet, after the end.
+
+        :raises subprocess.TimeoutExpired: if it runs longer than ``timeout`` [s].
+        """
         end = None if timeout is None else time.monotonic() + timeout
         if self.stdin is not None and not self.stdin.closed:
             with contextlib.suppress(BrokenPipeError):
                 self.stdin.write(input or "")
                 self.stdin.close()
-        texts: dict[IO, list[str]] = {pipe: [] for pipe in (self.stdout, self.stderr) if pipe is not None}
+        pipes = self.stdout, self.stderr
+        texts: dict[IO, list[str]] = {pipe: [] for pipe in pipes if pipe is not None and not pipe.closed}
         readers = [
             threading.Thread(target=lambda p=pipe, t=texts[pipe]: t.append(p.read()), daemon=True) for pipe in texts
         ]
@@ -158,7 +162,7 @@ class Popen:
         self.wait(None if end is None else max(end - time.monotonic(), 0.0))
         for pipe in texts:
             pipe.close()
-        out, err = ("".join(texts[pipe]) if pipe is not None else None for pipe in (self.stdout, self.stderr))
+        out, err = ("".join(texts.get(pipe, [])) if pipe is not None else None for pipe in pipes)
         return out, err
 
     def __enter__(self) -> Popen:
