@@ -84,6 +84,7 @@ def test_gradient_is_the_slope_of_the_loss(ticks: int, checkpoint: int) -> None:
     assert sum(terms) == pytest.approx(0.0, abs=1e-4 * max(map(abs, terms)))
 
 
+@pytest.mark.long
 def test_gradient_by_initial_pose_load_and_fast_motion() -> None:
     """phi = 1 while a joint turns fast is the same in the adjoint; a turn of the first pose; a steady wrench."""
     model = forked()

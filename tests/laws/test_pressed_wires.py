@@ -238,7 +238,7 @@ def test_wires_bear_the_same_when_an_actor_joins_and_leaves() -> None:
     np.testing.assert_array_equal(*found)
 
 
-@pytest.mark.parametrize("below", [0.0, 0.1])
+@pytest.mark.parametrize("below", [0.1, *long(0.0)])
 def test_a_cane_on_a_wire_and_a_robot_under_it(below: float) -> None:
     """A cut cane lies across a wire which a robot lifts with 12 N, ``below`` [m] from it: one solve has the cane, the
     other the robot, and still the wire lies where both deflect it to; nothing swings."""

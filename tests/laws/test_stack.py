@@ -144,6 +144,7 @@ def test_contacts_add_no_speed(seed):
     assert rigid.mj_data.joint("box/0").qpos[2] == pytest.approx(0.0, abs=2e-3)
 
 
+@pytest.mark.long
 def test_two_runs_are_bitwise_equal():
     ends = []
     for _ in range(2):

@@ -253,6 +253,7 @@ def test_a_shoot_does_not_bear_on_the_wire_that_its_tie_is_bound_to() -> None:
         assert bool(tips(physics)[1, 2] < -0.015) is is_tied
 
 
+@pytest.mark.long
 def test_pulled_shoots_of_the_demo_gain_no_energy_at_the_shipped_phi() -> None:
     """Every sixth shoot pulled with 2 N, across or down, and released without damping, wind or contacts: no budget
     holds trees on wires, but over 10 s they never have more than at the start, and calm down."""

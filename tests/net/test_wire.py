@@ -212,6 +212,7 @@ def test_puts_without_subscribers_cost_nothing():
         assert max(map(max, pairs)) < 0.01 * 30_000 * 70, "none of the pairs has the cost of puts that are sent"
 
 
+@pytest.mark.long
 def test_branch_touched_far_from_all_peers_costs_nothing(world):
     world.settle()
     world.command("ada", place=[55.0, 0.0])  # 25 m from cleo, 53 m from bob
@@ -241,6 +242,7 @@ def test_branch_is_received_only_by_clients_near_it(world):
     world.check_idle(idle, "cleo")
 
 
+@pytest.mark.long
 def test_a_client_that_comes_near_receives_and_one_that_leaves_does_not(world):
     world.settle()
     world.command("ada", touch=[0])
@@ -278,6 +280,7 @@ def test_motion_by_wind_is_not_sent(world):
             assert after[family]["messages_out"] == before[name][family]["messages_out"]
 
 
+@pytest.mark.long
 def test_poses_are_received_at_60_hz_near_and_at_5_hz_far(world):
     world.settle()
     found = []
@@ -351,6 +354,7 @@ def test_a_free_bunch_from_cut_to_ground_to_hand_to_box(world):
     assert retained_count(start["cleo"], world.command("cleo"), "bytes_in") == 0, "a client 29 m away received a record"
 
 
+@pytest.mark.long
 def test_a_carried_box_is_one_stream_and_a_box_on_a_robot_is_none(world):
     """F79, F80: one stream for the box, none for its contents; nothing on a robot that drives, which does not move it
     in its own frame (the pose of the box follows from the record that names its support)."""
@@ -375,6 +379,7 @@ def test_a_carried_box_is_one_stream_and_a_box_on_a_robot_is_none(world):
     assert world.command("bob")["facts"][str(BOX)]["parent"] == "ada/base_link"
 
 
+@pytest.mark.long
 def test_one_owner_again_after_five_seconds_without_a_link(world, record_property):
     world.settle()
     ada, bob = world.clients["ada"], world.clients["bob"]

@@ -350,6 +350,7 @@ def test_a_damaged_file_makes_its_image_missing(whole: pathlib.Path, tmp_path: p
     assert dataset.missing_images(out, IMAGES) == [3]
 
 
+@pytest.mark.long
 def test_the_same_command_renders_damaged_images_again(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:

@@ -268,6 +268,7 @@ def test_every_kind_of_moving_object_is_replicated():
     assert set(ObjectKind) == {ObjectKind.TREE, ObjectKind.BUNCH, ObjectKind.BOX}
 
 
+@pytest.mark.long
 def test_two_runs_are_bitwise_equal():
     def scenario() -> bytes:
         world, ada, bob = two_clients()

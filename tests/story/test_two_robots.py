@@ -102,6 +102,7 @@ def test_two_robots_of_one_client_are_two_actors_for_others():
     assert farm.replicators["farm_2"].counters.environment.bytes_out > 0
 
 
+@pytest.mark.long
 def test_two_robots_of_one_client_send_each_other_no_plants():
     """With the visitor 20 m away, one robot touches a vine beside the other robot of its client: no byte is sent."""
     world = TwoRobots(visitor_back=20.0)

@@ -136,7 +136,7 @@ def run_track(recording: pathlib.Path, out: pathlib.Path, markers: list[str] = M
 
 
 @pytest.mark.parametrize(
-    "kind", ["rgb8, metres", "data set with a rate", *long("bgr8, millimetres, a folder", "data set")]
+    "kind", ["rgb8, metres", *long("data set with a rate", "bgr8, millimetres, a folder", "data set")]
 )
 def test_from_recorded_pictures_to_a_plant_file_by_commands_alone(
     kind: str, swing: Trajectory, pictures: Pictures, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture
