@@ -6,16 +6,19 @@ OUT = out
 JOBS = 2
 PYTEST = .venv/bin/python -m pytest -n $(JOBS) --dist loadgroup
 
-.PHONY: demo test check lint docs validation setup clean
+.PHONY: demo test test-long check lint docs validation setup clean
 demo:
 	@PYTHON=$(PYTHON) tools/setup run
 	@.venv/bin/vinesim demo --seconds $(SECONDS) --seed $(SEED) --out $(OUT) $(ARGS)
 
-test: lint # lint, types and all tests
+test: lint # lint, types and the tests of every claim
 	@$(PYTEST)
 
+test-long: setup # what make test leaves out: more seeds and examples, soaks, notebooks, more pages in a browser
+	@$(PYTEST) -m "long or hypothesis" --hypothesis-profile test-long
+
 check: lint # lint, types, structure and the fast tests
-	@$(PYTEST) -m "not slow"
+	@$(PYTEST) -m "not slow and not long"
 
 lint: setup
 	@.venv/bin/ruff check .

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from tests.support.waiting import deadline
+
 MEASURE = """
 import sys
 import numpy as np
@@ -54,5 +56,7 @@ print(len(blocks))
 @pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="needs /proc of Linux")
 def test_gaps_in_the_heap_are_given_back_in_time() -> None:
     """Of 100 MiB of small blocks one in four stays; the gaps are gone without a call."""
-    done = subprocess.run([sys.executable, "-c", GAPS], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", GAPS], capture_output=True, text=True, check=True, timeout=deadline(60.0)
+    )
     assert int(done.stdout) == 200

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import vinesim
+from tests.support.waiting import deadline
 from vinesim import frames
 from vinesim.errors import UsageError
 from vinesim.net.codec import messages
@@ -384,13 +385,13 @@ def test_the_vineyard_of_a_client_in_a_cell_of_a_notebook():
         page = client.page()
         (address,) = re.findall(r'<iframe src="([^"]+)"', page._repr_html_())
         assert address.startswith(page.address)
-        with urllib.request.urlopen(address, timeout=60.0) as answer:
+        with urllib.request.urlopen(address, timeout=deadline(60.0)) as answer:
             assert b"vinesim" in answer.read()
             assert "frame-ancestors" not in answer.headers["Content-Security-Policy"]
             assert "X-Frame-Options" not in answer.headers
         client.step()
     with pytest.raises(urllib.error.URLError, match="refused"):  # the page ends with the client
-        urllib.request.urlopen(address, timeout=60.0)
+        urllib.request.urlopen(address, timeout=deadline(60.0))
 
 
 # ---------------------------------------------------------------- robots

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import pathlib
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 
+from tests.support import programs
+from tests.support.waiting import deadline
 from vinesim.cli.client_session import save_report
 from vinesim.cli.demo.progress import PICKER
 from vinesim.cli.demo.summary import write_summary
@@ -55,7 +56,7 @@ def test_a_summary_is_written_before_pictures_that_find_no_room(tmp_path):
 def test_a_client_whose_folder_cannot_be_made_says_so_at_once(role, tmp_path):
     (tmp_path / "file").write_text("")
     command = [sys.executable, "-m", "vinesim", "client", "--role", role, "--out", str(tmp_path / "file" / "out")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = programs.run(command, timeout=deadline(300.0))
     assert done.returncode == 5
     assert done.stderr.splitlines()[-1].startswith(f"vinesim: {tmp_path / 'file' / 'out'} cannot be written: Not a dir")
     assert "Traceback" not in done.stderr

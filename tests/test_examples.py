@@ -1,13 +1,16 @@
 """Every example runs unchanged, uses only ``import vinesim``, has at most forty lines and prints its result."""
 
 import ast
-import os
 import pathlib
 import re
-import subprocess
 import sys
 
 import pytest
+
+from tests.support import programs
+from tests.support.waiting import deadline
+
+pytestmark = pytest.mark.slow
 
 ROOT = pathlib.Path(__file__).parents[1]
 FILES = sorted((ROOT / "examples").glob("*.py"))
@@ -16,11 +19,9 @@ MAX_LINES = 40
 
 def run(name: str, folder: pathlib.Path, *arguments: str) -> str:
     """Output of an example, run in its own folder."""
-    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / name), *arguments],
-        cwd=folder, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=240, check=False,
-    )  # fmt: skip
+    done = programs.run(
+        [sys.executable, str(ROOT / "examples" / name), *arguments], cwd=folder, timeout=deadline(240.0)
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -10,7 +10,7 @@ import pytest
 
 import vinesim
 from tests.support.sweep_tasks import die_at_three, die_once, fail_at_three, square, swing
-from tests.support.waiting import TIMEOUT, wait
+from tests.support.waiting import deadline, wait
 from vinesim.api.sweep import WorkerLost
 
 
@@ -31,7 +31,7 @@ def test_an_error_on_an_executor_cancels_what_has_not_begun():
         begun.append(number)
         if number == 0:
             raise ValueError("zero is not taken")
-        ended.wait(TIMEOUT)
+        ended.wait(deadline())
 
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         with pytest.raises(ValueError, match="zero is not taken"):
@@ -49,7 +49,7 @@ def test_a_killed_process_loses_nothing(tmp_path, caplog):
     assert "died" in caplog.text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dask_workers_give_the_bits_of_local_processes_though_one_is_killed(tmp_path):
     """Two worker processes on the loopback, of which one is killed half-way through the third of eight tasks."""
     distributed = pytest.importorskip("distributed", reason="Dask is an extra (dask)")

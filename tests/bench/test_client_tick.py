@@ -23,6 +23,7 @@ def test_a_tick_is_the_sum_of_its_parts_and_has_a_budget(monkeypatch: pytest.Mon
     assert whole.ratio == pytest.approx(1.2 / whole.value)
 
 
+@pytest.mark.long
 def test_the_measured_client_pushes_and_sends_updates() -> None:
     scene = load_scene("demo")
     with contextlib.ExitStack() as stack:

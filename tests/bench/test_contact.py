@@ -10,6 +10,7 @@ from vinesim.bench import contact as bench
 from vinesim.cli.bench import BENCHES
 
 
+@pytest.mark.long
 def test_every_tick_is_divided_into_mujoco_vinesim_and_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "SCENE", "demo")
     monkeypatch.setattr(bench, "MEASURED_STEPS", 20)

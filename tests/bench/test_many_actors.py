@@ -8,7 +8,7 @@ from vinesim.bench.many_actors import run_crowd
 from vinesim.robot.description.loader import load_description
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_all_clients_of_a_crowd_agree_on_what_its_actors_moved():
     """26 robots and people of two clients, each with a body on both: every bunch was picked, every box pushed."""
     found = run_crowd(26, load_description("vinebot"), clients=2)

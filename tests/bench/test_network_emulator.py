@@ -12,6 +12,7 @@ import time
 import pytest
 
 from tests.support.live_server import require_network_emulation, wait
+from tests.support.waiting import deadline
 from vinesim.bench.support import network_emulator
 from vinesim.bench.support.network_emulator import Count, Link, LinkProfile, NetworkEmulator
 
@@ -54,7 +55,7 @@ def _links():
 def probe(net: NetworkEmulator, end: str, count: int, *flood: str) -> tuple[list[float], int]:
     command = [sys.executable, "-c", PROBE, net.hub(end), str(count), *flood]
     process = net.start(end, command, stdout=subprocess.PIPE, text=True)
-    trips, answered = json.loads(process.communicate(timeout=120)[0])
+    trips, answered = json.loads(process.communicate(timeout=deadline())[0])
     return trips, answered
 
 

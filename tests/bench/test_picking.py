@@ -37,6 +37,7 @@ def test_success_is_counted_over_all_and_by_class():
     assert values["failed in phase advance"] == values["other bunches that came off"] == 1.0
 
 
+@pytest.mark.long
 def test_narrow_bunches_are_tried_as_well_and_the_freest_is_the_one_that_a_job_takes():
     scene = with_seed(load_scene("harvest"), 7)
     model, near = generate(scene), spawn_pose(scene, 0)[:2]

@@ -8,7 +8,7 @@ from tests.support.live_server import require_network_emulation
 from vinesim.bench.poor_link import run_poor_link
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_link_of_50_ms_that_loses_2_percent_is_not_a_dead_one():
     """On a busy machine the process that emulates the link may stand still for longer than the lease: three tries."""
     require_network_emulation()

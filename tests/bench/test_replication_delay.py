@@ -9,6 +9,7 @@ from vinesim.bench import replication_delay
 from vinesim.bench.replication_delay import buffered, count_reversals, extrapolation
 
 
+@pytest.mark.long
 def test_local_contact_acts_at_once_and_a_remote_authority_a_round_trip_later():
     """F12, F68, F81, F87."""
     rows = replication_delay.one_push(0.05)

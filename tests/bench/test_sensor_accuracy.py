@@ -39,6 +39,7 @@ def test_a_lidar_with_errors_loses_some_returns_and_mixes_some() -> None:
     assert len(scan.real) == pytest.approx(scan.returned * len(scan.exact))
 
 
+@pytest.mark.long
 def test_renderers_agree_with_ray_casting(tmp_path) -> None:
     model = generate(load_scene("demo"))
     pictures = sensor_accuracy.compare_renderers(CameraSpec.load("d435"), model, rest_snapshot(model))
@@ -53,6 +54,7 @@ def test_renderers_agree_with_ray_casting(tmp_path) -> None:
     assert (tmp_path / "sensors-backends.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 def test_pictures_are_drawn(tmp_path) -> None:
     spec = CameraSpec.load("d435")
     one = DepthStatistics({0.5: 0.001, 2.0: 0.02}, {0.5: 1.0, 2.0: 0.9})

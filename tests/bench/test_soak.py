@@ -117,7 +117,7 @@ def test_a_client_that_ends_badly_does_not_cost_the_figures(tmp_path: pathlib.Pa
     }  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_short_run_is_clean(monkeypatch) -> None:
     """One robot, one person and a recorder, six samples: hardly a thread or a file more, nothing malformed."""
     monkeypatch.setattr(soak, "SAMPLE_PERIOD", 2.0)

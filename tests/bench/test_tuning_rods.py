@@ -12,6 +12,7 @@ from vinesim.bench.tuning_cases import draw_case
 from vinesim.tune import measure
 
 
+@pytest.mark.long
 def test_the_rod_begins_in_the_equilibrium_of_the_cane() -> None:
     case = draw_case(0)
     nodes, tangents = tuning_rods._held_shape(case)
@@ -24,6 +25,7 @@ def test_the_rod_begins_in_the_equilibrium_of_the_cane() -> None:
     np.testing.assert_allclose(nodes[-1], held, atol=5e-4)
 
 
+@pytest.mark.long
 def test_the_rod_swings_as_the_cane_does() -> None:
     if not tuning_rods.is_installed():
         pytest.skip("PyElastica is not installed")

@@ -12,6 +12,8 @@ import threading
 import pytest
 import warp as wp
 
+from tests.support import programs
+from tests.support.waiting import deadline
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.server.admission import SceneId
@@ -19,14 +21,12 @@ from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 CANE = str(pathlib.Path(__file__).parents[2] / "examples/cane.toml")
-TIMEOUT = 300.0
+TIMEOUT = deadline(300.0)
 """Limit for a command [s]; reached only by a failure."""
 
 
 def vinesim(*arguments, cwd=None):
-    return subprocess.run(
-        [sys.executable, "-m", "vinesim", *arguments], capture_output=True, text=True, timeout=TIMEOUT, cwd=cwd
-    )
+    return programs.run([sys.executable, "-m", "vinesim", *arguments], timeout=TIMEOUT, cwd=cwd)
 
 
 def assert_refused(done, code, *reasons):
@@ -168,7 +168,7 @@ def test_recording_needs_a_server_and_a_writable_file(tmp_path):
 def test_a_second_actor_of_one_name_is_refused():
     with Server("tcp/127.0.0.1:0") as server:
         arguments = ["client", "--connect", server.endpoint, "--name", "twin", "--no-ros", "--status", "json"]
-        first = subprocess.Popen(
+        first = programs.Popen(
             [sys.executable, "-m", "vinesim", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         try:
@@ -183,7 +183,7 @@ def test_a_second_actor_of_one_name_is_refused():
 @contextlib.contextmanager
 def running_server(*arguments):
     """A server process and its first line."""
-    process = subprocess.Popen(
+    process = programs.Popen(
         [sys.executable, "-m", "vinesim", "server", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True,
     )  # fmt: skip
@@ -345,7 +345,7 @@ def test_three_roles_join_one_server_each_in_its_own_process():
         ):
             command = [sys.executable, "-m", "vinesim", *common, "--role", role, "--name", name, *options]
             clients[name] = stack.enter_context(
-                subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+                programs.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
             )
             stack.callback(clients[name].kill)
         expected = {"picker": ["eva"], "eva": ["picker"], "guest": ["eva", "picker"]}

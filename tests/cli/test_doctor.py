@@ -5,21 +5,19 @@ import json
 import os
 import pathlib
 import socket
-import subprocess
 import sys
 import time
 
 import pytest
 
+from tests.support import programs
 from vinesim.cli.doctor import command, machine, software
 from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding
 from vinesim.ros import dead_segments
 
 
 def test_every_check_gives_one_line_and_json_says_the_same():
-    done = subprocess.run(
-        [sys.executable, "-m", "vinesim", "doctor", "--json"], capture_output=True, text=True, check=False
-    )
+    done = programs.run([sys.executable, "-m", "vinesim", "doctor", "--json"])
     report = json.loads(done.stdout)
     assert [each["check"] for each in report["checks"]] == [
         "python", "packages", "cpu", "gpu", "ros", "page", "certificates", "ports", "shared memory", "datagrams",

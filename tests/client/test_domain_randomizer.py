@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.support import sensor_scenes
 from vinesim.client.composition.domain_randomizer import FOOTPRINT_RADIUS, SceneRandomizer, random_composition
 from vinesim.physics.parameters import PhysicsParameters
 from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
+
+pytestmark = pytest.mark.slow
 
 
 def test_placed_objects_do_not_overlap() -> None:
@@ -37,6 +40,7 @@ def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
     assert results[0] == results[1] != results[2]
 
 
+@pytest.mark.long
 def test_wind_moves_the_plants() -> None:
     """Some leaves move by centimetres in wind, and none without."""
     model = sensor_scenes.demo()

@@ -233,6 +233,7 @@ def test_a_reset_of_the_state_keeps_what_was_spawned_where_it_was_spawned(world)
     assert world.names == {"cart", "box_0", "box_1", "bunch_00000"}
 
 
+@pytest.mark.long
 def test_resets_leave_nothing_behind(world):
     """Neither the physics before nor threads; counts of faults go on."""
     physics, threads = [], threading.active_count()

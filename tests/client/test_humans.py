@@ -9,6 +9,7 @@ import pytest
 
 from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
+from tests.support.long_rows import long
 from vinesim import frames
 from vinesim.avatar.leg_estimator import LegEstimator
 from vinesim.avatar.scripted_human import ScriptedHuman
@@ -34,6 +35,8 @@ from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitives import Primitives
+
+pytestmark = pytest.mark.slow
 
 DT = 0.01
 FOREARM = np.array([0.2, 0.36, 0.885])
@@ -348,7 +351,7 @@ class PushingHuman:
         return self.human.replicator.counters.force.bytes_out
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.02, 0.05, 0.1])
+@pytest.mark.parametrize("delay", [0.05, *long(0.0, 0.02, 0.1)])
 def test_a_push_on_the_copy_acts_on_the_robot(vinebot, delay):
     """F05, F92, F93: the human's client computes the contact at once; the robot's client applies its force a latency
     later, and joint efforts balance it. At rest both have the same force at any latency."""

@@ -138,6 +138,7 @@ def test_the_process_that_stands_by_takes_the_place_of_a_killed_one(robot, monke
     robot.run_for_pictures(2)
 
 
+@pytest.mark.long
 def test_pictures_go_on_when_the_process_that_stands_by_is_killed(robot, monkeypatch):
     monkeypatch.setattr(worker_process, "STANDBY_DELAY", 0.0)
     monkeypatch.setattr(worker_process, "LONGEST_PAUSE", 0.0)
@@ -155,6 +156,7 @@ def test_pictures_go_on_when_the_process_that_stands_by_is_killed(robot, monkeyp
     robot.run_for_pictures(1)
 
 
+@pytest.mark.long
 def test_pictures_go_on_after_a_process_that_hangs(robot, monkeypatch):
     robot.run_for_pictures(1)
     monkeypatch.setattr(worker_process, "HANG_TIMEOUT", 3)
@@ -173,6 +175,7 @@ def test_a_picture_that_finds_no_room_is_one_line_and_the_process_goes_on(robot,
     assert robot.sensors.report()["sensor_restarts"] == 0
 
 
+@pytest.mark.long
 def test_repeated_failures_are_logged_twice_and_counted(robot, caplog, monkeypatch):
     monkeypatch.setattr(worker_process, "LONGEST_PAUSE", 0.0)
     caplog.set_level(logging.WARNING)

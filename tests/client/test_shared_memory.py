@@ -7,6 +7,7 @@ import multiprocessing
 import numpy as np
 import pytest
 
+from tests.support.waiting import deadline
 from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
 from vinesim.client.sensing.shared_queue import SharedQueue
 
@@ -35,7 +36,7 @@ def forward_snapshots(snapshot, pipe):
     pipe.send("ready")
     numbers = []
     while not numbers or numbers[-1] >= 0:
-        if snapshot.wait(5.0):
+        if snapshot.wait(deadline(5.0)):
             with snapshot.reading() as arrays:
                 number, values = int(arrays["number"][0]), arrays["values"].copy()
             assert (values == number).all()

@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import subprocess
 import sys
 
+import pytest
+
 from tests.support.waiting import wait
-from vinesim.client.sensing.spawned_process import CONTEXT, spawn, start_early
+from vinesim.client.sensing import spawned_process
+from vinesim.client.sensing.spawned_process import spawn, start_early
 
 MODULES = ("json", "a_module.that_is_missing", "tests.client.test_spawned_process")
+
+
+CONTEXT = multiprocessing.get_context("spawn")
+
+
+@pytest.fixture(autouse=True)
+def real_starts(monkeypatch):
+    """Not those of other tests, which share their imports."""
+    monkeypatch.setattr(spawned_process, "CONTEXT", CONTEXT)
 
 
 def report(lock, words, pipe):

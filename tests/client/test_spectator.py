@@ -54,6 +54,7 @@ def watch(recording: Recording) -> tuple[list[bytes], dict[int, np.ndarray]]:
     return states, tree
 
 
+@pytest.mark.long
 def test_two_replays_move_the_trees_equally(bent):
     (first, tree), (second, _) = watch(bent), watch(bent)
     assert first == second

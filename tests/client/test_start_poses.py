@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from tests.support.long_rows import long
 from vinesim import frames
 from vinesim.client.tasks import start_poses
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
 
 
-@pytest.mark.parametrize("seed", [0, 6, 11, 14, 29])
+@pytest.mark.parametrize("seed", [0, *long(6, 11, 14, 29)])
 def test_there_is_space_for_a_robot_before_some_bunch(seed):
     scene = with_seed(load_scene("demo"), seed)
     model = generate(scene)

@@ -23,6 +23,8 @@ from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
+pytestmark = pytest.mark.slow
+
 
 def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Task]:
     scene = load_scene("harvest")

@@ -1,11 +1,9 @@
 """Commands of vinesim in the pages are accepted as they stand there; short ones run, and so does the Python."""
 
-import os
 import pathlib
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 
 import numpy as np
@@ -13,11 +11,14 @@ import pytest
 import typer.main
 
 from tests.client.test_recorder import World
+from tests.support import programs
 from tests.support.recorded_pick import record_a_pick
 from tests.support.tuning import hanging, scan
 from vinesim.cli import app
 from vinesim.cli.bench import BENCHES
 from vinesim.tune import Experiment, load_specimen, measure
+
+pytestmark = pytest.mark.slow
 
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -26,6 +27,8 @@ RUNS = ("certs ", "experiment ", "render ", "replay run.mcap --out ", "replay ru
 """How commands begin that end by themselves, in seconds."""
 ELSEWHERE = {"docs/gradients.md", "docs/sensors.md", "README.md"}
 """Pages whose Python other tests run: test_gradients, test_reconstruction, test_docs."""
+LONG = {"docs/tuning.md", "docs/tutorials/research.md"}
+"""Pages whose commands compute for long; tests/tune has the same in short."""
 
 
 def shell_lines(page: pathlib.Path) -> list[str]:
@@ -82,19 +85,27 @@ def unknown_options(line: str) -> list[str]:
     return [name for name in options if name not in known]
 
 
-@pytest.mark.parametrize("line", commands())
-def test_a_command_of_the_pages_is_accepted(line):
-    parse(line)
-    if line.startswith("bench "):
-        names = [word for word in shlex.split(line)[1:] if not word.startswith("-")]
-        assert names[0] in BENCHES
+def test_commands_of_the_pages_are_accepted():
+    found = []
+    for line in commands():
+        try:
+            parse(line)
+        except Exception as error:
+            found.append(f"vinesim {line}: {error}")
+        if line.startswith("bench "):
+            names = [word for word in shlex.split(line)[1:] if not word.startswith("-")]
+            if names[0] not in BENCHES:
+                found.append(f"vinesim {line}: no bench is named {names[0]}")
+    assert not found, "\n".join(found)
 
 
-@pytest.mark.parametrize("line", commands_in_prose())
-def test_a_command_in_a_sentence_has_these_options(line):
-    assert not unknown_options(line)
-    if line.startswith("bench "):
-        assert line.split()[1] in BENCHES
+def test_commands_in_sentences_have_these_options():
+    found = []
+    for line in commands_in_prose():
+        found += [f"vinesim {line}: no such option: {name}" for name in unknown_options(line)]
+        if line.startswith("bench ") and line.split()[1] not in BENCHES:
+            found.append(f"vinesim {line}: no such bench")
+    assert not found, "\n".join(found)
 
 
 def test_no_command_of_a_page_is_overlooked():
@@ -113,11 +124,13 @@ def pages_that_run() -> list:
         lines = [line for line in commands_of(page) if line.startswith(RUNS)]
         marks = [pytest.mark.ros] if any("--ros" in line for line in lines) else []
         if lines:
-            found.append(pytest.param(page, id=str(page.relative_to(ROOT)), marks=marks))
+            name = str(page.relative_to(ROOT))
+            if name in LONG:
+                marks.append(pytest.mark.long)
+            found.append(pytest.param(page, id=name, marks=marks))
     return found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("page", pages_that_run())
 def test_the_short_commands_of_a_page_run(page, tmp_path):
     """In their order, in a folder that has the examples and the files that a reader brings along."""
@@ -133,10 +146,7 @@ def test_the_short_commands_of_a_page_run(page, tmp_path):
     if any("run.mcap" in line for line in lines):
         record_a_pick(tmp_path / "run.mcap")
     for line in lines:
-        done = subprocess.run(
-            [sys.executable, "-m", "vinesim", *shlex.split(line)], cwd=tmp_path, check=False,
-            env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True,
-        )  # fmt: skip
+        done = programs.run([sys.executable, "-m", "vinesim", *shlex.split(line)], cwd=tmp_path)
         assert done.returncode == 0, f"{line}: {done.stdout}{done.stderr}"
         assert "Traceback" not in done.stderr, done.stderr
 
@@ -159,6 +169,7 @@ def python_pages() -> list[pathlib.Path]:
     ]  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", python_pages(), ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_python_of_a_page_runs(page, tmp_path):
     (tmp_path / "examples").symlink_to(ROOT / "examples")
@@ -168,9 +179,6 @@ def test_the_python_of_a_page_runs(page, tmp_path):
         world.recorded()
     for language, code in BLOCK.findall(page.read_text()):
         if language == "python":
-            done = subprocess.run(
-                [sys.executable, "-c", code], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)},
-                capture_output=True, text=True, check=False,
-            )  # fmt: skip
+            done = programs.run([sys.executable, "-c", code], cwd=tmp_path)
             assert done.returncode == 0, done.stderr
             assert done.stdout.strip(), code

@@ -29,7 +29,7 @@ def test_a_notebook_uses_the_public_interface_and_ends_with_a_check(path):
             assert not [alias.name for alias in node.names if alias.name.startswith("vinesim.")]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_and_its_check_holds(path, tmp_path):
     done = subprocess.run(

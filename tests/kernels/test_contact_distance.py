@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 import warp as wp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim import frames
@@ -139,7 +139,6 @@ def true_distance(kind: str, p: np.ndarray) -> np.ndarray:
     return np.where(inside, np.maximum(across, along), np.hypot(np.maximum(across, 0), np.maximum(along, 0)))
 
 
-@settings(max_examples=150, deadline=None)
 @given(kind=st.sampled_from(["sphere", "capsule", "cylinder", "box"]), start=points, end=points)
 def test_distance_of_a_segment_is_the_minimum_over_its_points(kind, start, end):
     a, b = np.array(start, float), np.array(end, float)
@@ -181,7 +180,6 @@ def test_distance_of_an_ellipsoid_is_exact_outside_and_of_first_order_inside():
     np.testing.assert_allclose(ellipsoid_distance(points[outside]), truth[outside], atol=1e-12)
 
 
-@settings(max_examples=100, deadline=None)
 @given(start=points, end=points)
 def test_distance_of_a_segment_and_an_ellipsoid_has_the_right_sign_and_is_exact_outside(start, end):
     size = np.array(KINDS["ellipsoid"][1])
@@ -212,7 +210,6 @@ def _crossing(
     found_out[i] = distance.segment_segment_distance(a[i], b[i], c[i], d[i])
 
 
-@settings(max_examples=150, deadline=None)
 @given(a=points, b=points, c=points, d=points)
 def test_distance_of_two_segments_is_the_minimum_over_their_points(a, b, c, d):
     ends = [np.array([x], float) for x in (a, b, c, d)]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.support.waiting import deadline
 from vinesim.kernels.launch import ThreadPool, bind_launch
 
 
@@ -49,7 +50,7 @@ def test_a_thread_pool_runs_in_parallel_and_returns_when_all_is_done() -> None:
 
             def work(i: int, counts: list[int] = counts, tick: int = tick) -> None:
                 if tick == 0:
-                    barrier.wait(10.0)  # passes only if all three run at the same time
+                    barrier.wait(deadline(10.0))  # passes only if all three run at the same time
                 counts[i] = tick + 1
 
             pool.run([lambda i=i, work=work: work(i) for i in range(3)])

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.support.long_rows import each_once
 from vinesim import frames
 from vinesim.api.energy import energy
 from vinesim.physics.parameters import PhysicsParameters
@@ -15,6 +15,8 @@ from vinesim.physics.step import Physics
 from vinesim.scene.builder import TreeBuilder, assemble, solve_rest_pose
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+
+pytestmark = pytest.mark.slow
 
 SHOOT, MASS = 0.5, 0.05
 """A shoot here: a rod [m] of a mass [kg] that stands on a joint with a spring; far up a tie holds it to a post."""
@@ -132,8 +134,7 @@ def test_what_one_leaning_shoot_does_to_another_that_does_to_it() -> None:
     np.testing.assert_allclose(moved, moved.T, rtol=5e-3)
 
 
-@pytest.mark.parametrize("modulus", [1e8, 1e9, 1e11])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("modulus", "sign"), each_once([1e8, 1e9, 1e11], [1.0, -1.0]))
 def test_modes_of_two_shoots_on_an_arm(modulus: float, sign: float) -> None:
     """In step and opposed two equal shoots swing as joints and arm say, beside what the trapezoidal rule does to any
     oscillator: tan(w dt / 2) = dt/2 sqrt(K / M). M has (dt/2)^2 (k - S) beside the shoots' own."""
@@ -155,7 +156,7 @@ def test_modes_of_two_shoots_on_an_arm(modulus: float, sign: float) -> None:
     assert 0.5 * (len(turns) - 1) / (dt * (exact[1] - exact[0])) == pytest.approx(frequency, rel=2e-3)
 
 
-@pytest.mark.parametrize(("modulus", "phi", "lean"), list(itertools.product((1e7, 1e9, 1e11), (0.5, 0.55), (0.0, 0.8))))
+@pytest.mark.parametrize(("modulus", "phi", "lean"), each_once((1e7, 1e9, 1e11), (0.5, 0.55), (0.0, 0.8)))
 def test_shoots_on_an_arm_gain_no_energy(modulus: float, phi: float, lean: float) -> None:
     """Undamped, at 100 Hz, on arms of any stiffness: energy, with that of the mass that the scheme adds (see
     :mod:`vinesim.kernels.articulation.elastic_supports`), is kept for phi 1/2 and falls beyond."""

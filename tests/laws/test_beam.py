@@ -17,6 +17,8 @@ from tests.support.beam_theory import Beam
 from vinesim import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("alpha", [0.1, 1.0, 5.0, 20.0])
 def test_the_elastica_agrees_with_its_elliptic_integrals(alpha: float) -> None:

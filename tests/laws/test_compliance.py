@@ -19,6 +19,8 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
 ARM = tuple(f"arm_left_{i}_joint" for i in range(1, 8))
 GATE = """<robot name="gate">

@@ -17,6 +17,8 @@ from vinesim.robot.drives.robot_instance import RobotInstance
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
 
+pytestmark = pytest.mark.slow
+
 STIFFNESS, DAMPING = 4000.0, 400.0
 INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
 RAM = f"""<robot name="ram"><link name="base_footprint"><inertial><mass value="500"/>{INERTIA}</inertial></link>

@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.support.long_rows import long
 from vinesim import frames
 from vinesim.kernels.articulation.energy_budget import CLOSELY, NO_BUDGET, NOW_AND_THEN
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+
+pytestmark = pytest.mark.slow
 
 G = 9.81
 
@@ -102,10 +105,8 @@ def releasable(model: Model, bends: np.ndarray, steps: int) -> np.ndarray:
     ("phi", "damping", "seconds"),
     [
         (0.5, 0.0, 5),
-        (0.55, 0.0, 5),
         (0.55, 0.006, 5),
-        pytest.param(0.5, 0.0, 20, marks=pytest.mark.slow),
-        pytest.param(0.55, 0.0, 20, marks=pytest.mark.slow),
+        *long((0.55, 0.0, 5), (0.5, 0.0, 20), (0.55, 0.0, 20)),
     ],
 )
 def test_no_random_rod_gains_energy(phi: float, damping: float, seconds: int) -> None:

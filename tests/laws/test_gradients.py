@@ -9,10 +9,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from tests.support.long_rows import long
 from vinesim import frames
 from vinesim.physics.plants.rollout import Rollout, Trajectory
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
+
+pytestmark = pytest.mark.slow
 
 
 def forked() -> Model:
@@ -53,7 +56,7 @@ def slope(loss: Callable[[float], float], reach: float = 0.06) -> float:
     return float(np.linalg.lstsq(np.stack([e, e**3], 1), odd, rcond=None)[0][0])
 
 
-@pytest.mark.parametrize(("ticks", "checkpoint"), [(50, 50), (200, 50), (200, 33)])
+@pytest.mark.parametrize(("ticks", "checkpoint"), [(50, 33), *long((200, 50), (200, 33))])
 def test_gradient_is_the_slope_of_the_loss(ticks: int, checkpoint: int) -> None:
     """Within 1e-3 in every parameter: all together, and the springs, dampers and masses of single bodies."""
     model = forked()
@@ -81,6 +84,7 @@ def test_gradient_is_the_slope_of_the_loss(ticks: int, checkpoint: int) -> None:
     assert sum(terms) == pytest.approx(0.0, abs=1e-4 * max(map(abs, terms)))
 
 
+@pytest.mark.long
 def test_gradient_by_initial_pose_load_and_fast_motion() -> None:
     """phi = 1 while a joint turns fast is the same in the adjoint; a turn of the first pose; a steady wrench."""
     model = forked()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.support.long_rows import each_once
 from vinesim import frames
 from vinesim.api.energy import energy
 from vinesim.api.simulation import Simulation
@@ -15,6 +16,8 @@ from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+
+pytestmark = pytest.mark.slow
 
 G = 9.81
 
@@ -30,19 +33,22 @@ def tied_piece(pieces: int, tied: tuple[int, ...], stiffness: float = 2000.0) ->
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("spin", [(0.0, 0.0, 0.0), (1.0, 2.0, 1.0)])
-@pytest.mark.parametrize("stiffness", [20.0, 2000.0])
-@pytest.mark.parametrize(("pieces", "tied"), [(1, (0,)), (3, (0,)), (3, (1,)), (3, (2,)), (3, (0, 1))])
-@pytest.mark.parametrize("grip", [True, False])
+@pytest.mark.parametrize(
+    ("where", "stiffness", "spin", "grip"),
+    each_once(
+        [(1, (0,)), (3, (0,)), (3, (1,)), (3, (2,)), (3, (0, 1))], [20.0, 2000.0],
+        [(0.0, 0.0, 0.0), (1.0, 2.0, 1.0)], [True, False],
+    ),
+)  # fmt: skip
 def test_what_hangs_from_a_tie_gains_no_energy(
-    pieces: int, tied: tuple[int, ...], stiffness: float, spin: tuple, grip: bool, monkeypatch: pytest.MonkeyPatch
+    where: tuple[int, tuple[int, ...]], stiffness: float, spin: tuple, grip: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cut off level, it swings down: in 20 s, without air and whether or not the tie resists that it turns, its energy
     never is above that at the start by 1 % of the largest kinetic one, and ends below it. Before, one stiff
     piece tied by its end gained 150 times the kinetic energy of its swing."""
     if not grip:
         monkeypatch.setattr(ties, "TURNING_TIME", 0.0)
-    model = tied_piece(pieces, tied, stiffness)
+    model = tied_piece(*where, stiffness)
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.body_drag[:] = 0.0
     plants.cut(0)
@@ -73,6 +79,7 @@ def test_what_hangs_from_a_tie_falls_asleep(pieces: int, tied: tuple[int, ...]) 
     raise AssertionError("still awake after 30 s")
 
 
+@pytest.mark.long
 def test_cut_shoots_of_the_demo_that_hang_from_ties_calm_down() -> None:
     """64 of its shoots are cut at a random joint: 30 s later nothing that hangs turns faster than ``sleep_rate``, and
     three in five of what hangs are asleep."""

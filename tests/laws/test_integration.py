@@ -15,6 +15,8 @@ from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 
+pytestmark = pytest.mark.slow
+
 
 def twisted_ring(pieces: int, ratio: float, twist: float) -> ArticulationSolver:
     """A straight rod of a metre, bent to a ring, twisted by so many rad and clamped at both ends; weightless, damped.

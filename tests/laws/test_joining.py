@@ -13,6 +13,8 @@ from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotSpec
 
+pytestmark = pytest.mark.slow
+
 TICKS = 260
 BOXES = {
     "box_pose": [[3.0, 0.0, 0.0, 0, 0, 0, 1], [3.0, 0.0, 0.301, 0, 0, 0, 1], [5.0, 0.0, 1.8, 0.1, 0.2, 0.0, 0.97]],

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.examples import share
 from tests.support.shared_vineyard import BOX, BUNCH, Server, vineyard
 from vinesim import frames
 from vinesim.net.codec.messages import Hello
@@ -15,6 +16,8 @@ from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import is_tree
 from vinesim.scene.values import RobotUpdate
+
+pytestmark = pytest.mark.slow
 
 TICK = 0.01
 DELAY, JITTER = 0.03, 0.02
@@ -125,7 +128,7 @@ def play(
 
 
 @given(actions, st.integers(0, 2**31), st.sampled_from([Claim(), Claim(65534, 65533), Claim(65535, 65535)]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=share(0.2))
 def test_after_all_release_all_agree_within_a_round_trip(scenario, seed, start):
     hub, server, clients, picked = play(scenario, seed, 0.0, start)
     for client in clients.values():
@@ -144,7 +147,7 @@ def test_after_all_release_all_agree_within_a_round_trip(scenario, seed, start):
 
 
 @given(actions, st.integers(0, 2**31), st.sampled_from([0.02, 0.3]))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=share(0.2))
 def test_after_losses_one_heartbeat_restores_one_owner_among_those_that_touch(scenario, seed, loss):
     hub, server, clients, _ = play(scenario, seed, loss, Claim())
     hub.loss = 0.0

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import cane
+from tests.support.long_rows import each_once, long
 from vinesim import frames
 from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
+
+pytestmark = pytest.mark.slow
 
 RADIUS = 0.0014
 """[m] of a wire."""
@@ -85,7 +88,7 @@ def lie_on_wires(places: list[tuple[float, float]]) -> Physics:
     return physics
 
 
-@pytest.mark.parametrize("drop", [0.0, 0.05, 0.1, 0.2, 0.3, 0.6])
+@pytest.mark.parametrize("drop", [0.0, 0.6, *long(0.05, 0.1, 0.2, 0.3)])
 def test_a_cut_cane_that_falls_on_wires_lies_on_them_and_sleeps(drop: float) -> None:
     """Falls of up to 3.4 m/s onto two wires: both bear it, together its weight within 1 %, until it sleeps on them."""
     places = [(0.2, 0.99 - drop), (0.8, 0.99 - drop)]
@@ -116,8 +119,9 @@ def test_what_was_cut_off_above_its_tie_bears_on_the_wire() -> None:
     assert touched == {8}
 
 
-@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.7, 0.0, -0.7)])
-@pytest.mark.parametrize("held", [0, 15])
+@pytest.mark.parametrize(
+    ("direction", "held"), each_once([(1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.7, 0.0, -0.7)], [0, 15])
+)
 def test_a_cut_cane_that_a_hand_drags_over_a_wire_does_not_pass_it(direction: tuple, held: int) -> None:
     """By one end, at 1 m/s, with the spring of a hand (100 N/m, at most 100 N): sideways, downward, slanting."""
     place = (0.5, 0.97)

@@ -15,6 +15,8 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 
+pytestmark = pytest.mark.slow
+
 MASS = 0.4
 
 
@@ -24,6 +26,7 @@ def force_on(physics: Physics, bunch: int) -> float:
     return float(np.linalg.norm(np.sum(forces, 0))) if forces else 0.0
 
 
+@pytest.mark.long
 def test_bunches_of_a_hedge_fall_when_they_are_picked() -> None:
     """They hang beside upright shoots and over wires, most of them drawn into these by some centimetres."""
     scene = load_scene("vsp")

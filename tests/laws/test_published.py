@@ -22,6 +22,8 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
 
+pytestmark = pytest.mark.slow
+
 _SPEC = importlib.util.spec_from_file_location(
     "published_trees", pathlib.Path(__file__).parents[2] / "benchmarks" / "published_trees.py"
 )

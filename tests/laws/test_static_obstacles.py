@@ -16,6 +16,8 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanSpec
 
+pytestmark = pytest.mark.slow
+
 WIRE, ARM = (
     {"fixed_organ": [int(Organ.WIRE)], "fixed_index": [0]},
     {"fixed_organ": [int(Organ.ARM)], "fixed_index": [0]},

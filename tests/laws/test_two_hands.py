@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import bunch_scene
+from tests.support.long_rows import long
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.net.codec import messages
@@ -16,6 +17,8 @@ from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.physics.rigid.human_shapes import HAND_HALF_THICKNESS
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanPose
+
+pytestmark = pytest.mark.slow
 
 DT = 0.01
 RADIUS = 0.04
@@ -107,7 +110,7 @@ class TwoHands:
         return sum(client.replicator.counters.force.bytes_out for client in self.clients.values())
 
 
-@pytest.mark.parametrize(("delay", "jitter", "loss"), [(0.0, 0.0, 0.0), (0.05, 0.02, 0.02), (0.1, 0.04, 0.04)])
+@pytest.mark.parametrize(("delay", "jitter", "loss"), [(0.05, 0.02, 0.02), *long((0.0, 0.0, 0.0), (0.1, 0.04, 0.04))])
 def test_two_equal_pulls_leave_the_bunch_in_the_middle_on_both_clients(delay, jitter, loss):
     """F69, F93: both pull with 10 N. Each client alone would show the bunch 5 cm off to its own side."""
     world = TwoHands(delay, jitter=jitter, loss=loss)
@@ -128,7 +131,7 @@ def test_two_equal_pulls_leave_the_bunch_in_the_middle_on_both_clients(delay, ji
     assert owners < set(world.hands)
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.1])
+@pytest.mark.parametrize("delay", [0.1, *long(0.0)])
 def test_of_two_pulls_the_stronger_wins_on_both_clients(delay):
     world = TwoHands(delay)
     world.grasp()

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.support.long_rows import each_once
 from vinesim import frames
 from vinesim.api.energy import energy
 from vinesim.physics.parameters import PhysicsParameters
@@ -17,6 +17,8 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
+
+pytestmark = pytest.mark.slow
 
 ARM, MASS, SPRING = 0.5, 0.05, 4.0
 """A shoot here: a rod [m] of a mass [kg] that leans on a joint [N m/rad]; its tip is tied to the wire."""
@@ -126,12 +128,14 @@ def test_shoots_of_one_wire_move_each_other_as_a_dense_solve_says() -> None:
     assert tips(physics)[1, 0] == pytest.approx(1.5 / (2000.0 + SPRING / ARM**2), rel=2e-3)
 
 
-@pytest.mark.parametrize(("tie", "tension"), [(2000.0, 900.0), (10_000.0, 100.0), (500.0, 1e5)])
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_modes_of_two_shoots_on_a_wire(tie: float, tension: float, sign: float) -> None:
+@pytest.mark.parametrize(
+    ("springs", "sign"), each_once([(2000.0, 900.0), (10_000.0, 100.0), (500.0, 1e5)], [1.0, -1.0])
+)
+def test_modes_of_two_shoots_on_a_wire(springs: tuple[float, float], sign: float) -> None:
     """In step and against each other two equal shoots swing as joint, ties and wire say, beside what the trapezoidal
     rule does to any oscillator: tan(w dt / 2) = dt/2 sqrt(K / M). M has (dt/2)^2 (k - S) beside the shoots' own."""
     along, dt = (0.8, 1.2), 0.01
+    tie, tension = springs
     physics = world(row_of_shoots(along, tie=tie, tension=tension, beta=0.0), phi=0.5)
     set_turning(physics, [-0.05, -0.05 * sign])
     series = stiffness_of_ties(along, tie, tension)
@@ -166,9 +170,7 @@ def test_a_slow_mode_is_right_within_two_percent() -> None:
     assert 0.5 * (len(turns) - 1) / (0.01 * (exact[1] - exact[0])) == pytest.approx(frequency, rel=0.02)
 
 
-@pytest.mark.parametrize(
-    ("tie", "tension", "phi"), list(itertools.product((2000.0, 5e4), (50.0, 900.0, 1e5), (0.5, 0.55)))
-)
+@pytest.mark.parametrize(("tie", "tension", "phi"), each_once((2000.0, 5e4), (50.0, 900.0, 1e5), (0.5, 0.55)))
 def test_shoots_on_a_wire_gain_no_energy(tie: float, tension: float, phi: float) -> None:
     """Undamped, at 100 Hz, with ties and wires of any stiffness: energy, with that of the mass that the scheme adds
     (see :mod:`vinesim.kernels.articulation.elastic_supports`), is kept for phi 1/2 and falls beyond."""
@@ -251,6 +253,7 @@ def test_a_shoot_does_not_bear_on_the_wire_that_its_tie_is_bound_to() -> None:
         assert bool(tips(physics)[1, 2] < -0.015) is is_tied
 
 
+@pytest.mark.long
 def test_pulled_shoots_of_the_demo_gain_no_energy_at_the_shipped_phi() -> None:
     """Every sixth shoot pulled with 2 N, across or down, and released without damping, wind or contacts: no budget
     holds trees on wires, but over 10 s they never have more than at the start, and calm down."""

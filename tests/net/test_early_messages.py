@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.net.test_replicator import Client, run
@@ -31,7 +31,6 @@ def test_messages_are_taken_in_order_and_once():
 
 
 @given(_PUTS)
-@settings(max_examples=100, deadline=None)
 def test_bytes_messages_and_senders_are_bounded_and_every_message_is_kept_or_counted(puts):
     bounds = {"MAX_EARLY_MESSAGES": 5, "MAX_EARLY_BYTES": 100, "MAX_EARLY_SENDERS": 4, "MAX_EARLY_TOTAL": 250}
     before = {name: getattr(early_messages, name) for name in bounds}

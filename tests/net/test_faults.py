@@ -14,8 +14,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from tests.support import programs
 from tests.support.live_server import ServerProcess, wait
 from vinesim.bench.support.fake_client import FakeClientProcess
+
+pytestmark = pytest.mark.slow
 
 PLACES = {"ada": 1.0, "bob": 2.0, "cleo": 3.0, "dan": 2.5}
 SKEWS = {"ada": 2.0, "bob": -2.0}
@@ -55,8 +58,9 @@ def clients() -> Iterator[FakeClients]:
 
         def start(name: str) -> FakeClientProcess:
             return FakeClientProcess(
-                server.endpoint, [{"name": name, "place": [PLACES[name], 0.0]}], skew=SKEWS.get(name, 0.0)
-            )
+                server.endpoint, [{"name": name, "place": [PLACES[name], 0.0]}], skew=SKEWS.get(name, 0.0),
+                start=programs.Popen,
+            )  # fmt: skip
 
         with ThreadPoolExecutor() as pool:
             processes = dict(zip(PLACES, pool.map(start, PLACES), strict=True))

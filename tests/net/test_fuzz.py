@@ -12,7 +12,10 @@ import numpy as np
 import pytest
 import zenoh
 
+from tests.support import programs
 from tests.support.live_server import ServerProcess, wait
+from tests.support.long_rows import long
+from tests.support.waiting import deadline
 from vinesim.bench import message_fuzz
 from vinesim.bench.message_fuzz import ATTACKER, storm
 from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, tree_row
@@ -131,7 +134,7 @@ def robot_client(hub: MemoryHub, now: list[float]) -> tuple[Client, np.ndarray]:
     return client, pose
 
 
-@pytest.mark.parametrize("kind", ["robot", "human"])
+@pytest.mark.parametrize("kind", ["human", *long("robot")])
 def test_a_client_with_physics_survives_malformed_messages(kind):
     """Valid messages may still be absurd (trees turned inside out, boxes in the sky): the state stays finite."""
     hub, now = MemoryHub(), [10.0]
@@ -239,7 +242,7 @@ def test_a_hanging_bunch_that_is_claimed_by_an_actor_who_leaves_goes_on_hanging(
 def test_zenoh_sessions_and_the_server_survive_malformed_messages():
     with (
         ServerProcess("tcp/127.0.0.1:0") as server,
-        FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada,
+        FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}], start=programs.Popen) as ada,
     ):
         model = tree_row()
         with ZenohBus(ATTACKER, connect=server.endpoint) as bus:
@@ -264,7 +267,7 @@ def test_zenoh_sessions_and_the_server_survive_malformed_messages():
             )
             assert ada.command()["ticks"] > ticks
         wait(lambda: ATTACKER in ada.command()["left_at"], "the attacker to leave")
-        with FakeClientProcess(server.endpoint, [{"name": "bob", "place": [2.0, 0.0]}]) as bob:
+        with FakeClientProcess(server.endpoint, [{"name": "bob", "place": [2.0, 0.0]}], start=programs.Popen) as bob:
             wait(lambda: "ada" in bob.command()["poses"], "another client to be admitted")
             ada.command(touch=[3])
             wait(lambda: bob.command()["owner"].get("3") == "ada", "the stream to continue")
@@ -318,6 +321,6 @@ for say in (b"GET / HTTP/1.1\\r\\n\\r\\n", os.urandom(4000), b"", b"\\xff" * 700
 """
     with ServerProcess("tcp/127.0.0.1:0") as server:
         host, port = server.endpoint.removeprefix("tcp/").split(":")
-        subprocess.run([sys.executable, "-c", code, host, port], check=True, timeout=300)
-        with FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}]) as ada:
+        subprocess.run([sys.executable, "-c", code, host, port], check=True, timeout=deadline(300.0))
+        with FakeClientProcess(server.endpoint, [{"name": "ada", "place": [1.0, 0.0]}], start=programs.Popen) as ada:
             assert ada.command()["trouble"] == ""

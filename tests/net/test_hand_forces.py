@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -155,7 +155,6 @@ def test_a_link_that_no_hand_reaches_is_not_pushed(pose, refused):
 
 
 @given(st.lists(st.dictionaries(st.sampled_from(sorted(LINKS)), _wrenches, min_size=1), min_size=1, max_size=8))
-@settings(max_examples=100, deadline=None)
 def test_no_person_and_not_all_together_push_harder_than_hands_can(pushes):
     robot = robot_sync()
     for number, wrenches in enumerate(pushes):

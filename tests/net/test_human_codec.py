@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim import frames
@@ -73,7 +73,6 @@ def test_a_human_pose_is_root_three_inputs_hips_and_feet_in_162_bytes():
 
 
 @given(st.integers(0, 1 << 32))
-@settings(max_examples=30, deadline=None)
 def test_quantisation_is_idempotent(seed):
     once = quantise_pose(random_human(seed).pose)
     assert quantise_pose(once).points.tobytes() == once.points.tobytes()
@@ -118,7 +117,6 @@ MESSAGES = [encode_human(random_human()), encode_wrenches(WrenchMessage(1.0, {"a
 
 @pytest.mark.parametrize("payload", MESSAGES)
 @given(data=st.data())
-@settings(max_examples=150, deadline=None)
 def test_damaged_messages_are_decoded_or_refused(payload, data):
     """Truncated, longer, or with changed bytes."""
     damaged = bytearray(payload[: data.draw(st.integers(0, len(payload)))] + data.draw(st.binary(max_size=8)))

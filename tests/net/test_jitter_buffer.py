@@ -6,7 +6,7 @@ import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim import frames
@@ -56,7 +56,6 @@ def test_output_interpolates_the_samples(sent, delay):
         assert (middle <= high + 1e-9).all()
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**31), st.floats(0.02, 0.3))
 def test_jitter_below_the_delay_does_not_change_the_output(seed, delay):
     """The same samples with two sets of delays, all below that of the buffer: the output is the same at every time."""

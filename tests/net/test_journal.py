@@ -6,7 +6,7 @@ import contextlib
 import logging
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim.net.codec import messages
@@ -59,7 +59,6 @@ def test_an_added_record_is_in_the_file_at_once(tmp_path):
     assert records_of(Journal.load(journal.path)) == [((0, 0), record(7))]
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_a_file_torn_at_any_byte_yields_the_records_before_and_is_backed_up(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("torn")
@@ -85,7 +84,6 @@ def test_a_file_torn_at_any_byte_yields_the_records_before_and_is_backed_up(tmp_
     assert len(list(folder.glob("*.torn-*"))) == len(backups)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.data())
 def test_a_damaged_file_is_refused_or_backed_up_unchanged(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("any")

@@ -8,12 +8,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.support.long_rows import long
 from vinesim.bench.message_fuzz import attack
 from vinesim.bench.support.fuzz_world import ATTACKER, FuzzWorld, LawBroken
 from vinesim.bench.support.lies import tell_lies
 
 
-@pytest.mark.parametrize(("kind", "is_stranger"), [("human", False), ("robot", False), ("human", True)])
+@pytest.mark.parametrize(("kind", "is_stranger"), [("human", False), *long(("robot", False), ("human", True))])
 def test_broken_messages_break_no_law(kind, is_stranger):
     done = attack(3_000, seed=5, kind=kind, is_stranger=is_stranger)
     assert done.sent == 3_000
@@ -22,7 +23,7 @@ def test_broken_messages_break_no_law(kind, is_stranger):
     assert (done.malformed > 500) != is_stranger, "a stranger's messages are dropped before they are decoded"
 
 
-@pytest.mark.parametrize("kind", ["human", "robot"])
+@pytest.mark.parametrize("kind", ["human", *long("robot")])
 def test_well_formed_lies_break_no_law(kind):
     assert tell_lies(20, seed=2, kind=kind) > 40
 

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.examples import share
 from vinesim import frames
 from vinesim.net.codec import messages, rotation
 from vinesim.net.codec.messages import Hello, MessageError, TreeStates, WrongVersion
@@ -118,7 +119,6 @@ def test_trees_are_decoded_within_quantisation(rate):
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(1, 20), min_size=1, max_size=40))
-@settings(max_examples=60, deadline=None)
 def test_owner_and_receivers_hold_the_same_bits_and_messages_fit_a_datagram(seed, sizes):
     sent = trees(np.random.default_rng(seed), sizes)
     payloads, quantised = messages.encode_trees(sent)
@@ -317,13 +317,13 @@ def decode_with_all(payload: bytes) -> None:
 
 
 @given(st.binary(max_size=200), st.sampled_from([1, 2, 3, 4, 5, 16, 17]), st.booleans())
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=share(8.0))
 def test_arbitrary_bytes_raise_only_message_errors(tail, kind, framed):
     decode_with_all((b"VS\x01" + bytes([kind]) if framed else b"") + tail)
 
 
 @given(st.data())
-@settings(max_examples=1500, deadline=None)
+@settings(max_examples=share(8.0))
 def test_damaged_messages_raise_only_message_errors(data):
     rng = np.random.default_rng(5)
     sound = [
@@ -345,7 +345,6 @@ def test_damaged_messages_raise_only_message_errors(data):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 100), st.integers(-9, 9), st.sampled_from([0.0, 1e-3, 0.3, 4.0, 60.0]))
-@settings(max_examples=100, deadline=None)
 def test_objects_are_decoded_within_quantisation(seed, count, where, speed):
     sent, cell = objects(np.random.default_rng(seed), count, (where, -where), speed), (where, -where)
     payloads, received = messages.encode_objects(sent, cell)
@@ -390,7 +389,6 @@ def test_an_invalid_object_id_is_refused(number):
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.tuples(st.integers(1, 20), st.integers(0, 4)), min_size=1, max_size=40))
-@settings(max_examples=60, deadline=None)
 def test_trees_are_decoded_with_their_cut_bodies(seed, shapes):
     rng = np.random.default_rng(seed)
     sent = trees(rng, [size for size, _ in shapes])

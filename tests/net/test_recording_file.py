@@ -12,13 +12,13 @@ import time
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
-from tests.support.waiting import TIMEOUT
+from tests.support.waiting import deadline
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import encode_human
 from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
@@ -44,7 +44,6 @@ KEYS = st.sampled_from([
 ])  # fmt: skip
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 2**62), KEYS, st.binary(max_size=200)), max_size=30))
 def test_written_messages_are_read_bit_for_bit(tmp_path_factory, entries):
     path = write(tmp_path_factory.mktemp("r") / "run.mcap", entries, scene="x")
@@ -58,7 +57,7 @@ def test_written_messages_are_read_bit_for_bit(tmp_path_factory, entries):
 
 def until(condition) -> None:
     """Wait for the writer thread."""
-    end = time.monotonic() + TIMEOUT
+    end = time.monotonic() + deadline()
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
@@ -157,7 +156,6 @@ def test_the_official_reader_reads_a_truncated_file_as_far(whole_file, tmp_path)
     assert len(official_reader) == len(own_reader.messages)
 
 
-@settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_damaged_bytes_are_not_read_as_messages(whole_file, tmp_path_factory, data):
     path = tmp_path_factory.mktemp("damaged") / "run.mcap"

@@ -8,12 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.examples import share
 from tests.support.shared_vineyard import Server
 from vinesim.bench.support.fake_client import FakeClient, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.replication import interest
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
+
+pytestmark = pytest.mark.slow
 
 TICK = 0.01
 PLACES = {"ada": 1.0, "bob": 2.0, "cleo": 3.0, "dan": 2.5}
@@ -102,7 +105,7 @@ def apply_action(world: World, name: str, action: str, number: int, picked: set[
 
 
 @given(scenarios, st.integers(0, 2**31), st.sampled_from([0.0, 0.02, 0.3]), st.sampled_from([0.0, 0.3]))
-@settings(max_examples=4, deadline=None)
+@settings(max_examples=share(0.15))
 def test_after_any_actions_all_agree_and_picked_bunches_stay_picked(scenario, seed, loss, duplicated):
     world = World("ada", "bob", "cleo", delay=0.03, jitter=0.02, loss=loss, duplicated=duplicated, seed=seed)
     world.run(0.4)
@@ -134,7 +137,7 @@ def test_after_any_actions_all_agree_and_picked_bunches_stay_picked(scenario, se
 
 
 @given(st.floats(0.0, 0.15), st.integers(0, 4), st.sampled_from(["touch", "grab"]), st.sampled_from(["touch", "grab"]))
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=share(0.3))
 def test_a_conflict_is_resolved_within_a_round_trip_and_two_ticks(delay, apart, first, second):
     """Two take the same object at once, or so close in time that neither can have received the other's claim."""
     world = World("ada", "bob", "cleo", delay=delay)
@@ -159,7 +162,7 @@ def test_a_conflict_is_resolved_within_a_round_trip_and_two_ticks(delay, apart, 
 @given(
     st.lists(st.floats(0.0, 20.0), min_size=3, max_size=3), st.integers(0, 5), st.floats(0.5, 5.0),
 )  # fmt: skip
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=share(0.3))
 def test_bytes_are_sent_exactly_when_a_peer_is_near(positions, tree, near):
     """Interest, for any positions, any tree and any interest radius."""
     hub = MemoryHub()
@@ -191,7 +194,7 @@ def test_bytes_are_sent_exactly_when_a_peer_is_near(positions, tree, near):
 
 
 @given(st.integers(0, 2**31), st.floats(0.0, 0.1), st.floats(0.0, 1.0), st.floats(-1e5, 1e5), st.floats(-1e5, 1e5))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=share(0.3))
 def test_clock_offsets_are_within_the_jitter(seed, delay, jitter_ratio, skew_a, skew_b):
     """For any skew. Each way takes delay +- jitter, so an offset is wrong by at most the jitter."""
     jitter = jitter_ratio * delay

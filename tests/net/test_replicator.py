@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.support.examples import share
 from vinesim import frames
 from vinesim.net.codec import control, messages
 from vinesim.net.codec.messages import Hello
@@ -23,6 +24,8 @@ from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate, TreeUpdate
+
+pytestmark = pytest.mark.slow
 
 TICK = 0.01
 TREES = 12
@@ -548,8 +551,8 @@ actions = st.lists(
 )  # fmt: skip
 
 
+@settings(max_examples=share(0.3))
 @given(actions, st.integers(0, 2**31), st.sampled_from([0.0, 0.02, 0.3]))
-@settings(max_examples=25, deadline=None)
 def test_any_sequence_of_actions_on_any_network_ends_with_one_owner(scenario, seed, loss):
     hub = MemoryHub(delay=0.03, jitter=0.02, loss=loss, seed=seed)
     clients = {name: Client(hub, name, x) for name, x in (("ada", 1.0), ("bob", 2.0), ("cleo", 3.0))}

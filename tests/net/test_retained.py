@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim.net.codec.messages import RetainedRecord
@@ -63,7 +63,6 @@ submissions = st.builds(
 )  # fmt: skip
 
 
-@settings(deadline=None)
 @given(st.lists(submissions, max_size=12, unique_by=lambda one: (one[1].object, one[1].claim)), st.data())
 def test_order_and_repetition_do_not_matter(records, data):
     one, other = RetainedState(), RetainedState()

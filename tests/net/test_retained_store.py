@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.waiting import wait
@@ -43,7 +43,6 @@ records = st.builds(
 submission_lists = st.lists(st.tuples(st.tuples(st.integers(-2, 2), st.just(0)), records), max_size=30)
 
 
-@settings(max_examples=25, deadline=None)
 @given(submission_lists, st.randoms())
 def test_any_order_and_reloading_give_the_same_snapshot(tmp_path_factory, submissions, random):
     folder = tmp_path_factory.mktemp("kept")

@@ -13,7 +13,8 @@ import time
 import pytest
 import zenoh
 
-from tests.support.waiting import wait
+from tests.support import programs
+from tests.support.waiting import deadline, wait
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello, RetainedRecord, Welcome
 from vinesim.net.counters import Counters
@@ -115,7 +116,7 @@ def test_run_returns_when_stopped():
         thread.start()
         assert thread.is_alive()
         server.stop()
-        thread.join(timeout=120.0)
+        thread.join(deadline())
         assert not thread.is_alive()
     server.close()
 
@@ -123,7 +124,9 @@ def test_run_returns_when_stopped():
 def test_the_server_simulates_nothing():
     heavy = {"warp", "mujoco", "vinesim.physics", "vinesim.kernels"}
     code = f"import sys, vinesim.net.server.server; print(sorted({heavy} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=deadline(300.0), check=True
+    )
     assert done.stdout == "[]\n"
 
 
@@ -334,7 +337,7 @@ with Server(sys.argv[1], state_folder=pathlib.Path(sys.argv[2])) as server:
 
 @contextlib.contextmanager
 def serving(endpoint, folder):
-    process = subprocess.Popen(
+    process = programs.Popen(
         [sys.executable, "-c", SERVE, endpoint, str(folder)], stdout=subprocess.PIPE, text=True
     )  # fmt: skip
     try:

@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from tests.support.waiting import TIMEOUT, wait
+from tests.support import programs
+from tests.support.waiting import deadline, wait
 from vinesim import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
@@ -29,6 +30,8 @@ from vinesim.net.transport.zenoh_session import ServerUnreachable, close_session
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotUpdate
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
@@ -219,7 +222,7 @@ def test_a_query_returns_its_reply(server):
 
         wait(reply_arrived, "bob's answer")
         assert answers[0][:2] == ("hello/bob", b"hi!")
-        assert 0.0 <= answers[0].age < TIMEOUT
+        assert 0.0 <= answers[0].age < deadline()
 
 
 def test_an_oversized_sample_is_dropped(server):
@@ -255,7 +258,9 @@ def test_an_open_session_does_not_block_exit(server):
         "from vinesim.net.transport.zenoh_bus import ZenohBus\n"
         f"bus = ZenohBus('ada', connect={server.endpoint!r})\nprint('in')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=deadline(300.0), check=False
+    )
     assert (done.returncode, done.stdout) == (0, "in\n"), done.stderr
 
 
@@ -342,8 +347,8 @@ def test_replication_resumes_after_a_router_restart():
     with socket.create_server(("127.0.0.1", 0)) as reserved:
         endpoint = f"tcp/127.0.0.1:{reserved.getsockname()[1]}"
 
-    def start() -> subprocess.Popen:
-        process = subprocess.Popen([sys.executable, "-c", code, endpoint], stdout=subprocess.PIPE, text=True)
+    def start() -> programs.Popen:
+        process = programs.Popen([sys.executable, "-c", code, endpoint], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         return process
@@ -561,7 +566,7 @@ def test_an_error_in_the_thread_of_the_bus_does_not_end_it(server):
         ada.submit(lambda: 1 // 0)
         done = threading.Event()
         ada.submit(done.set)
-        assert done.wait(TIMEOUT)
+        assert done.wait(deadline())
         assert ada.failures == 1
 
 
@@ -577,14 +582,14 @@ with ZenohBus("ada", connect=sys.argv[1]):
 @pytest.mark.parametrize("direction", [0, 1], ids=["tcp", "udp"])
 def test_a_frozen_client_is_removed(direction):
     with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, ZenohBus("bob", connect=server.endpoint) as bob:
-        process = subprocess.Popen(
+        process = programs.Popen(
             [sys.executable, "-c", JOIN, str(server.endpoints[direction])],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )
         try:
             assert process.stdout is not None
-            assert process.stdout.readline() == b"in\n"
+            assert process.stdout.readline() == "in\n"
             wait(lambda: "ada" in bob.alive() and "vineyard/ada" in server.actors, "ada")
             process.send_signal(signal.SIGSTOP)
             wait(lambda: "ada" not in bob.alive() and "vineyard/ada" not in server.actors, "ada to leave")
@@ -606,10 +611,8 @@ def test_all_links_resume_after_a_server_restart(protocols, tmp_path):
         "    print('up', flush=True)\n    server.run()"
     )
 
-    def start() -> subprocess.Popen:
-        process = subprocess.Popen(
-            [sys.executable, "-c", code, *map(str, endpoints)], stdout=subprocess.PIPE, text=True
-        )
+    def start() -> programs.Popen:
+        process = programs.Popen([sys.executable, "-c", code, *map(str, endpoints)], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         assert process.stdout.readline() == "up\n"
         return process

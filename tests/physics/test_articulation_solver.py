@@ -9,6 +9,7 @@ import pytest
 import warp as wp
 
 from tests.support.clustered_trees import clustered, momenta, moving
+from tests.support.waiting import deadline
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.device_buffers import DeviceBuffers, DeviceUnavailable
@@ -647,7 +648,7 @@ def test_threads_end_with_their_solver() -> None:
     del plants
     gc.collect()
     for thread in workers:
-        thread.join(10.0)
+        thread.join(deadline(10.0))
         assert not thread.is_alive()
 
 

@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
+from tests.support.examples import share
 from vinesim import frames
 from vinesim.bench import scenes
 from vinesim.kernels.contact import structs
@@ -482,7 +483,7 @@ def random_scene(seed: int) -> tuple[Physics, list[str]]:
     return physics, ["bar", "probe"]
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share(0.4), suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 2**31))
 def test_contacts_satisfy_signorini_coulomb_and_action_is_reaction(seed):
     physics, robots = random_scene(seed)
@@ -528,7 +529,7 @@ def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axi
     return least
 
 
-@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=share(0.1), suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 2**31))
 def test_waking_is_never_late(seed):
     """On any path of a bar through a vineyard, it touches no sleeping tree at the end of a step."""

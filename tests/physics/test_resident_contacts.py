@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from tests.support.long_rows import each_once
 from vinesim import frames
 from vinesim.physics.contact.resident_contacts import ResidentContacts
 from vinesim.physics.parameters import PhysicsParameters
@@ -98,8 +99,7 @@ ANGULAR_GEOMS = {
 }
 
 
-@pytest.mark.parametrize("interleave", [0, 2])
-@pytest.mark.parametrize("name", ANGULAR_GEOMS)
+@pytest.mark.parametrize(("interleave", "name"), each_once([0, 2], list(ANGULAR_GEOMS)))
 def test_trees_press_on_a_geom_that_is_not_round_as_in_a_scene(
     name: str, interleave: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

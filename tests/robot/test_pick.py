@@ -23,6 +23,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.spec import with_seed
 
+pytestmark = pytest.mark.slow
+
 GRAVITY = 9.81
 
 
@@ -57,6 +59,7 @@ def run(pick: PickBunch) -> PickBunch:
     return pick
 
 
+@pytest.mark.long
 def test_a_picked_bunch_ends_in_the_box_with_its_weight(vinebot: RobotDescription):
     model, task = vineyard(7)
     physics = Physics(model)
@@ -135,6 +138,7 @@ def test_a_robot_without_a_cutter_is_refused(vinebot: RobotDescription):
         PickBunch(physics, robot, task)
 
 
+@pytest.mark.long
 def test_two_picks_are_bitwise_equal(vinebot: RobotDescription):
     ends = []
     for _ in range(2):

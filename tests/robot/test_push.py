@@ -17,6 +17,8 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.builder import assemble
 
+pytestmark = pytest.mark.slow
+
 HERE = frames.pose([0.0, 0.0, 0.0])
 
 

@@ -17,6 +17,8 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene as load_scene
 
+pytestmark = pytest.mark.slow
+
 
 @functools.cache
 def yard() -> tuple[Model, SwapPlan]:
@@ -39,6 +41,7 @@ def tick(task: SwapBoxes) -> None:
     task.physics.step()
 
 
+@pytest.mark.long
 def test_a_full_box_is_exchanged_for_an_empty_one():
     task = start_task()
     model, swap = yard()

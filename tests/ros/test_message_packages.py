@@ -10,6 +10,7 @@ import sys
 
 import pytest
 
+from tests.support.waiting import deadline
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 
@@ -65,7 +66,7 @@ def test_two_processes_build_at_once_and_agree(cache):
         subprocess.Popen([sys.executable, "-c", BUILD], env=surroundings, stdout=subprocess.PIPE, text=True)
         for _ in range(2)
     ]
-    places = [build.communicate(timeout=600)[0] for build in builds]
+    places = [build.communicate(timeout=deadline(600.0))[0] for build in builds]
     assert [build.returncode for build in builds] == [0, 0]
     assert places[0] == places[1]
     built = sorted(os.listdir(os.path.join(cache, "vinesim", "interfaces")))
@@ -75,7 +76,12 @@ def test_two_processes_build_at_once_and_agree(cache):
 def test_type_hashes_are_the_official_ones(own_cache):
     surroundings = os.environ | {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100)}
     asked = subprocess.run(
-        [sys.executable, "-c", ASK_HASHES], env=surroundings, capture_output=True, text=True, timeout=300, check=True
+        [sys.executable, "-c", ASK_HASHES],
+        env=surroundings,
+        capture_output=True,
+        text=True,
+        timeout=deadline(300.0),
+        check=True,
     )
     assert dict(line.split() for line in asked.stdout.splitlines()) == OFFICIAL
 

@@ -11,6 +11,7 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
+from tests.support.waiting import deadline
 from vinesim.ros import middleware
 
 WHEELS = importlib.util.find_spec("ros_wheels_bootstrapper") is not None
@@ -120,7 +121,7 @@ def test_only_nodes_with_pictures_use_shared_memory(reach):
 
     def segments(kind: str) -> list[int]:
         command = [sys.executable, "-c", NODE, kind]
-        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True, timeout=300.0)
+        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True, timeout=deadline(300.0))
         return json.loads(done.stdout)
 
     assert segments("small") == []

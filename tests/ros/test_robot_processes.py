@@ -133,6 +133,7 @@ def test_every_step_is_published_once_and_in_order_or_counted_as_lost(robot):
     check_clock_counts(robot, wanted)
 
 
+@pytest.mark.long
 def test_pictures_and_clouds_come_and_killed_processes_come_back_and_diagnostics_say_so(robot):
     """To subscribers with the default QoS of rclpy."""
     topics = {
@@ -181,6 +182,7 @@ def test_pictures_and_clouds_come_and_killed_processes_come_back_and_diagnostics
     assert robot.status.current()["faults"]["commands_refused"] == 1, "what the killed process refused is not forgotten"
 
 
+@pytest.mark.long
 def test_of_a_process_that_stops_for_a_while_every_step_is_sent_or_counted_as_lost(robot):
     wanted = wanted_topics(robot)
     clocks = robot.subscribe(Clock, "/clock")

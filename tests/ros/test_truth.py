@@ -163,7 +163,7 @@ class Chain:
         return pose
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_detections_and_label_pixels_agree_while_the_robot_drives_and_turns(peer):
     """Of a real client: boxes are those of the label pixels. Bunches that are known project onto their label pixels
     within 1 px through tf and camera_info; poses and cut points agree with them."""

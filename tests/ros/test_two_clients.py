@@ -230,7 +230,7 @@ def test_stamps_of_both_clients_compare_with_the_one_clock(world: World, peer: S
     assert world.successions() == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_another_client_takes_the_clock_over_and_it_never_goes_back(world: World, peer: StockNode) -> None:
     """After SIGKILL of a client's process, whose others then leave by themselves; and of all its processes, which are
     missed only when their lease has run out."""

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.support.waiting import deadline
 from vinesim.ros import middleware
 
 pytestmark = pytest.mark.ros
@@ -282,12 +283,12 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
         robot.node.destroy_subscription(one)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_goals_from_another_process_end_as_they_should(robot: StockNode) -> None:
     """A small version of ``vinesim bench ros``: one goal to its end, one cancelled, one preempted; none is kept."""
     done = subprocess.run(
         [sys.executable, "-m", "vinesim.bench.goal_sender", "--goals", "1", "--cancels", "1", "--preempts", "1"],
-        capture_output=True, text=True, timeout=300, check=False,
+        capture_output=True, text=True, timeout=deadline(300.0), check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
@@ -298,12 +299,12 @@ def test_goals_from_another_process_end_as_they_should(robot: StockNode) -> None
         assert row.ratio is None or row.ratio >= 1.0, row
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_resets_from_another_process_leave_nothing_behind(robot: StockNode) -> None:
     """A small version of the resets of ``vinesim bench ros``: spawned, driven and commanded before each."""
     done = subprocess.run(
         [sys.executable, "-m", "vinesim.bench.reset_caller", "--resets", "2"],
-        capture_output=True, text=True, timeout=600, check=False, input="\n\n",
+        capture_output=True, text=True, timeout=deadline(600.0), check=False, input="\n\n",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]

@@ -27,13 +27,17 @@ def annotation_and_description(name):
     return annotation, description
 
 
-@pytest.mark.parametrize("name", FIELDS)
-def test_every_parameter_has_a_unit_and_a_source(name):
-    annotation, description = annotation_and_description(name)
-    if annotation.startswith(("Count", "Capacity")) or "int" in annotation or annotation == "bool":
-        return
-    assert re.match(r"\[[^]]+\] ", description), f"{name}: give its unit first"
-    assert re.search(r"\b(READ|DERIVED|TUNED|GUESSED)\b", description), f"{name}: give its source"
+def test_every_parameter_has_a_unit_and_a_source():
+    found = []
+    for name in FIELDS:
+        annotation, description = annotation_and_description(name)
+        if annotation.startswith(("Count", "Capacity")) or "int" in annotation or annotation == "bool":
+            continue
+        if not re.match(r"\[[^]]+\] ", description):
+            found.append(f"{name}: give its unit first")
+        if not re.search(r"\b(READ|DERIVED|TUNED|GUESSED)\b", description):
+            found.append(f"{name}: give its source")
+    assert not found, "\n".join(found)
 
 
 def test_the_page_counts_the_guesses_among_them_and_among_pairs_of_materials():

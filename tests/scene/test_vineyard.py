@@ -20,6 +20,8 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.state import State
 from vinesim.scene.summary import summary_rows, total_leaf_area
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", params=["demo", "vsp"])
 def vineyard(request):

@@ -5,10 +5,13 @@ import pytest
 import trimesh
 
 from tests.support import sensor_scenes
+from tests.support.long_rows import each_once, long
 from vinesim import frames
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.export.images import look_at
+
+pytestmark = pytest.mark.slow
 
 SKEW = frames.normalize(np.array([0.3, 0.2, -0.4, 0.8]))
 
@@ -39,8 +42,7 @@ def _box(half):
     return distance
 
 
-@pytest.mark.parametrize("away", [0.3, 1.5, 3.0])
-@pytest.mark.parametrize("kind", ["sphere", "capsule", "box", "cylinder"])
+@pytest.mark.parametrize(("kind", "away"), each_once(["sphere", "capsule", "box", "cylinder"], [0.3, 1.5, 3.0]))
 def test_depth_is_exact(kind: str, away: float) -> None:
     eye = np.array([-away, 0.02, 1.03])
     pose = look_at(eye, np.array([0.0, 0.0, 1.0]))
@@ -127,8 +129,10 @@ def test_the_ray_caster_sees_the_same_from_anywhere(scene) -> None:
     assert agree / total >= 0.999
 
 
-@pytest.mark.parametrize("kind", ["sphere", "capsule", "cylinder", "box", "ellipsoid"])
-@pytest.mark.parametrize("side", [(0.0, 0.06), (0.06, 0.0), (-0.05, 0.05)])
+@pytest.mark.parametrize(
+    ("kind", "side"),
+    each_once(["sphere", "capsule", "cylinder", "box", "ellipsoid"], [(0.0, 0.06), (0.06, 0.0), (-0.05, 0.05)]),
+)
 def test_what_crosses_the_pinhole_plane_is_seen(kind: str, side: tuple[float, float]) -> None:
     """A solid beside the pinhole, half of it behind: seen as the ray caster sees it."""
     size = {
@@ -159,8 +163,7 @@ GRAZING = {
 """A solid and a point 2 mm above its middle: seen from there, all of it is grazed."""
 
 
-@pytest.mark.parametrize("kind", GRAZING)
-@pytest.mark.parametrize("away", [0.0, 0.7, 1.5])
+@pytest.mark.parametrize(("kind", "away"), each_once(list(GRAZING), [0.0, 0.7, 1.5]))
 def test_what_is_grazed_is_seen(kind: str, away: float, tmp_path) -> None:
     """Along a surface, from 2 mm above it, from its middle, its end and beyond."""
     size, above = GRAZING[kind]
@@ -237,7 +240,7 @@ def test_a_camera_inside_a_housing_looks_out(tmp_path) -> None:
     assert np.abs(depth - 1.5).max() < 2e-6
 
 
-@pytest.mark.parametrize("kind", ["cylinder", "box", "ellipsoid"])
+@pytest.mark.parametrize("kind", ["ellipsoid", *long("cylinder", "box")])
 def test_solids_all_around_the_pinhole_are_seen(kind: str) -> None:
     """Long and flat ones of any attitude, touching the eye or around it, beside, behind and in front of it."""
     rng = np.random.default_rng(11)

@@ -10,6 +10,8 @@ from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.cuda_rasterizer import CudaRasterizer
 
+pytestmark = pytest.mark.slow
+
 CLOSE_TO_A_SOLID = ([1.17, 0.93, 0.62], [1.5, 1.2, 0.62])
 
 

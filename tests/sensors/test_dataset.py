@@ -19,6 +19,8 @@ import pytest
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
+from tests.support import programs
+from tests.support.waiting import deadline
 from vinesim.cli.render import run as render
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.client.composition.scene_composer import PlacementError
@@ -30,6 +32,8 @@ from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import annotations, dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.spec_file import SensorError
+
+pytestmark = pytest.mark.slow
 
 IMAGES = 6  # of two vineyards
 LIFE = SceneRandomizer(0.5)
@@ -73,7 +77,7 @@ def whole(scene: pathlib.Path, tmp_path_factory: pytest.TempPathFactory) -> path
 
 
 def _until(condition, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
+    end = time.monotonic() + deadline(seconds)
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.01)
@@ -89,10 +93,10 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
     out = tmp_path / "set"
     command = _command(scene, out, 1)
     for end, images in ((signal.SIGINT, 0), (signal.SIGKILL, 1)):  # Ctrl-C while vines grow, a kill after an image
-        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
+        with programs.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
             _until(lambda: (out / "dataset.json").exists() and len(_records(out)) >= images)  # noqa: B023
             run.send_signal(end)
-            said = run.communicate(timeout=120)[0]
+            said = run.communicate(timeout=deadline())[0]
         assert run.returncode == (130 if end == signal.SIGINT else -signal.SIGKILL)
         if end == signal.SIGINT:
             assert f"0 of {IMAGES} images" in said
@@ -101,29 +105,27 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
     assert 0 < len(done) < IMAGES
     assert not (out / "annotations.json").exists()
     (out / "images" / ".000001.png.1.part").write_bytes(b"half")  # as a kill may leave it
-    last = subprocess.run(_command(scene, out, 2), capture_output=True, text=True, timeout=120)
+    last = programs.run(_command(scene, out, 2), timeout=deadline())
     assert last.returncode == 0, last.stderr
     assert {name: _records(out)[name] for name in done} == done
     assert _files(out) == _files(whole)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_worker_is_one_line_and_the_same_command_goes_on(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     out = tmp_path / "set"
-    with subprocess.Popen(
-        _command(scene, out, 1), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    ) as run:
+    with programs.Popen(_command(scene, out, 1), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as run:
         _until(lambda: _records(out))
         (worker,) = _spawned_by(run.pid)
         os.kill(worker, signal.SIGKILL)
-        errors = run.communicate(timeout=120)[1]
+        errors = run.communicate(timeout=deadline())[1]
     assert run.returncode == 5
     assert [line for line in errors.splitlines() if line.strip()] == [
         "vinesim: a worker was killed by SIGKILL; what is done is kept, the same command goes on"
     ]
-    last = subprocess.run(_command(scene, out, 1), capture_output=True, text=True, timeout=120)
+    last = programs.run(_command(scene, out, 1), timeout=deadline())
     assert last.returncode == 0, last.stderr
     assert _files(out) == _files(whole)
 
@@ -348,6 +350,7 @@ def test_a_damaged_file_makes_its_image_missing(whole: pathlib.Path, tmp_path: p
     assert dataset.missing_images(out, IMAGES) == [3]
 
 
+@pytest.mark.long
 def test_the_same_command_renders_damaged_images_again(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
@@ -355,7 +358,7 @@ def test_the_same_command_renders_damaged_images_again(
     shutil.copytree(whole, out)
     _truncate(out / "images" / "000002.png")
     (out / "depth" / "000005.png").unlink()
-    done = subprocess.run(_command(scene, out, 1), capture_output=True, text=True, timeout=120)
+    done = programs.run(_command(scene, out, 1), timeout=deadline())
     assert done.returncode == 0, done.stderr
     assert f"{IMAGES} images (5 train, 1 val, 0 test), 2 of them new" in done.stdout
     assert _files(out) == _files(whole)
@@ -411,7 +414,7 @@ def test_yolo_finds_every_image_and_its_labels_from_any_folder(
 def test_what_stops_a_worker_is_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
     bare = tmp_path / "bare.toml"
     bare.write_text(scene.read_text().replace("[6, 8]", "[0, 0]"))
-    done = subprocess.run(_command(bare, tmp_path / "set", 1), capture_output=True, text=True, timeout=300)
+    done = programs.run(_command(bare, tmp_path / "set", 1), timeout=deadline(300.0))
     assert done.returncode == 2
     assert [line for line in done.stderr.splitlines() if line.strip()] == [
         "vinesim: scene 'one vine' bears no bunch to look at; raise fruit.bunches"

@@ -32,7 +32,7 @@ def files(folder: pathlib.Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dask_workers_make_the_same_files_though_one_is_killed(tmp_path, capsys) -> None:
     """Of two workers on the loopback one that is at work is killed after the first image."""
     distributed = pytest.importorskip("distributed", reason="Dask is an extra (dask)")

@@ -7,6 +7,7 @@ import pytest
 import warp as wp
 
 from tests.support import sensor_scenes
+from tests.support.long_rows import each_once
 from vinesim import frames
 from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.sensing import stereo_depth
@@ -38,8 +39,7 @@ def _arrays(frame: CameraFrame) -> list[np.ndarray]:
     return [frame.rgb, frame.depth, frame.exact_depth, frame.labels]
 
 
-@pytest.mark.parametrize("quality", QUALITIES)
-@pytest.mark.parametrize("info", [INFO, ODD], ids=["320x240", "136x102"])
+@pytest.mark.parametrize(("quality", "info"), each_once(list(QUALITIES), [INFO, ODD]))
 def test_any_number_of_threads_gives_the_same_bits(primitives, quality: str, info) -> None:
     made = [Camera(SPEC, info, quality=quality, threads=n).render(primitives, ALONG_THE_ROW) for n in (1, 2, 3)]
     for other in made[1:]:

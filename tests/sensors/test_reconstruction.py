@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from vinesim import frames
 from vinesim.cli.render import run
 
-o3d = pytest.importorskip("open3d", reason="Open3D is an extra (perception)")
+pytestmark = pytest.mark.long
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs" / "sensors.md"
 VIEWPOINTS = "x,y,z,look_x,look_y,look_z\n0.4,1.2,1.3,3,1,1.7\n0.45,1.15,1.3,3,1,1.7\n0.5,1.2,1.35,3,1,1.7\n"
@@ -55,6 +55,7 @@ def _assert_surface(vertices: np.ndarray, folder: pathlib.Path, truncation: floa
 
 
 def test_the_example_of_the_docs_fuses_pictures(folder: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("open3d", reason="Open3D is an extra (perception)")
     example = next(code for code in re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S) if "open3d" in code)
     monkeypatch.chdir(folder)
     names: dict = {}
@@ -62,8 +63,10 @@ def test_the_example_of_the_docs_fuses_pictures(folder: pathlib.Path, monkeypatc
     _assert_surface(names["mesh"].vertex.positions.numpy(), folder, 8.0 * VOXEL)  # Open3D's own
 
 
-@pytest.mark.skipif(o3d.__version__ == "0.20.0", reason="its ScalableTSDFVolume integrates nothing")
 def test_the_older_volume_of_the_pinned_version_fuses_pictures(folder: pathlib.Path) -> None:
+    o3d = pytest.importorskip("open3d", reason="Open3D is an extra (perception)")
+    if o3d.__version__ == "0.20.0":
+        pytest.skip("its ScalableTSDFVolume integrates nothing")
     volume = o3d.pipelines.integration.ScalableTSDFVolume(
         VOXEL, TRUNCATION, o3d.pipelines.integration.TSDFVolumeColorType.NoColor
     )

@@ -1,5 +1,6 @@
 """The Taichi rasteriser finds what Warp's finds."""
 
+import importlib
 import threading
 
 import numpy as np
@@ -12,8 +13,8 @@ from vinesim.sensors.export.images import look_at
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.primitive_arrays import KINDS
 
-pytest.importorskip("taichi", reason="Taichi, the extra 'taichi', is not installed")
-taichi_rasterizer = pytest.importorskip("vinesim.sensors.raster.taichi_rasterizer")
+pytestmark = pytest.mark.slow
+
 NEAR_PLANE = {
     "through the canopy, a solid beside the lens": ([1.17, 0.93, 0.62], [1.5, 1.2, 0.62]),
     "a leaf through the pinhole": ([1.1, 0.2, 1.97], [1.4, 0.5, 1.9]),
@@ -25,9 +26,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory):
     return sensor_scenes.everything(tmp_path_factory.mktemp("mesh"))
 
 
+def rasterizer():
+    """A new one. Taichi is imported here, as its import takes a second."""
+    pytest.importorskip("taichi", reason="Taichi, the extra 'taichi', is not installed")
+    return importlib.import_module("vinesim.sensors.raster.taichi_rasterizer").TaichiRasterizer()
+
+
 @pytest.fixture(scope="module")
 def raster():
-    return taichi_rasterizer.TaichiRasterizer()
+    return rasterizer()
 
 
 def _seen(scene, pose: np.ndarray, raster) -> tuple[np.ndarray, np.ndarray]:
@@ -68,9 +75,10 @@ def test_every_kind_is_seen(scene, raster) -> None:
     assert found == set(np.unique(scene.shapes.kind.numpy())) == set(KINDS.values())
 
 
+@pytest.mark.long
 def test_two_passes_find_what_one_finds(scene, raster) -> None:
     """As on a GPU without 64-bit atomics: depth first, then whose it is."""
-    phased = taichi_rasterizer.TaichiRasterizer()
+    phased = rasterizer()
     phased._gpu = True
     for where in ("along the rows", "solids", "inside the canopy"):
         pose = look_at(*map(np.array, VIEWPOINTS[where]))

@@ -11,6 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.support.waiting import deadline
+
+pytestmark = pytest.mark.slow
+
 DEMO = [sys.executable, "-m", "vinesim", "demo", "--headless"]
 
 
@@ -31,12 +35,13 @@ def children_of(marker):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    done = subprocess.run([*DEMO, "--seconds", "20", "--out", str(out)], capture_output=True, text=True, timeout=900)
+    done = subprocess.run(
+        [*DEMO, "--seconds", "20", "--out", str(out)], capture_output=True, text=True, timeout=deadline(900.0)
+    )
     assert done.returncode == 0, done.stderr
     return out, json.loads((out / "summary.json").read_text())
 
 
-@pytest.mark.slow
 @pytest.mark.ros
 class TestDemo:
     def test_the_bunch_moves_within_one_tick_of_the_touch(self, run):
@@ -111,7 +116,7 @@ class TestDemo:
         assert children_of(str(out)) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ctrl_c_ends_all_processes_of_a_background_demo(tmp_path):
     out = tmp_path / "interrupted"
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell does for "vinesim demo &"; children inherit it
@@ -128,7 +133,7 @@ def test_ctrl_c_ends_all_processes_of_a_background_demo(tmp_path):
         watchdog.cancel()
         assert children_of(str(out))
         demo.send_signal(signal.SIGINT)
-        _, rest = demo.communicate(timeout=120)
+        _, rest = demo.communicate(timeout=deadline())
     finally:
         demo.kill()
     assert demo.returncode == 130

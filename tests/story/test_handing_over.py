@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 
 from vinesim import frames
 from vinesim.avatar.local_human import LocalHuman
@@ -18,6 +19,8 @@ from vinesim.robot.tasks.meet_person import MeetPerson
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanSpec
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_carrier_gets_the_bunch_of_a_person_and_no_other_leaves_its_vine():

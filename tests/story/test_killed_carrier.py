@@ -9,6 +9,8 @@ from tests.support.shared_vineyard import BOX, BUNCH, DT, REACH, World, bytes_se
 from vinesim import frames
 from vinesim.client.client import Client
 
+pytestmark = pytest.mark.slow
+
 CARRIED = (BOX(1), BUNCH(0))
 ON_GROUND = 0.3
 """[m] The origin of a bunch or box on the ground is below this."""

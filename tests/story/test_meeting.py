@@ -30,6 +30,8 @@ from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.scene.primitives import Primitives
 from vinesim.web.page_server import PageServer
 
+pytestmark = pytest.mark.slow
+
 BUNCH, BOX = 10, 0
 BOX_PLACE = np.array([-2.4, -0.7, 0.0])
 HANDED_OVER_FROM = BOX_PLACE[:2] + np.array([0.0, 0.5])
@@ -175,7 +177,6 @@ def walk_to(page, x, y):
     page.run(f"steer.place = {[float(x), float(y)]}, 0")
 
 
-@pytest.mark.slow
 @pytest.mark.xdist_group("browser")
 def test_one_person_points_says_a_word_picks_and_lays_the_bunch_into_the_box_of_another(tmp_path):
     """Every step is judged by what the other clients, the other person's page, the robot's camera and its microphone

@@ -23,6 +23,8 @@ from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.ids import ObjectKind, Organ, parse_object_name
 from vinesim.scene.values import HumanPose
 
+pytestmark = pytest.mark.slow
+
 
 def drive(client: Client, speed: float) -> None:
     client.pre_step[:] = [lambda time: client.robot.command_base(speed, 0.0, time)]
@@ -266,6 +268,7 @@ def test_every_kind_of_moving_object_is_replicated():
     assert set(ObjectKind) == {ObjectKind.TREE, ObjectKind.BUNCH, ObjectKind.BOX}
 
 
+@pytest.mark.long
 def test_two_runs_are_bitwise_equal():
     def scenario() -> bytes:
         world, ada, bob = two_clients()
@@ -369,6 +372,7 @@ def test_a_box_stays_when_the_robot_that_carries_it_leaves():
     np.testing.assert_allclose(record.pose[:2], deck[:2], atol=0.1)
 
 
+@pytest.mark.long
 def test_a_bunch_pulled_off_carried_and_dropped_by_a_human_is_replicated():
     """F74, F76 by hand: pulled off, replicated while it is carried, falls when a still hand opens."""
     weak = vineyard.__wrapped__()

@@ -18,11 +18,13 @@ from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.spec import with_seed
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
 GRAVITY = 9.81
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_picked_bunch_is_in_the_box_with_its_weight_on_the_other_client():
     now = [100.0]
     scene = with_seed(load_scene("harvest"), 7)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import os
 import pathlib
 import re
 import signal
@@ -17,8 +16,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from tests.support import programs
 from tests.support.recorded_world import TICK, MinimalClient
-from tests.support.waiting import TIMEOUT
+from tests.support.waiting import deadline
 from vinesim.client.recording.recorder import Recorder
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
@@ -29,22 +29,24 @@ from vinesim.net.transport.access_control import Role
 from vinesim.net.transport.certificates import create as new_certificate
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
+pytestmark = pytest.mark.slow
 
-def command(*arguments: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
+
+def command(*arguments: str) -> programs.Popen:
+    return programs.Popen(
         [sys.executable, "-m", "vinesim", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 
 @contextlib.contextmanager
-def terminated(process: subprocess.Popen[str]) -> Iterator[subprocess.Popen[str]]:
+def terminated(process: programs.Popen) -> Iterator[programs.Popen]:
     """A process that is killed, if necessary, when the block ends."""
     try:
         yield process
     finally:
         if process.poll() is None:
             process.kill()
-        process.communicate(timeout=TIMEOUT)
+        process.communicate(timeout=deadline())
 
 
 class TickedClients:
@@ -57,7 +59,7 @@ class TickedClients:
     def until(
         self, condition: Callable[[], object], description: str, on_tick: Callable[[], None] = lambda: None
     ) -> None:
-        end = time.monotonic() + TIMEOUT
+        end = time.monotonic() + deadline()
         while not condition():
             assert time.monotonic() < end, f"waited in vain for {description}"
             self.number += 1
@@ -115,7 +117,7 @@ def killed_recording(tmp_path_factory) -> Iterator[tuple[str, pathlib.Path, floa
             )  # fmt: skip
             killed = time.time()
             recorder.send_signal(signal.SIGKILL)
-            recorder.wait(TIMEOUT)
+            recorder.wait(deadline())
             state = [rest.joint_q for rest in rest_updates(path)]
         assert len(state) == 1
         yield endpoint, path, killed
@@ -156,7 +158,7 @@ def test_a_second_recorder_writes_a_second_file(killed_recording):
             lambda: client.bend(1, 0.5 * np.sin(0.1 * clients.number)),
         )  # fmt: skip
         recorder.send_signal(signal.SIGINT)
-        _, output = recorder.communicate(timeout=TIMEOUT)
+        _, output = recorder.communicate(timeout=deadline())
     assert recorder.returncode == 0, output
     assert str(second) in output
     assert f"{path} is there already" in output
@@ -248,7 +250,7 @@ def count_bytes(endpoint: str, path: pathlib.Path | None, distance: float) -> li
                 ready &= distance > 5.0 or recorder._faster.get(("ada", POSE_LAYERS[-1]), (None, None))[1] is not None
             return ready
 
-        end = time.monotonic() + TIMEOUT
+        end = time.monotonic() + deadline()
         while not all_matched():
             assert time.monotonic() < end
             tick()
@@ -294,9 +296,8 @@ def test_a_full_disk_ends_a_recording_with_one_line(tmp_path):
             MinimalClient(stack.enter_context(ZenohBus(name, connect=server.endpoint)), x)
             for name, x in (("ada", 0.5), ("bob", 2.0))
         ]
-        process = subprocess.Popen(
+        process = programs.Popen(
             [sys.executable, "-c", limited, str(path), "--connect", server.endpoint], stderr=subprocess.PIPE, text=True,
-            env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
         )  # fmt: skip
         with terminated(process):
             TickedClients(*clients).until(lambda: process.poll() is not None, "its end")

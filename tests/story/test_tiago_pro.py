@@ -13,6 +13,8 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.builder import assemble
 
+pytestmark = pytest.mark.slow
+
 BUNCH = np.array([0.65, 0.25, 1.25])
 """Centre of a hanging bunch, ahead of the robot's left shoulder [m]."""
 

@@ -14,6 +14,8 @@ from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
 DELAY = 0.02
 COMPARED_TICK = 600

@@ -10,6 +10,8 @@ import threading
 import numpy as np
 import pytest
 
+from tests.support import programs
+from tests.support.waiting import deadline
 from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import QUEUE_SPACING, bunch_centres, find_reachable_bunch, spawn_pose, start_pose
@@ -19,8 +21,10 @@ from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
+pytestmark = pytest.mark.slow
+
 DT = 0.01
-PROCESS_TIMEOUT = 300.0
+PROCESS_TIMEOUT = deadline(300.0)
 """Limit for a process to start or to end [s]; reached only by a failure."""
 
 
@@ -98,6 +102,7 @@ def test_two_robots_of_one_client_are_two_actors_for_others():
     assert farm.replicators["farm_2"].counters.environment.bytes_out > 0
 
 
+@pytest.mark.long
 def test_two_robots_of_one_client_send_each_other_no_plants():
     """With the visitor 20 m away, one robot touches a vine beside the other robot of its client: no byte is sent."""
     world = TwoRobots(visitor_back=20.0)
@@ -116,7 +121,6 @@ def test_robots_of_one_client_start_side_by_side_then_in_a_queue():
     assert min(distances) > 1.1
 
 
-@pytest.mark.slow
 @pytest.mark.ros
 def test_each_robot_publishes_under_its_prefix():
     """A stock ROS node receives the topics of both, each under its own prefix, and one clock."""
@@ -129,7 +133,7 @@ def test_each_robot_publishes_under_its_prefix():
     with contextlib.ExitStack() as stack:
         monitor, client = (
             stack.enter_context(
-                subprocess.Popen(
+                programs.Popen(
                     [sys.executable, "-m", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE, text=True,
                 )
@@ -148,7 +152,7 @@ def test_each_robot_publishes_under_its_prefix():
         for status in map(json.loads, client.stdout):
             if subscribed is None and "joint_states" in status["topics"]:
                 subscribed = status["time"]
-            if subscribed is not None and status["time"] > subscribed + 5.0:
+            if subscribed is not None and status["time"] > subscribed + 2.0:
                 break
         client.send_signal(signal.SIGINT)
         _, errors = client.communicate(timeout=PROCESS_TIMEOUT)

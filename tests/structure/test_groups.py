@@ -7,6 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from tests.support.waiting import deadline
+
 TESTS = """
 import pytest
 
@@ -20,6 +24,7 @@ def test_that_shares(costly, i):
 """
 
 
+@pytest.mark.long
 def test_tests_that_share_a_fixture_run_in_one_process(tmp_path: Path) -> None:
     """pytest 9.2 ignored the groups that pytest-xdist 3.8 sets, without a word."""
     conftest = (Path(__file__).parents[1] / "conftest.py").read_text()
@@ -38,7 +43,7 @@ def test_tests_that_share_a_fixture_run_in_one_process(tmp_path: Path) -> None:
         "no:cacheprovider",
         str(tmp_path),
     ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=deadline(300.0))
     workers = re.findall(r"\[(gw\d)\] .* PASSED", done.stdout)
     assert len(workers) == 6, done.stdout + done.stderr
     assert len(set(workers)) == 1

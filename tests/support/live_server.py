@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import pytest
 
+from tests.support import programs
 from tests.support.waiting import wait as wait
 from vinesim.bench.support import network_emulator
 
@@ -27,7 +28,7 @@ def require_network_emulation() -> None:
 class ServerProcess:
     """A server in a process of its own, perhaps in a namespace; it can be killed and started again."""
 
-    def __init__(self, listen: str, start: Callable[..., subprocess.Popen] = subprocess.Popen) -> None:
+    def __init__(self, listen: str, start: Callable[..., subprocess.Popen | programs.Popen] = programs.Popen) -> None:
         self._start = start
         self.endpoint = listen
         self.run()

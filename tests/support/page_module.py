@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any, cast
 
-from vinesim.bench.support.browser import browser_page
+from vinesim.bench.support.browser import Page
 from vinesim.web.page_server import PageServer, World
 
 
@@ -15,8 +15,8 @@ class _NoWorld:
 
 
 @contextlib.contextmanager
-def page_module(name: str, *imported: str) -> Iterator[Callable[[str], Any]]:
+def page_module(page: Page, name: str, *imported: str) -> Iterator[Callable[[str], Any]]:
     """A function that evaluates a script in which what is ``imported`` from a module is known, and gives its value."""
-    with browser_page() as page, PageServer(cast(World, _NoWorld())) as server:
+    with PageServer(cast(World, _NoWorld())) as server:
         page.open(server.address + "package.json")  # of the page's files one that starts no script
         yield lambda script: page.run(f"import('/{name}').then(({{ {', '.join(imported)} }}) => {{ {script} }})")

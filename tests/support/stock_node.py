@@ -10,17 +10,17 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 
-TIMEOUT = 120.0
-"""Longest wait for anything [s]; reached only by a failure, also on a busy machine."""
+from tests.support import waiting
+from tests.support.waiting import TIMEOUT as TIMEOUT
 
 
 def wait_until(
     condition: Callable[[], object], meanwhile: Callable[[], object] = lambda: time.sleep(0.01), name: str = "condition"
 ) -> None:
-    """Call ``meanwhile`` until ``condition`` holds, at most :data:`TIMEOUT`; a failure shows the ``name``."""
-    deadline = time.monotonic() + TIMEOUT
+    """Call ``meanwhile`` until ``condition`` holds, at most :func:`waiting.deadline`; a failure shows the ``name``."""
+    end = time.monotonic() + waiting.deadline()
     while not condition():
-        assert time.monotonic() < deadline, f"waited {TIMEOUT} s in vain for: {name}"
+        assert time.monotonic() < end, f"waited in vain for: {name}"
         meanwhile()
 
 

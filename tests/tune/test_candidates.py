@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.support.long_rows import long
 from tests.support.tuning import bunch, cane, number
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
@@ -87,7 +88,7 @@ def test_only_modulus_over_mass_shows_in_a_free_swing() -> None:
     assert np.ptp(one[:, 0, 2]) > 0.1
 
 
-@pytest.mark.parametrize("specimen", [cane(), bunch()], ids=["cane", "bunch"])
+@pytest.mark.parametrize("specimen", [cane(), *long(bunch())], ids=["cane", "bunch"])
 def test_the_jacobian_is_that_of_the_adjoint(specimen) -> None:
     """The gradient of a loss by modulus and damping: by candidates side by side, and by the adjoints of the same
     kernels through 250 ticks."""

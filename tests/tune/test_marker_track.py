@@ -53,7 +53,11 @@ def to_camera(picture: CameraFrame, points: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "distortion", [(), (0.12, -0.25, 0.001, -0.0005, 0.05)], ids=["a pinhole", "a lens that distorts"]
+    "distortion",
+    [
+        pytest.param((), id="a pinhole", marks=pytest.mark.long),
+        pytest.param((0.12, -0.25, 0.001, -0.0005, 0.05), id="a lens that distorts"),
+    ],
 )
 def test_the_ball_of_a_d435_is_found_within_a_fifth_of_a_pixel_and_the_errors_of_its_depth(distortion) -> None:
     centres = places(24)

@@ -97,6 +97,7 @@ def test_a_shaken_cane_is_written_read_and_fitted(tmp_path: pathlib.Path, capsys
         tune(cane(), track, release=0.2)
 
 
+@pytest.mark.long
 def test_shaking_tells_modulus_over_mass_and_the_fit_says_so() -> None:
     fit = tune(cane(), measure(cane(), SHAKE), ("modulus", "damping", "mass"))
     (ridge,) = fit.posterior.ridges

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from tests.support.long_rows import long
 from tests.support.tuning import cane
 from vinesim.cli.tune import run as run_tune
 from vinesim.cli.tune import track as track_markers
@@ -134,7 +135,9 @@ def run_track(recording: pathlib.Path, out: pathlib.Path, markers: list[str] = M
     return read_trajectory(out)
 
 
-@pytest.mark.parametrize("kind", ["rgb8, metres", "bgr8, millimetres, a folder", "data set", "data set with a rate"])
+@pytest.mark.parametrize(
+    "kind", ["rgb8, metres", *long("data set with a rate", "bgr8, millimetres, a folder", "data set")]
+)
 def test_from_recorded_pictures_to_a_plant_file_by_commands_alone(
     kind: str, swing: Trajectory, pictures: Pictures, tmp_path: pathlib.Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from tests.support.long_rows import long
 from tests.support.tuning import bunch, cane, number
 from vinesim.bench.tuning_cases import draw_case
 from vinesim.cli.tune import plan, run
@@ -29,7 +30,7 @@ def track() -> Trajectory:
     return measure(cane(), SHORT)
 
 
-@pytest.mark.parametrize(("seed", "ratio", "off"), [(1, 0.01, 5.0), (2, 0.03, 0.2), (3, 0.1, 5.0)])
+@pytest.mark.parametrize(("seed", "ratio", "off"), [(1, 0.01, 5.0), *long((2, 0.03, 0.2), (3, 0.1, 5.0))])
 def test_modulus_and_damping_are_recovered_from_far_away(seed: int, ratio: float, off: float) -> None:
     """2 mm of noise, 30 pictures a second, 3 s, start values five times off; the truth was stepped at 1 ms."""
     damping = ratio / (math.pi * 3.48)
@@ -44,7 +45,7 @@ def test_modulus_and_damping_are_recovered_from_far_away(seed: int, ratio: float
     assert 0.005 < deviation[1] < 0.08
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, *long(3)])
 def test_an_exact_track_tells_the_modulus_exactly(seed: int) -> None:
     """The bias of the coarse chain, 1.2 %, is taken off to a twentieth of a percent; the truth's own is 0.03 %."""
     case = draw_case(seed)
@@ -53,6 +54,7 @@ def test_an_exact_track_tells_the_modulus_exactly(seed: int) -> None:
     assert fit.estimate("damping").value == pytest.approx(case.truth.damping.value, rel=5e-3)
 
 
+@pytest.mark.long
 def test_each_axis_weighs_by_its_own_noise() -> None:
     """A camera measures distances less exactly than directions; across the plane of the swing they tell nothing."""
     exact = measure(cane(), dataclasses.replace(SHORT, noise=0.0))

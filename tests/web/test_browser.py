@@ -21,7 +21,7 @@ from tests.support.recorded_pick import PICKED_AT, replay_of_a_pick
 from tests.support.waiting import wait
 from vinesim import frames
 from vinesim.avatar.gestures import GESTURES
-from vinesim.bench.support.browser import browser_page, emulated_headset
+from vinesim.bench.support.browser import emulated_headset
 from vinesim.client.page_world import LOADED, PageWorld
 from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -96,13 +96,6 @@ WRIST = """
 })(vinesim.viewer)
 """
 """What a person in a headset reads, whether it is seen, and how far it is from the left hand [m]."""
-
-
-@pytest.fixture(scope="module")
-def page():
-    """One browser for all tests."""
-    with browser_page() as page:
-        yield page
 
 
 @pytest.mark.slow
@@ -197,7 +190,7 @@ def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch(page):
         assert page.errors == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
     """The page shows the shears where the cut then happens, and says what they have cut."""
@@ -281,7 +274,7 @@ def in_picture(page, point):
     }})(vinesim.viewer, vinesim.viewer, {[float(value) for value in point]})""")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 def test_a_person_with_a_phone_picks_one_bunch_and_cuts_another_by_touch_alone(page):
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, touch_screen(page, 390, 844):
@@ -457,7 +450,7 @@ def test_a_headset_moves_head_and_hands(page):
         assert page.errors == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile(page):
     """Its tab is hidden, its connection is cut, its client is started again; and what a browser lacks is said."""
@@ -586,7 +579,7 @@ def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_pe
         assert page.errors == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 @pytest.mark.parametrize(("yaw", "share"), [(0.0, 1.0), (1.5, 0.8), (4.0, 0.8)], ids=["into", "along", "out"])
 def test_what_the_eyes_can_see_is_drawn_and_what_is_behind_them_only_casts_shadows(page, yaw, share):
@@ -635,7 +628,7 @@ def test_what_the_eyes_can_see_is_drawn_and_what_is_behind_them_only_casts_shado
     assert found["straight"], "also what is right before the eyes, whatever is rounded"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 def test_who_flies_on_in_a_large_vineyard_sees_what_grows_there(page):
     """Of 5,000 primitives that a page may have, all that are near; picked bunches stay where they are."""
@@ -670,7 +663,7 @@ def test_who_flies_on_in_a_large_vineyard_sees_what_grows_there(page):
         assert page.errors == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 def test_names_stand_just_above_heads_near_and_far_and_stay_in_the_picture(page):
     """By projection: eyes at a known place that look along x, and the highest point of a hat above its eyes. One person
@@ -722,7 +715,7 @@ def test_names_stand_just_above_heads_near_and_far_and_stay_in_the_picture(page)
         assert page.errors == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 def test_the_timeline_of_a_recording(page, tmp_path):
     """Buttons and slider of the page: the recording plays, pauses, goes back to before a pick and on to after it."""

@@ -8,7 +8,6 @@ import pytest
 from tests.support.live_page import CONTROLS, LiveVineyard, is_drawn_anew, open_page, touch_screen
 from tests.support.waiting import wait
 from vinesim import frames
-from vinesim.bench.support.browser import browser_page
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanSpec
@@ -95,13 +94,6 @@ FLOWN = """
 """How far eyes that look along x fly and turn by gamepads in a time [s]."""
 
 
-@pytest.fixture(scope="module")
-def page():
-    """One browser for all tests."""
-    with browser_page() as page:
-        yield page
-
-
 def show_everything(page, live):
     """Show all that the page may show: names and owners of what is there, sentences, a failure, the timeline."""
     x, y = live.bunch[:2]
@@ -120,7 +112,7 @@ def show_everything(page, live):
       document.querySelectorAll('details').forEach((one) => { one.open = true; })""")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 @pytest.mark.parametrize("is_person", [False, True], ids=["spectator", "person"])
 def test_text_has_contrast_before_any_picture_and_focus_is_seen(page, is_person):
@@ -177,7 +169,7 @@ def pad_of(axes=(0.0, 0.0, 0.0, 0.0), *, sinks=0.0, rises=0.0, mapping="standard
     return {"connected": connected, "mapping": mapping, "axes": axes, "buttons": buttons}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 def test_a_spectator_flies_by_gamepad(page):
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:

@@ -37,7 +37,7 @@ def exact(kind: int, u: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def extents():
+def extents(browser):
     """How far all primitives reach in directions [k, 3], and the boxes around them, by their kind."""
     shape = np.zeros((len(PRIMITIVES), 16))
     for row, values in zip(shape, PRIMITIVES.values(), strict=True):
@@ -45,7 +45,7 @@ def extents():
     numbers = list(range(len(shape)))
     arrays = {"shape": shape.ravel().tolist(), "first": numbers, "size": [1] * len(shape), "carrier": numbers}
     arrays["kind"] = list(PRIMITIVES)
-    with page_module("extent.js", "boxAround", "farthest", "outermost") as run:
+    with page_module(browser, "extent.js", "boxAround", "farthest", "outermost") as run:
 
         def reach(directions):
             found = run(f"""

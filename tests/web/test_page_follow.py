@@ -12,7 +12,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 EYES = "const eyes = new FlyingEyes({ addEventListener() {} }, [9, 9, 1.6, 0, 0, 0, 1]);"
 
 
-def test_the_side_is_chosen_by_what_is_between_and_kept_until_the_actor_has_moved() -> None:
+def test_the_side_is_chosen_by_what_is_between_and_kept_until_the_actor_has_moved(page) -> None:
     """The actor looks along x. Something stands to its left, then, when it has moved, to its right."""
     script = f"""
         {EYES}
@@ -25,7 +25,7 @@ def test_the_side_is_chosen_by_what_is_between_and_kept_until_the_actor_has_move
             places.push([...stand(x, isHidden)]);
         return [places, eyes.yaw];
     """
-    with page_module("fly.js", "FlyingEyes") as run:
+    with page_module(page, "fly.js", "FlyingEyes") as run:
         places, yaw = run(script)
     for (x, y, z), (actor, side) in zip(places, [(1.0, -1), (1.5, -1), (3.0, 1), (3.0, 1)], strict=True):
         assert np.hypot(x - actor, y - 2.0) == pytest.approx(3.2, abs=0.01)
@@ -35,7 +35,7 @@ def test_the_side_is_chosen_by_what_is_between_and_kept_until_the_actor_has_move
     assert yaw == pytest.approx(np.arctan2(2.0 - places[-1][1], 3.0 - places[-1][0]), abs=1e-6)
 
 
-def test_clusters_of_plants_near_a_line_of_sight_are_counted() -> None:
+def test_clusters_of_plants_near_a_line_of_sight_are_counted(page) -> None:
     """Beside the exact distance of spheres of half the radius to the first four fifths of the line."""
     rng = np.random.default_rng(4)
     eye, point = np.array([1.0, 2.0, 1.6]), np.array([4.0, 1.0, 1.1])
@@ -47,5 +47,5 @@ def test_clusters_of_plants_near_a_line_of_sight_are_counted() -> None:
         const [ball, eye, point] = {given}, world = {{ plantClusters: {{ first: Array(ball.length / 4), ball }} }};
         return World.prototype.countBetween.call(world, eye, point);
     """
-    with page_module("world.js", "World") as run:
+    with page_module(page, "world.js", "World") as run:
         assert run(script) == (gap < 0.0).sum() > 5

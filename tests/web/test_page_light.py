@@ -8,7 +8,6 @@ import pytest
 
 from tests.support.waiting import wait
 from vinesim import frames
-from vinesim.bench.support.browser import browser_page
 from vinesim.client.page_world import PageWorld
 from vinesim.client.spectator import Spectator
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -74,13 +73,13 @@ def page_picture(page, client, eye, target):
         return page.picture()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 @pytest.mark.parametrize("name", VIEWS)
-def test_bunches_leaves_and_wood_are_as_bright_as_in_a_camera(name):
+def test_bunches_leaves_and_wood_are_as_bright_as_in_a_camera(name, page):
     eye, target = map(np.array, VIEWS[name])
     scene = load_scene(name)
-    with MemoryHub().bus("viewer") as bus, browser_page() as page:
+    with MemoryHub().bus("viewer") as bus:
         client = Spectator(scene, generate(scene), None, bus, name="viewer", pose=frames.pose(eye))
         seen, organ = camera_picture(client, eye, target)
         shown = page_picture(page, client, eye, target)

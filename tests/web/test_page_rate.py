@@ -10,9 +10,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
 
 @pytest.fixture(scope="module")
-def rates():
+def rates(browser):
     """Evaluate a script in which everything of ``rate.js`` is known; its value."""
-    with page_module("rate.js", "Detail", "FirstPictures", "PIXELS", "TRIANGLES") as run:
+    with page_module(browser, "rate.js", "Detail", "FirstPictures", "PIXELS", "TRIANGLES") as run:
         yield run
 
 

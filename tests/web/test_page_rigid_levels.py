@@ -7,7 +7,6 @@ from tests.support.live_page import LiveVineyard, is_drawn_anew, open_page
 from tests.support.page_module import page_module
 from tests.support.waiting import wait
 from vinesim import frames
-from vinesim.bench.support.browser import browser_page
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
@@ -37,9 +36,9 @@ MOVED = """((way) => {
 """Whether the list is kept when all rigid bodies have gone a way [m] along x."""
 
 
-def test_levels_are_as_far_inside_the_true_form_as_they_say():
+def test_levels_are_as_far_inside_the_true_form_as_they_say(page):
     """By points all over their faces."""
-    with page_module("geometry.js", "MESHES") as run:
+    with page_module(page, "geometry.js", "MESHES") as run:
         meshes = run("return MESHES.filter(({ inside }) => inside)")
     assert [mesh["name"] for mesh in meshes] == ["ellipsoid", "cylinder"]
     u, v = np.meshgrid(np.linspace(0.0, 1.0, 21), np.linspace(0.0, 1.0, 21))
@@ -54,8 +53,9 @@ def test_levels_are_as_far_inside_the_true_form_as_they_say():
         assert mesh["inside"] == sorted(mesh["inside"])
 
 
-def test_a_robot_and_two_people_cost_less_where_they_are_small_in_the_picture():
-    with browser_page() as page, MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
+@pytest.mark.long
+def test_a_robot_and_two_people_cost_less_where_they_are_small_in_the_picture(page):
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live:
         open_page(page, live)
         place = live.client.pose[:3] * [1.0, 1.0, 0.0] + np.array([0.0, 8.0, 0.0])
         for k, who in enumerate(("anna", "bert")):

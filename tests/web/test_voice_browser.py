@@ -125,7 +125,7 @@ def test_a_word_in_a_page_reaches_a_robot_and_a_robots_loudspeaker_reaches_the_p
         assert live.server.voice.refused == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.xdist_group("browser")
 def test_what_a_browser_lacks_to_speak_is_said_with_the_remedy():
     refuse = "navigator.mediaDevices.getUserMedia = async () => { throw new DOMException('', '%s'); };"

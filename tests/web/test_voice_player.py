@@ -2,7 +2,6 @@
 
 import pytest
 
-from vinesim.bench.support.browser import browser_page
 from vinesim.web.page_files import PAGE
 
 FRAME, QUANTUM = 960, 128
@@ -38,23 +37,22 @@ PLAY = """
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
-def test_a_voice_waits_longer_after_stalls_and_no_longer_than_needed_once_its_network_is_quick_again():
-    with browser_page() as page:
-        script = PLAY % (PAGE / "voice_worklet.js").read_text()
+def test_a_voice_waits_longer_after_stalls_and_no_longer_than_needed_once_its_network_is_quick_again(page):
+    script = PLAY % (PAGE / "voice_worklet.js").read_text()
 
-        def play(*sentences):
-            return page.run(f"({script})({[list(one) for one in sentences]})")
+    def play(*sentences):
+        return page.run(f"({script})({[list(one) for one in sentences]})")
 
-        even, rough = [0] * 20, [0, 0, 0, 3 * FRAME, 2 * FRAME, FRAME] + [0] * 14
-        smooth = play(even, even, even)
-        assert smooth["stalls"] == 0
-        assert max(smooth["delays"]) <= START + 2 * QUANTUM, "half a frame after the first one has come"
+    even, rough = [0] * 20, [0, 0, 0, 3 * FRAME, 2 * FRAME, FRAME] + [0] * 14
+    smooth = play(even, even, even)
+    assert smooth["stalls"] == 0
+    assert max(smooth["delays"]) <= START + 2 * QUANTUM, "half a frame after the first one has come"
 
-        bad = play(*[rough] * 12)
-        assert 0 < bad["stalls"] < 12, "it has learned to wait"
-        assert bad["delays"][-1] > 2 * FRAME
+    bad = play(*[rough] * 12)
+    assert 0 < bad["stalls"] < 12, "it has learned to wait"
+    assert bad["delays"][-1] > 2 * FRAME
 
-        after = play(*[rough] * 12, *[even] * 24)
-        assert after["stalls"] == bad["stalls"], "no new ones"
-        assert after["delays"][11] == bad["delays"][11]
-        assert after["delays"][-1] <= START + 2 * QUANTUM, "as early as before"
+    after = play(*[rough] * 12, *[even] * 24)
+    assert after["stalls"] == bad["stalls"], "no new ones"
+    assert after["delays"][11] == bad["delays"][11]
+    assert after["delays"][-1] <= START + 2 * QUANTUM, "as early as before"

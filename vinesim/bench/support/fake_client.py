@@ -255,7 +255,7 @@ class FakeClientProcess:
         connect: str,
         fake_clients: Iterable[dict[str, Any]],
         *,
-        start: Callable[..., subprocess.Popen] = subprocess.Popen,
+        start: Callable[..., Any] = subprocess.Popen,
         **options: Any,
     ) -> None:
         """``start(command, **options of Popen)`` may start it in a namespace; ``options`` as in :func:`run`."""
