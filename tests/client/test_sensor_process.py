@@ -278,3 +278,32 @@ def test_a_list_of_bodies_that_comes_after_its_snapshot_does_not_stop_the_start(
         one.sensors.attach(one.client)
         one.run_for_pictures(1)
         assert one.sensors.report()["frames_skipped"] > 0
+
+
+def test_a_sensor_process_that_is_stopped_holds_time_for_three_seconds_and_then_no_longer(robot, caplog):
+    """While it lives, time waits for it: no picture is more than a fifth of a second after the one before."""
+    robot.client.frame_score = lambda: robot.client.physics.time  # each picture is better than the last: it is wanted
+    robot.run_for_pictures(3)
+    pid = robot.sensors.worker.current().process.pid
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        robot.run_until(robot.sensors.held, "the hold")
+        begin = time.monotonic()
+        before = robot.client.physics.time
+        wait(lambda: not robot.sensors.held(), "the end of the hold")
+        assert time.monotonic() - begin > 0.9 * worker_process.HOLD_TIMEOUT
+        assert robot.client.physics.time == before
+        robot.run_until(lambda: robot.client.physics.time > before + 1.0, "time that goes on")
+        assert [m for m in caplog.messages if "done nothing" in m] == [
+            "the sensor process of robot has done nothing for 3 s: until it goes on, simulated time goes on without "
+            "its pictures"
+        ]
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    robot.run_for_pictures(2)
+
+
+def test_a_sensor_process_that_is_not_ready_holds_nothing(robot):
+    robot.kill_sensors()
+    wait(lambda: not robot.sensors.worker.is_ready, "the end of the process")
+    assert robot.sensors.held() == ""

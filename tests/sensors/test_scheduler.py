@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
+from vinesim.client.sensing.sensor_process import time_of_snapshot
 from vinesim.scene.ids import Organ, label
-from vinesim.scene.values import CameraOutput
+from vinesim.scene.values import CameraOutput, SensorMode, SensorPacing
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scene.primitives import rest_snapshot
@@ -164,3 +165,78 @@ def test_depth_is_measured_only_for_those_who_look_at_it(view) -> None:
     assert without.rgb.shape[:2] == without.exact_depth.shape == complete.depth.shape == complete.labels.shape
     near = np.isfinite(complete.exact_depth) & (complete.exact_depth < 5.0)
     assert not np.array_equal(complete.depth[near], complete.exact_depth[near])
+
+
+def frames_beside_a_slow_renderer(view, sensors, poses, pacing: SensorPacing, cost: float, seconds: float) -> float:
+    """A world of 100 steps a second of real time that stops at the scheduler's horizon, and a renderer that takes the
+    newest snapshot of every second step whenever it is free, and ``cost`` [s] of real time for a frame.
+
+    Returns how fast simulated time passed.
+    """
+    horizon, step = [np.inf], 0.01
+    scheduler = SensorScheduler(
+        sensor_scenes.empty(), sensors, pacing=pacing, on_taken=lambda: horizon.append(scheduler.horizon())
+    )
+    time, tick, real, free, newest, seen = 0.0, 0, 0.0, 0.0, 0.0, -1.0
+    while time < seconds:
+        real += step
+        if time + 0.5 * step <= time_of_snapshot(horizon[-1], step):
+            tick += 1
+            time = tick * step
+            newest = time if tick % 2 == 0 else newest
+        if real >= free and newest > seen:
+            seen, before = newest, sum(scheduler.frames.values())
+            scheduler.advance(dataclasses.replace(view, time=seen), poses)
+            free = real + cost * (sum(scheduler.frames.values()) - before)
+    assert scheduler.sustainable_factor() < np.inf
+    return time / real
+
+
+POSES = {"head": sensor_scenes.AHEAD, "lidar": np.array([0, 0, 1.0, 0, 0, 0, 1])}
+
+
+@pytest.mark.parametrize("cost", [0.02, 0.35, 3.0])
+def test_live_sensors_never_fall_below_their_least_rate_in_simulated_time(view, cost) -> None:
+    """However long a frame takes: time waits, and no longer than it must."""
+    pictures, scans = Inbox(), Inbox()
+    lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
+    sensors = [ScheduledSensor(_camera(), pictures, rate=30.0), ScheduledSensor(lidar, scans)]
+    factor = frames_beside_a_slow_renderer(view, sensors, POSES, SensorPacing(least_rate=5.0), cost, 4.0)
+    for inbox in (pictures, scans):
+        assert np.diff([frame.time for frame in inbox]).max() <= 0.2 + 1e-6
+        assert len(inbox) >= 5 * 3.8
+    if cost == 3.0:
+        assert len(pictures) <= 6.0 * 4.0, "not many more than were asked for"
+        assert factor == pytest.approx(0.18 / (2 * cost), rel=0.3)
+
+
+def test_a_live_sensor_that_is_slower_by_itself_holds_nothing(view) -> None:
+    inbox = Inbox()
+    sensors = [ScheduledSensor(_camera(), inbox, rate=1.0)]
+    factor = frames_beside_a_slow_renderer(view, sensors, POSES, SensorPacing(), 0.5, 4.0)
+    assert factor > 0.95
+    assert [round(frame.time, 2) for frame in inbox] == [0.0, 1.0, 2.0, 3.0, 4.0]
+
+
+@pytest.mark.parametrize("cost", [0.02, 0.5])
+def test_paced_sensors_deliver_every_frame_at_its_time(view, cost) -> None:
+    pictures, scans = Inbox(), Inbox()
+    lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
+    sensors = [ScheduledSensor(_camera(), pictures, rate=10.0), ScheduledSensor(lidar, scans)]
+    frames_beside_a_slow_renderer(view, sensors, POSES, SensorPacing(SensorMode.PACED), cost, 2.0)
+    assert np.diff([frame.time for frame in pictures]) == pytest.approx(0.1, abs=1e-6)
+    assert np.diff([scan.time for scan in scans]) == pytest.approx(0.1, abs=1e-6)
+    assert len(pictures) >= 19
+    assert len(scans) >= 18
+
+
+def test_sensors_that_nobody_wants_hold_nothing(view) -> None:
+    wanted = [CameraOutput.ALL]
+    sensors = [ScheduledSensor(_camera(), Inbox(), lambda: wanted[-1], rate=10.0)]
+    scheduler = SensorScheduler(sensor_scenes.empty(), sensors)
+    assert scheduler.horizon() == np.inf
+    scheduler.advance(dataclasses.replace(view, time=1.0), POSES)
+    assert scheduler.horizon() == pytest.approx(1.18)
+    wanted.append(CameraOutput.NONE)
+    assert scheduler.horizon() == np.inf
+    assert scheduler.sustainable_factor() == np.inf

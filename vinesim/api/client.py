@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import pathlib
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
@@ -20,6 +19,7 @@ import numpy as np
 
 from vinesim.api.simulation import base_pose
 from vinesim.client.client import Client as RobotClient
+from vinesim.client.rate_loop import paced_loop
 from vinesim.client.tasks.start_poses import start_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.physics.step import Physics
@@ -68,6 +68,7 @@ class Client:
         self.model: Model = generate(self.scene)
         described = load_description(robot)
         place = start_pose(self.scene, spawn) if pose is None else base_pose(pose)
+        self._is_shared = connect is not None
         self._stack = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
             bus: Any
@@ -130,11 +131,17 @@ class Client:
             self._client.tick()
 
     def run(self, seconds: float) -> None:
-        """Step in real time for so long."""
-        begin, dt = time.monotonic(), self._client.physics.dt
-        for number in range(round(seconds / dt)):
+        """Step for so much simulated time, as fast as the world's time passes: slower than real time if one of its
+        clients cannot follow.
+
+        The world does not wait for a client in Python, which may stand still between two calls.
+        """
+        loop = paced_loop(self._client, is_shared=self._is_shared)
+        for _ in range(round(seconds / loop.dt)):
+            loop.begin()
             self.step()
-            time.sleep(max(begin + (number + 1) * dt - time.monotonic(), 0.0))
+            loop.end()
+        self._client.step_time = None
 
     def page(self, port: int = 0) -> Page:
         """Show this client's vineyard in browsers of this machine, and in a cell of a notebook, until it is closed or

@@ -9,7 +9,6 @@ import os
 import pathlib
 import sys
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
@@ -19,8 +18,7 @@ from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.cli.signals import stop_at_signals
 from vinesim.client.client import Client
-from vinesim.client.pace import OwnPace, RealTime, WorldPace
-from vinesim.client.rate_loop import RateLoop
+from vinesim.client.rate_loop import RateLoop, paced_loop
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
@@ -44,8 +42,6 @@ FIRST_STATUS = 0.1
 """Wall time from the first step to the first status line [s]: shows early that the client runs."""
 CLOCK_TIMEOUT = 2.0
 """How long the first step waits for the server's clock [s]."""
-MAX_LAG = 1.0
-"""Lag behind a clock that waits for slow clients, beyond which steps are skipped after all [s]."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -157,7 +153,13 @@ class ClientSession:
         ``sent`` counts the ROS messages by topic, ``sensors`` gives the status of sensors, ``publish`` takes every
         status for /diagnostics.
         """
-        loop = self._loop(client)
+        is_shared = self.options.connect is not None
+        if is_shared:
+            client.wait_for_clock(CLOCK_TIMEOUT)
+        loop = paced_loop(client, is_shared=is_shared, factor=self.options.real_time_factor)
+        if is_shared and client.slows_the_world:
+            client.replicator.report_pace(loop.report)
+        loop.is_stopping = self._stop.is_set
         status = Status(client, loop, sent, task, sensors)
         reporter = threading.Thread(
             target=report_status, args=(status, publish, self.options.status, self._stop), name="status"
@@ -177,25 +179,6 @@ class ClientSession:
             with writing(self.options.tick_log):
                 loop.log().save(self.options.tick_log)
         return status
-
-    def _loop(self, client: Client) -> RateLoop:
-        """The loop of a client: it follows the clock of its server, or one of its own."""
-        dt, factor = client.physics.dt, self.options.real_time_factor
-        if self.options.connect is not None:
-            client.wait_for_clock(CLOCK_TIMEOUT)
-            loop = RateLoop(dt, WorldPace(client.replicator), max_lag=MAX_LAG)
-            client.step_time = lambda: loop.next_time
-            if client.slows_the_world:
-                client.replicator.report_pace(loop.report)
-        elif factor is not None:
-            loop = RateLoop(dt, RealTime(factor))
-        else:
-            loop = RateLoop(dt, max_lag=MAX_LAG)
-            loop.clock = OwnPace(client.name, time.monotonic(), loop.report)
-        loop.meter.limits += client.pace_limits
-        loop.hold = client.held
-        loop.is_stopping = self._stop.is_set
-        return loop
 
 
 def start_trace(client: Client, model: Model, bunch: int) -> Trace:

@@ -150,6 +150,8 @@ class Client:
         """Time of the world, in which ROS messages are stamped."""
         self.step_time: Callable[[], float] | None = None
         """Of a client whose steps follow the clock of its server: the world's time at the present step [s]."""
+        self.pace_text: Callable[[], str] = lambda: ""
+        """How fast time passes and what limits it, for people: see :func:`vinesim.net.pace.describe`."""
         self.holds: list[Callable[[], str]] = []
         """Each says why the next step has to wait, such as "sensors"; empty if it may begin."""
         self.pace_limits: list[Callable[[], Limit]] = []

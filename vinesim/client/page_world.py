@@ -264,7 +264,8 @@ class PageWorld:
             shown["shears"] = self._shears
         state = array_message.encode(
             {
-                **shown, "tick": tick, "time": snapshot.time, "rigid": self._rigid_version,
+                **shown, "pace": self._client.pace_text(),
+                "tick": tick, "time": snapshot.time, "rigid": self._rigid_version,
                 "haptics": {hand: [one.amplitude, one.duration] for hand, one in haptics.items()},
             },
             {

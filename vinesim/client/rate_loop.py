@@ -7,13 +7,20 @@ import logging
 import pathlib
 import time
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinesim.client.pace import PaceMeter, RealTime, StepClock
-from vinesim.net.pace import PaceReport
+from vinesim.client.pace import OwnPace, PaceMeter, RealTime, StepClock, WorldPace
+from vinesim.net.pace import PaceReport, describe
+
+if TYPE_CHECKING:
+    from vinesim.client.client import Client
 
 log = logging.getLogger(__name__)
+
+WAITING_MAX_LAG = 1.0
+"""Lag behind a clock that waits for slow clients, beyond which steps are skipped after all [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,3 +210,20 @@ class RateLoop:
         """Percentiles (0 to 100) of the work of a step [ms]."""
         done = self._work[: min(self.ticks, len(self._work))]
         return [float(v) * 1e3 for v in np.percentile(done, percentiles)] if len(done) else [0.0] * len(percentiles)
+
+
+def paced_loop(client: Client, *, is_shared: bool, factor: float | None = None) -> RateLoop:
+    """A loop for the steps of a client: by the clock of its server if its world ``is_shared``, else by a clock of its
+    own, which runs at a fixed real-time ``factor`` or, without one, as fast as this client can follow."""
+    if is_shared:
+        loop = RateLoop(client.physics.dt, WorldPace(client.replicator), max_lag=WAITING_MAX_LAG)
+        client.step_time = lambda: loop.next_time
+    elif factor is not None:
+        loop = RateLoop(client.physics.dt, RealTime(factor))
+    else:
+        loop = RateLoop(client.physics.dt, max_lag=WAITING_MAX_LAG)
+        loop.clock = OwnPace(client.name, time.monotonic(), loop.report)
+    client.pace_text = lambda: describe(loop.clock.factor, loop.clock.cause)
+    loop.meter.limits += client.pace_limits
+    loop.hold = client.held
+    return loop

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import collections
 import logging
+import math
 import pathlib
 import threading
 import types
@@ -42,6 +43,12 @@ SAVE_TIMEOUT = 60.0
 
 Counts = dict[str, dict[str, int]]
 """Counts by sensor or topic, by what is counted."""
+
+
+def time_of_snapshot(time: float, dt: float) -> float:
+    """Simulated time of the first snapshot at ``time`` or later [s], for steps of ``dt`` [s]."""
+    period = SNAPSHOT_PERIOD * dt
+    return math.ceil(time / period - 1e-6) * period if math.isfinite(time) else time
 
 
 class SensorProcess:
@@ -133,8 +140,8 @@ class SensorProcess:
         if self.is_lockstep:
             is_behind = not self.worker.is_ready or run is not self._run or wanted["shown"][0] != self._snapshot_count
         else:
-            latest = wanted["horizon"][0] + SNAPSHOT_PERIOD * physics.dt + 1e-6
-            is_behind = self.worker.is_ready and physics.time + physics.dt > latest
+            latest = time_of_snapshot(float(wanted["horizon"][0]), physics.dt)
+            is_behind = self.worker.is_ready and physics.time + 0.5 * physics.dt > latest
         if self._is_overdue and (is_behind or self.is_lockstep):
             self._write(self.client)
             self._wake()

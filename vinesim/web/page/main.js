@@ -277,7 +277,7 @@ class Viewer {
       page.tick = this.newest.tick;
       const rate = 1 / this.frame;
       const said = `${this.world.header.scene}  ${this.newest.time.toFixed(1)} s  ${rate.toFixed(rate < 10 ? 1 : 0)} frames/s`;
-      element("state").textContent = said;
+      element("state").textContent = this.newest.pace ? `${said}  ${this.newest.pace}` : said;
       // the first picture after a hidden tab shows a state from when it was hidden
       const isKnown = this.newest.rigid === this.world.rigidVersion && !wasHidden;
       this.absence.drawn(this.newest.time, this.world.picked, isKnown ? actors.map(({ name }) => name) : null);
