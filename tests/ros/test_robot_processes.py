@@ -277,6 +277,9 @@ class RecordingNode:
     def has_subscribers(self, _: str) -> bool:
         return True
 
+    def must_wait(self, _: float) -> bool:
+        return False
+
     def commands(self) -> list:
         return []
 
