@@ -11,7 +11,9 @@ from vinesim.errors import UsageError
 ROLES = ("robot", "human", "spectator")
 
 ROLES_OF_OPTION = {
-    **dict.fromkeys(("robot", "approach", "namespace", "params_file", "ros", "push", "job", "watch"), ("robot",)),
+    **dict.fromkeys(
+        ("robot", "approach", "namespace", "params_file", "ros", "push", "job", "watch", "standby"), ("robot",)
+    ),
     **dict.fromkeys(("walk", "reach", "into", "height", "gestures", "outfit"), ("human",)),
     "jitter_buffer": ("robot", "human"),
     "sensor_hz": ("robot", "spectator"),
@@ -85,6 +87,8 @@ class ClientOptions:
     """Simulated time over real time that the loop of a client without a server aims at; 1 at most."""
     world: str = DEFAULT_WORLD
     """Of the server's worlds; those in different ones do not meet."""
+    standby: bool = False
+    """Whether a process stands by for the one that renders the sensors."""
 
     @property
     def is_for_page(self) -> bool:

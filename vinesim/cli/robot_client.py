@@ -76,6 +76,7 @@ def _start_sensors(
             name, session.scene, session.model, description, namespace="/".join(filter(None, parts)), ros=options.ros,
             keep_pictures=options.out is not None and i == 0, sensor_hz=options.sensor_hz,
             params_file=options.params_file, clock=i == 0, renderer=options.renderer, device=options.device,
+            standby=options.standby,
             interest_radius=None if options.connect is None else options.interest_radius,
         )  # fmt: skip
         processes.append(session.enter(process))
