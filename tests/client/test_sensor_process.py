@@ -39,11 +39,13 @@ CAMERA = "head_front_camera"
 class Robot:
     """A client with one vinebot far from a single cane, and its sensor process."""
 
-    def __init__(self, device: str = "cpu") -> None:
+    def __init__(self, device: str = "cpu", *, standby: bool = False) -> None:
         scene, vinebot = load_scene("demo"), load_description("vinebot")
         model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
         self.hub = MemoryHub()
-        self.sensors = SensorProcess("robot", scene, model, vinebot, ros=False, keep_pictures=True, device=device)
+        self.sensors = SensorProcess(
+            "robot", scene, model, vinebot, ros=False, keep_pictures=True, device=device, standby=standby
+        )
         self.client = Client(scene, model, vinebot, self.hub.bus("robot"), name="robot", pose=spawn_pose(scene, 0))
 
     def frames(self) -> int:
@@ -70,6 +72,14 @@ class Robot:
 @pytest.fixture
 def robot() -> Iterator[Robot]:
     one = Robot()
+    with one.sensors:
+        one.sensors.attach(one.client)
+        yield one
+
+
+@pytest.fixture
+def robot_with_standby() -> Iterator[Robot]:
+    one = Robot(standby=True)
     with one.sensors:
         one.sensors.attach(one.client)
         yield one
@@ -123,8 +133,9 @@ def test_a_killed_process_is_started_again(robot, caplog):
     ]
 
 
-def test_the_process_that_stands_by_takes_the_place_of_a_killed_one(robot, monkeypatch):
+def test_the_process_that_stands_by_takes_the_place_of_a_killed_one(robot_with_standby, monkeypatch):
     """It has imported all before, and has the niceness of the client until it is ready, so that it is back soon."""
+    robot = robot_with_standby
     monkeypatch.setattr(worker_process, "STANDBY_DELAY", 0.0)
     worker = robot.sensors.worker
     robot.run_for_pictures(1)
@@ -139,7 +150,8 @@ def test_the_process_that_stands_by_takes_the_place_of_a_killed_one(robot, monke
 
 
 @pytest.mark.long
-def test_pictures_go_on_when_the_process_that_stands_by_is_killed(robot, monkeypatch):
+def test_pictures_go_on_when_the_process_that_stands_by_is_killed(robot_with_standby, monkeypatch):
+    robot = robot_with_standby
     monkeypatch.setattr(worker_process, "STANDBY_DELAY", 0.0)
     monkeypatch.setattr(worker_process, "LONGEST_PAUSE", 0.0)
     worker = robot.sensors.worker

@@ -54,7 +54,7 @@ class Robot:
         self.peer = peer
         scene, vinebot = load_scene("demo"), load_description("vinebot")
         model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
-        self.processes = RobotProcesses("robot", scene, model, vinebot, sensor_hz=5.0)
+        self.processes = RobotProcesses("robot", scene, model, vinebot, sensor_hz=5.0, standby=True)
         self.client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
         self.loop = RateLoop(self.client.physics.dt)
         self.status = Status(self.client, self.loop, self.processes.sent_messages, sensors=self.processes.status)
@@ -278,6 +278,9 @@ class RecordingNode:
 
     def has_subscribers(self, _: str) -> bool:
         return True
+
+    def must_wait(self, _: float) -> bool:
+        return False
 
     def commands(self) -> list:
         return []

@@ -53,4 +53,3 @@ def test_two_runs_in_lockstep_are_equal_to_the_bit_on_an_idle_and_on_a_busy_mach
     assert set(idle["frame_digests"]) == {"head_front_camera", "lidar"}
     assert loaded["frame_digests"] == idle["frame_digests"]
     assert loaded["state_digest"] == idle["state_digest"]
-

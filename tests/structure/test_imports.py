@@ -3,6 +3,10 @@
 import subprocess
 import sys
 
+import pytest
+
+from vinesim.client.sensing.spawned_process import ROS_MODULES
+
 HEAVY = ("warp", "mujoco", "zenoh", "rclpy", "taichi", "cv2", "numpy", "open3d")
 
 
@@ -21,6 +25,13 @@ def test_the_server_simulates_nothing():
 
 def test_physics_needs_no_network_and_no_ros():
     assert modules_after("import vinesim.physics.step").isdisjoint({"zenoh", "rclpy", "cv2"})
+
+
+def test_the_ros_process_needs_no_physics_and_no_renderer():
+    """Its memory and its start are small; most of a robot's processes run on two cores."""
+    pytest.importorskip("rclpy")
+    modules = "; ".join(f"import {module}" for module in ROS_MODULES)
+    assert modules_after(modules) == {"numpy", "rclpy"}
 
 
 def test_a_client_without_ros_imports_no_ros():

@@ -81,7 +81,7 @@ class Vineyard:
         self._start("router", *command, router, "--connect", server)
         self._wait_for_endpoint(router)
         for i, (name, endpoint) in enumerate(zip(ROBOTS, (server, router), strict=True)):
-            options = ("--spawn", str(i), "--sensor-hz", SENSOR_HZ, "--namespace", name if i else "")
+            options = ("--standby", "--spawn", str(i), "--sensor-hz", SENSOR_HZ, "--namespace", name if i else "")
             options += () if self.ros else ("--no-ros",)
             self._start(
                 name, "-m", "vinesim", "client", "--status", "json", "--scene", SCENE, "--name", name, "--connect",

@@ -12,7 +12,9 @@ from vinesim.scene.values import SensorMode
 ROLES = ("robot", "human", "spectator")
 
 ROLES_OF_OPTION = {
-    **dict.fromkeys(("robot", "approach", "namespace", "params_file", "ros", "push", "job", "watch"), ("robot",)),
+    **dict.fromkeys(
+        ("robot", "approach", "namespace", "params_file", "ros", "push", "job", "watch", "standby"), ("robot",)
+    ),
     **dict.fromkeys(("walk", "reach", "into", "height", "gestures", "outfit"), ("human",)),
     "jitter_buffer": ("robot", "human"),
     "sensor_hz": ("robot", "spectator"),
@@ -92,6 +94,8 @@ class ClientOptions:
     """Least rate of live sensors in simulated time [Hz]; None: as the robot's file says."""
     world: str = DEFAULT_WORLD
     """Of the server's worlds; those in different ones do not meet."""
+    standby: bool = False
+    """Whether a process stands by for the one that renders the sensors."""
 
     @property
     def is_for_page(self) -> bool:

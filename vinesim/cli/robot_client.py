@@ -87,6 +87,7 @@ def _start_sensors(
             keep_pictures=options.out is not None and i == 0, sensor_hz=options.sensor_hz,
             params_file=options.params_file, clock=i == 0, renderer=options.renderer, device=options.device,
             pacing=_pacing(options, description),
+            standby=options.standby,
             interest_radius=None if options.connect is None else options.interest_radius,
         )  # fmt: skip
         processes.append(session.enter(process))

@@ -96,6 +96,13 @@ def configure(*, large_messages: bool | None = None) -> None:
     os.environ[PROFILE_VARIABLE] = str(profile_file(large_messages=large, local=local))
 
 
+def asks_for_acknowledgements() -> bool:
+    """Whether publishers ask their subscribers many times a second what has come, as vinesim's profile without large
+    messages makes them; else Fast DDS asks every three seconds."""
+    large, _ = OWN_PROFILES.get(os.environ.get(PROFILE_VARIABLE, ""), (True, False))
+    return uses_fast_dds() and not large
+
+
 def uses_fast_dds() -> bool:
     """Whether Fast DDS is the middleware here."""
     from rclpy.utilities import get_rmw_implementation_identifier

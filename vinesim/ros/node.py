@@ -26,7 +26,7 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from vinesim.ros import middleware
 from vinesim.ros.parameters import Parameters
-from vinesim.ros.topic import RELIABLE, Topic
+from vinesim.ros.topic import EVERY_STEP, RELIABLE, Topic
 
 log = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ class Node:
         self.close()
 
     def _advertise(self, message: type, name: str, qos: QoSProfile = RELIABLE) -> Topic:
-        topic = Topic(name, self._node.create_publisher(message, name, qos))
+        topic = Topic(name, self._node.create_publisher(message, name, qos), is_of_every_step=qos is EVERY_STEP)
         if (before := self._topics.get(name)) is not None:
             topic.sent, topic.dropped = before.sent, before.dropped
         self._topics[name] = topic

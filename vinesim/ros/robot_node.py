@@ -16,9 +16,11 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import String
 
+from vinesim.ros import middleware
 from vinesim.ros.commands.actions import ControllerActions
 from vinesim.ros.commands.subscriptions import BASE_COMMAND, CommandQueue, CommandSubscriptions
 from vinesim.ros.commands.types import Command, GoalResult
+from vinesim.ros.flow_control import FlowControl
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.node import Node
 from vinesim.ros.publishers.clock import CLOCK, ClockPublisher
@@ -29,7 +31,7 @@ from vinesim.ros.publishers.lights import LightsPublisher
 from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
 from vinesim.ros.publishers.robot import ODOM_FRAME, ODOMETRY, RobotPublisher
 from vinesim.ros.publishers.sound import SoundPublisher
-from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage
+from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage, Topic
 from vinesim.scene.values import ComponentStatus, ControllerSpec, HandGestures, Intention, RobotSample
 from vinesim.scene.values.signals import Color
 
@@ -89,6 +91,7 @@ class RobotNode(Node):
         self._foreign_types: dict[str, list[str]] = {}
         self._warned_topics: set[str] = set()
         names = [spec.name for spec in controllers]
+        self._flow_control: FlowControl | None = None
         super().__init__(name, namespace, [*names, *imus, *wrenches], params_file, parameters)
 
     def _open(self) -> None:
@@ -112,6 +115,8 @@ class RobotNode(Node):
         self._actions = ControllerActions(self._node, self._controllers, self._commands)
         self._subscriptions = CommandSubscriptions(self._node, self._controllers, self._commands, AudioData)
 
+        if middleware.asks_for_acknowledgements():
+            self._flow_control = FlowControl()
         self._declare_parameters()
 
     def _declare_parameters(self) -> None:
@@ -168,9 +173,28 @@ class RobotNode(Node):
             self._clock.update()
         if wall.monotonic() >= self._next_look:
             self._next_look = wall.monotonic() + LOOK_PERIOD
+            self._locate_subscribers()
             if not self._shares_topics:
                 self._warn_if_shared()
             self._warn_of_types()
+
+    def _locate_subscribers(self) -> None:
+        """Note whether the subscribers of what every step publishes are all on this machine.
+
+        Identifiers of Fast DDS begin with the maker and the machine, two bytes each.
+        """
+        for topic in self._topics_of_every_step():
+            name = self._node.resolve_topic_name(topic.name)
+            own, others = (
+                {tuple(one.endpoint_gid[:4]) for one in found}
+                for found in (
+                    self._node.get_publishers_info_by_topic(name), self._node.get_subscriptions_info_by_topic(name)
+                )
+            )  # fmt: skip
+            topic.is_local = others <= own
+
+    def _topics_of_every_step(self) -> list[Topic]:
+        return [topic for topic in list(self._topics.values()) if topic.is_of_every_step]
 
     def _warn_if_shared(self) -> None:
         """Say once that another robot has this one's names."""
@@ -195,6 +219,11 @@ class RobotNode(Node):
                     "%s is published as %s, of which nothing arrives; publish %s%s", topic, ", ".join(types),
                     self._subscriptions.types[topic], STAMPED_REMEDY if is_base else "",
                 )  # fmt: skip
+
+    def must_wait(self, now: float) -> bool:
+        """Whether no step shall be published at ``now`` [s], as subscribers do not keep up; see :class:`FlowControl`.
+        False where nothing is known of them."""
+        return self._flow_control is not None and self._flow_control.must_wait(self._topics_of_every_step(), now)
 
     def publish_clock(self, time: float) -> None:
         """Publish /clock at ``time`` [s], if this node is the one that does; for every step."""

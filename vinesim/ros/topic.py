@@ -7,19 +7,26 @@ import threading
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 log = logging.getLogger(__name__)
 
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""A second of messages of every step waits for a subscriber that has no processor; tf2 listeners expect it of /tf."""
+"""A hundred messages wait for a subscriber that has no processor."""
+HISTORY = 1000
+"""Messages that wait of the topics of every step, ten seconds of them; see :mod:`vinesim.ros.flow_control`."""
+EVERY_STEP = QoSProfile(depth=HISTORY, reliability=ReliabilityPolicy.RELIABLE)
+"""Of these topics; tf2 listeners expect reliable of /tf."""
 TRANSIENT_LOCAL = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 """A late subscriber receives the last message, too."""
 SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
 """Pictures and clouds: reliable, so that reliable and best-effort subscribers both receive them (REP-2003)."""
+
+_AT_ONCE = Duration()
 
 Build = Callable[[], Any]
 """Makes a message, its serialised bytes, or a list of messages; called only if the topic has subscribers."""
@@ -28,11 +35,15 @@ Build = Callable[[], Any]
 class Topic:
     """A publisher with its counts; one thread at a time may send."""
 
-    def __init__(self, name: str, publisher: Publisher) -> None:
+    def __init__(self, name: str, publisher: Publisher, *, is_of_every_step: bool = False) -> None:
         self.name = name
         """Relative to the node's namespace unless it begins with a slash."""
+        self.is_of_every_step = is_of_every_step
+        """Whether every step publishes it, or every other one."""
         self.subscription_count = 0
         """Number of subscribers when last counted."""
+        self.is_local = True
+        """Whether all subscribers run on this machine."""
         self.sent = 0
         """Messages."""
         self.dropped = 0
@@ -45,6 +56,11 @@ class Topic:
         """Query the middleware for the number of subscribers."""
         if not self._is_closed and not self._is_muted:
             self.subscription_count = self.publisher.get_subscription_count()
+
+    def is_acknowledged(self) -> bool:
+        """Whether all reliable subscribers have acknowledged all messages so far."""
+        with self._lock:
+            return self._is_closed or self.publisher.wait_for_all_acked(_AT_ONCE)
 
     def mute(self, is_muted: bool) -> None:
         """Whether nothing is sent, as if there were no subscribers; for the thread that counts them."""

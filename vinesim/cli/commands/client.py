@@ -88,6 +88,14 @@ Outfit = Annotated[
     str | None,
     typer.Option(help="Of a human: what it wears: orange, yellow, green, ...; follows from its name unless given."),
 ]
+Standby = Annotated[
+    bool,
+    typer.Option(
+        "--standby",
+        help="Of a robot: keep a process ready that takes the place of the one that renders its sensors if that fails; "
+        "0.11 GB.",
+    ),
+]
 # what the clients of a demo and of a benchmark are told to do
 Push = Annotated[int | None, typer.Option(hidden=True, help="Of a robot: reach for this bunch and push it repeatedly.")]
 Watch = Annotated[
@@ -119,6 +127,7 @@ def client(
     renderer: Renderer = "warp", tick_log: TickLog = None, page: Page = None,
     page_lan: PageLan = False, gestures: OwnGestures = None, outfit: Outfit = None,
     real_time_factor: RealTimeFactor = None, world: World = "vineyard",
+    standby: Standby = False,
 ) -> None:  # fmt: skip
     """Join the vineyard as one actor, with a simulation of its own.
 

@@ -42,6 +42,7 @@ class RobotProcesses:
         params_file: pathlib.Path | None = None, interest_radius: float | None = None,
         ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
         renderer: str = "warp", device: str = "cpu", pacing: SensorPacing | None = None,
+        standby: bool = False,
     ) -> None:  # fmt: skip
         """``clock``: may publish /clock, as one node of a ROS domain does; ``params_file``: ROS parameters of the
         nodes; ``interest_radius``: see :class:`RosProcess`. For the others see :class:`SensorProcess`."""
@@ -53,6 +54,7 @@ class RobotProcesses:
                 SensorProcess(
                     name, scene, model, description, namespace=namespace, params_file=params_file, ros=ros,
                     keep_pictures=keep_pictures, sensor_hz=sensor_hz, renderer=renderer, device=device, pacing=pacing,
+                    standby=standby,
                 )
             )  # fmt: skip
             self.ros = None

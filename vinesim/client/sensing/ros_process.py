@@ -139,8 +139,8 @@ class RosProcess:
     # ------------------------------------------------------------------ in the loop
 
     def held(self) -> str:
-        """Why the next step must wait, in two words: "ROS messages", of which no more fit on the way to the process, or
-        "ROS subscribers", which are behind. Empty when it may run.
+        """Why the next step must wait, in two words: no more "ROS messages" fit on the way to the process, or it waits
+        for "ROS subscribers", which are behind. Empty when it may run.
 
         A loop that calls it before each step, until it is empty, loses no message of a step on the way. A process that
         is not ready, or has done nothing for :data:`HOLD_TIMEOUT`, does not hold the loop; what finds no room is lost
@@ -335,9 +335,9 @@ class RosProcess:
 
 
 def _cause_to_wait(channel: RosChannel) -> str:
-    if channel.steps.waiting_count >= channel.steps.capacity:
-        return "ROS messages"
-    return "ROS subscribers" if channel.wanted["pause"][0] else ""
+    if channel.steps.waiting_count < channel.steps.capacity:
+        return ""
+    return "ROS subscribers" if channel.wanted["waits"][0] else "ROS messages"
 
 
 class _Microphone:

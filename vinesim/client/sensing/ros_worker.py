@@ -40,6 +40,8 @@ NICENESS = 5
 """Behind the client's loop, before the renderer."""
 QUEUE_CAPACITY = 100
 """Steps that may wait for the process, a second of them; the loop waits then (:meth:`RosProcess.held`)."""
+WAIT_PERIOD = 0.004
+"""Time between two looks whether subscribers are behind [s]."""
 STATISTICS_PERIOD = 0.2
 """Wall time between two reports to the client [s]."""
 COUNT_PERIOD = 0.05
@@ -105,12 +107,12 @@ class RosChannel:
                 "truth_period": ((1,), "f8"),
                 "goals": ((1,), "?"),
                 "sound": ((1,), "?"),
-                "pause": ((1,), "?"),
+                "waits": ((1,), "?"),
                 "turns": ((1,), "i8"),
             }
         )
         """Whether topics have subscribers, and actions goals, and how often true poses are wanted [s], 0 for never;
-        whether the world shall wait for subscribers; how often the process has looked at all this, so that the client
+        whether the process waits for subscribers; how often the process has looked at all this, so that the client
         sees that it lives. Written by the process."""
 
     def close(self) -> None:
@@ -157,6 +159,7 @@ class RosWorker:
         """Goals that have ended, each after how many records of steps."""
         self._microphone = Microphone()
         self._next_count = self._next_statistics = 0.0
+        self._pace = Pace()
         self._reported_parameters = self.node.set_parameters
 
     def run(self) -> None:
@@ -164,7 +167,7 @@ class RosWorker:
         report_ready(self.pipe, NICENESS)
         with self.node, self.simulation or contextlib.nullcontext():
             while self._take_requests():
-                record = self.channel.steps.take(POLL_PERIOD)
+                record = self._next_record()
                 if record is not None:
                     self.node.publish_clock(float(record["time"]))
                     if record["has_state"]:
@@ -179,6 +182,21 @@ class RosWorker:
                     self.pipe.send(("commands", commands))
                 self._report()
         self._send_statistics()  # what was sent last is counted, too
+
+    def _next_record(self) -> Any | None:
+        """The next step to publish; None if none comes for a while, or subscribers are behind."""
+        steps, wanted = self.channel.steps, self.channel.wanted
+        begin = time.monotonic()
+        while steps.waiting_count and self.node.must_wait(now := time.monotonic()):
+            wanted["waits"][0] = True
+            if now - begin > POLL_PERIOD:
+                return None
+            time.sleep(WAIT_PERIOD)
+        wanted["waits"][0] = False
+        time.sleep(self._pace.delay(steps.put_count))
+        if (record := steps.take(POLL_PERIOD)) is not None:
+            self._pace.add()
+        return record
 
     def _take_requests(self) -> bool:
         """Answer the client's requests; False after a "stop"."""
@@ -250,6 +268,42 @@ class RosWorker:
             "commands_refused": self.node.refused_commands,
         }  # fmt: skip
         self.pipe.send(("statistics", statistics))
+
+
+class Pace:
+    """How fast steps are published that have waited: little faster than the world makes them, few at once.
+
+    Stock subscribers keep ten messages of a topic, and overwrite them when more come before they are taken. What takes
+    them may wait for a processor, and does not say so.
+    """
+
+    BURST = 5
+    """Steps that are published at once."""
+    SPEED = 1.5
+    """Rate beyond, as a multiple of the world's."""
+    LEAST = 50.0
+    """The same at least [Hz]: the world may have paused."""
+    PERIOD = 0.5
+    """Of measurements of the world's rate [s]."""
+
+    def __init__(self) -> None:
+        self._interval = 0.01
+        self._due = self._since = time.monotonic()
+        self._count = 0
+
+    def delay(self, put_count: int) -> float:
+        """Time until the next step may be published [s], after the world has put so many."""
+        now = time.monotonic()
+        if (passed := now - self._since) > self.PERIOD:
+            rate = self.SPEED * (put_count - self._count) / passed
+            self._since, self._count = now, put_count
+            self._interval = 1.0 / max(rate, self.LEAST)
+        return max(self._due - now, 0.0)
+
+    def add(self) -> None:
+        """A step is published now."""
+        earliest = time.monotonic() - (self.BURST - 1) * self._interval
+        self._due = max(self._due, earliest) + self._interval
 
 
 def truth_frame(visual: RigidVisual) -> str:

@@ -69,12 +69,14 @@ class SensorProcess:
         renderer: str = "warp",
         device: str = "cpu",
         pacing: SensorPacing | None = None,
+        standby: bool = False,
     ) -> None:
         """Starts the process; :meth:`attach` connects it with a client.
 
         ``keep_pictures`` keeps the picture of the first camera with the highest ``Client.frame_score`` for
         :meth:`save_picture`, and renders it even without subscribers. ``sensor_hz`` replaces the sensors' own rates.
         ``pacing``: whether simulated time waits for sensors; as the ``description`` says unless given.
+        ``standby``: another process stands by and takes its place if it fails, see :class:`WorkerProcess`.
         """
         self.name = name
         self.missed_snapshots = 0
@@ -103,7 +105,8 @@ class SensorProcess:
         self._parameters = config.parameters
         self.worker = WorkerProcess(
             f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
-            lambda context: SensorChannel(config, context), self._receive, rehearsal=SENSOR_REHEARSAL,
+            lambda context: SensorChannel(config, context), self._receive,
+            rehearsal=SENSOR_REHEARSAL if standby else "",
         )  # fmt: skip
         self._run: Run[SensorChannel] | None = None
         """The run of the process that snapshots were last written for."""

@@ -22,15 +22,18 @@ class SharedQueue:
     def __init__(self, record: np.dtype, capacity: int, context: BaseContext) -> None:
         self.lost = 0
         """Records that found no room."""
-        self.put_count = 0
-        """Records that were put; the writer's."""
         self.capacity = capacity
-        self._memory = SharedArrays({"records": ((capacity,), record), "taken": ((1,), "i8")})
+        self._memory = SharedArrays({"records": ((capacity,), record), "put": ((1,), "i8"), "taken": ((1,), "i8")})
         self._free = context.Semaphore(capacity)
         self._filled = context.Semaphore(0)
         self._next = 0
         self._unannounced = 0
         """Records that were put since the reader was woken last."""
+
+    @property
+    def put_count(self) -> int:
+        """Records that were put."""
+        return int(self._memory["put"][0])
 
     @property
     def taken_count(self) -> int:
@@ -39,7 +42,7 @@ class SharedQueue:
 
     @property
     def waiting_count(self) -> int:
-        """Records that were put and not taken yet; for the writer."""
+        """Records that were put and not taken yet."""
         return self.put_count - self.taken_count
 
     @contextlib.contextmanager
@@ -56,7 +59,7 @@ class SharedQueue:
             raise
         self._next = (self._next + 1) % self.capacity
         self._unannounced += 1
-        self.put_count += 1
+        self._memory["put"][0] += 1
 
     def wake(self) -> None:
         """Let the reader take what was put."""

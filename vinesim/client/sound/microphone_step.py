@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from vinesim.audio.loudness import gain
 from vinesim.audio.microphone import HeardFrame
-from vinesim.client.sound.exchange import SoundStep
 from vinesim.scene.values import TONE_LEVEL
+
+if TYPE_CHECKING:
+    from vinesim.client.sound.exchange import SoundStep
 
 
 class MicrophoneStep(NamedTuple):

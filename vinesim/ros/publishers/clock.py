@@ -16,7 +16,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from vinesim.ros.messages import convert
 from vinesim.ros.messages.serialized import stamp_writer
-from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage, Topic
+from vinesim.ros.topic import EVERY_STEP, Advertise, PendingMessage, Topic
 
 CLOCK = "/clock"
 LOOK_PERIOD = 0.25
@@ -65,7 +65,7 @@ class ClockPublisher:
         self._lone_looks = 0 if others else self._lone_looks + 1
         if self._topic is None:
             if self._lone_looks >= FREE_LOOKS and self._looks >= FIRST_LOOKS:
-                self._topic, self._lone_looks = self._advertise(ClockMessage, CLOCK, RELIABLE), 0
+                self._topic, self._lone_looks = self._advertise(ClockMessage, CLOCK, EVERY_STEP), 0
         elif own and any(other < own[0] for other in others):
             topic, self._topic, self._sends = self._topic, None, False
             self._withdraw(topic)

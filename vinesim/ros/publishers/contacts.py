@@ -15,7 +15,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from vinesim.ros.messages import convert
 from vinesim.ros.messages.serialized import stamp_writer
 from vinesim.ros.publishers.robot import MAP_FRAME
-from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
+from vinesim.ros.topic import EVERY_STEP, RELIABLE, Advertise, PendingMessage
 from vinesim.scene.values import Contact, RobotSample
 
 MARKER_PERIOD = 10
@@ -35,7 +35,7 @@ class ContactPublisher:
     ) -> None:  # fmt: skip
         """``bunch_of_body`` [body]: -1 for wood. ``links``: numbers of the robot's links by name. ``interest_radius``
         [m]: of the area of interest around the robot; None: there is none, as no other client is in the world."""
-        self._contacts = advertise(PointCloud2, "vine/contacts", RELIABLE)
+        self._contacts = advertise(PointCloud2, "vine/contacts", EVERY_STEP)
         self._markers = advertise(MarkerArray, "vine/markers", RELIABLE)
         self._bunch_of_body, self._links = bunch_of_body, links or {}
         self._edge = None if interest_radius is None else _circle(interest_radius)

@@ -10,7 +10,7 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from vinesim.ros.messages import convert
-from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
+from vinesim.ros.topic import EVERY_STEP, Advertise, PendingMessage
 from vinesim.scene.values import ControllerKind, ControllerSpec, RobotSample
 
 STATE_PERIOD = 2
@@ -25,12 +25,12 @@ class ControlPublisher:
 
         self._state_type = JointTrajectoryControllerState
         self._states = [
-            (spec.joints, advertise(JointTrajectoryControllerState, f"{spec.name}/controller_state", RELIABLE))
+            (spec.joints, advertise(JointTrajectoryControllerState, f"{spec.name}/controller_state", EVERY_STEP))
             for spec in controllers
             if spec.kind is ControllerKind.JOINT_TRAJECTORY
         ]
         self._elements = [
-            (joint, advertise(JointState, f"{spec.name}/{joint}/state", RELIABLE))
+            (joint, advertise(JointState, f"{spec.name}/{joint}/state", EVERY_STEP))
             for spec in controllers
             if spec.kind is ControllerKind.SERIES_ELASTIC
             for joint in spec.joints

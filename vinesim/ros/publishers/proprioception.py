@@ -10,7 +10,7 @@ from geometry_msgs.msg import WrenchStamped
 from sensor_msgs.msg import Imu
 
 from vinesim.ros.messages.serialized import imu_writer, wrench_writer
-from vinesim.ros.topic import RELIABLE, Advertise, PendingMessage
+from vinesim.ros.topic import EVERY_STEP, Advertise, PendingMessage
 from vinesim.scene.values import RobotSample
 
 
@@ -18,8 +18,8 @@ class ProprioceptionPublisher:
     """``<imu>`` and ``<sensor>/wrench`` after every step, of the sensors that are named."""
 
     def __init__(self, advertise: Advertise, imus: Sequence[str], wrenches: Sequence[str]) -> None:
-        self._imus = {name: advertise(Imu, name, RELIABLE) for name in imus}
-        self._wrenches = {name: advertise(WrenchStamped, f"{name}/wrench", RELIABLE) for name in wrenches}
+        self._imus = {name: advertise(Imu, name, EVERY_STEP) for name in imus}
+        self._wrenches = {name: advertise(WrenchStamped, f"{name}/wrench", EVERY_STEP) for name in wrenches}
         self._writers: dict[str, Callable[[Any], bytes]] = {}
         """By sensor, once it has been read."""
 

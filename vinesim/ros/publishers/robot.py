@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from vinesim import frames
 from vinesim.ros.messages.serialized import joint_state_writer, odometry_writer
 from vinesim.ros.messages.transforms import SerializedTransforms
-from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
+from vinesim.ros.topic import EVERY_STEP, TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values import JointSample, RobotSample
 
 MAP_FRAME, ODOM_FRAME = "map", "odom"
@@ -53,9 +53,9 @@ class RobotPublisher:
         self._odometry_frame = ""
         """That of :attr:`_write_odometry`."""
 
-        self._joints = advertise(JointState, "joint_states", RELIABLE)
-        self._tf = advertise(tf_message, "tf", RELIABLE)
-        self._odometry = advertise(Odometry, ODOMETRY, RELIABLE)
+        self._joints = advertise(JointState, "joint_states", EVERY_STEP)
+        self._tf = advertise(tf_message, "tf", EVERY_STEP)
+        self._odometry = advertise(Odometry, ODOMETRY, EVERY_STEP)
 
         advertise(String, "robot_description", TRANSIENT_LOCAL).send(String(data=urdf))
         static = SerializedTransforms([(parent, child) for parent, child, _ in static_transforms])
