@@ -56,6 +56,7 @@ def test_wind_moves_the_plants() -> None:
     assert max(moved[True]) > 0.02
 
 
+@pytest.mark.long
 def test_the_parameters_of_the_scene_are_used() -> None:
     """The same number of steps of wind lasts twice as long with steps twice as long."""
     model, seconds = sensor_scenes.demo(), []

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.support.long_rows import long
 from vinesim import frames
 from vinesim.client.first_view import first_view
 from vinesim.client.spectator import EYE_HEIGHT
@@ -17,7 +18,7 @@ HEAD = np.array([0.0, 0.0, 1.3])
 """Of a robot, above its base [m]."""
 
 
-@pytest.fixture(scope="module", params=["demo", "vsp", "tendone"])
+@pytest.fixture(scope="module", params=["demo", "vsp", *long("tendone")])
 def vineyard(request):
     """Scene, model, and places [body, 3] m of its bodies."""
     scene = load_scene(request.param)

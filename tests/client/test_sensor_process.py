@@ -95,6 +95,7 @@ def test_sensors_whose_gpu_is_gone_compute_on_the_cpu_and_the_report_says_so():
         assert lost.sensors.report()["sensor_device"] == "cpu"
 
 
+@pytest.mark.long
 def test_a_body_that_joins_while_a_list_is_on_its_way_does_not_end_the_pictures(robot):
     """The list of bodies changes after a snapshot with the old list has left and before the process has read it."""
     robot.run_for_pictures(1)
@@ -242,6 +243,7 @@ def test_the_kept_picture_is_written(robot, tmp_path):
     assert cv2.imread(str(tmp_path / "rgb.png")).std() > 10.0
 
 
+@pytest.mark.long
 def test_without_subscribers_a_picture_is_rendered_only_where_it_would_be_kept(robot, tmp_path):
     """While the score rises by the camera's rate; afterwards none, and the one with the highest score is written."""
     physics, counter = robot.client.physics, itertools.count(1)

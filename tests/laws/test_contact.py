@@ -326,6 +326,7 @@ def test_two_fingers_grasp_lift_pull_and_release_a_cane():
     assert np.abs(ours.snapshot().body_q - home)[:, :3].max() < 1e-3
 
 
+@pytest.mark.long
 def test_friction_along_a_cane_is_mujocos():
     """Mean force over three pieces within 1 %; from tick to tick it is smooth but for the corners between pieces."""
     model, spec = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.1)]), probe((0.5, 0.0, 1.03))

@@ -105,6 +105,7 @@ def test_a_robot_that_joins_and_leaves_changes_no_bit_of_the_others(undisturbed)
     assert differences(undisturbed, disturbed) == []
 
 
+@pytest.mark.long
 def test_removing_the_first_robot_changes_no_bit_of_the_others():
     """Bodies behind a removed robot in MuJoCo's arrays continue as if it had stayed, far away."""
     distant = bar((30.0, 30.0, 1.0), "newcomer", 1000.0, 100.0)

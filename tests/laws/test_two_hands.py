@@ -131,6 +131,7 @@ def test_two_equal_pulls_leave_the_bunch_in_the_middle_on_both_clients(delay, ji
     assert owners < set(world.hands)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("delay", [0.1, *long(0.0)])
 def test_of_two_pulls_the_stronger_wins_on_both_clients(delay):
     world = TwoHands(delay)

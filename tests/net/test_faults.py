@@ -16,6 +16,7 @@ import pytest
 
 from tests.support import programs
 from tests.support.live_server import ServerProcess, wait
+from tests.support.waiting import deadline
 from vinesim.bench.support.fake_client import FakeClientProcess
 
 pytestmark = pytest.mark.slow
@@ -23,9 +24,9 @@ pytestmark = pytest.mark.slow
 PLACES = {"ada": 1.0, "bob": 2.0, "cleo": 3.0, "dan": 2.5}
 SKEWS = {"ada": 2.0, "bob": -2.0}
 LEAVE_TIMEOUT = 2.5
-"""A frozen client is gone within [s]."""
+"""A frozen client is gone within [s], on a machine that is idle."""
 RESUME_TIMEOUT = 1.5
-"""Streams go on within this time after a server listens again [s]: a second, and half of one for a busy machine."""
+"""Streams go on within this time after a server listens again [s], on a machine that is idle."""
 ATTEMPTS = 5
 """One of so many has to keep to its time: a busy machine makes single ones late, a fault all of them."""
 
@@ -120,7 +121,7 @@ def test_a_killed_client_leaves_and_its_trees_get_a_new_owner_or_rest(clients, r
 def test_a_frozen_client_leaves_within_2_5_s_and_rejoins(clients, record_property):
     ada, bob = clients["ada"], clients["bob"]
     missed: list[float] = []
-    while len(missed) < ATTEMPTS and not any(after < LEAVE_TIMEOUT for after in missed):
+    while len(missed) < ATTEMPTS and not any(after < deadline(LEAVE_TIMEOUT) for after in missed):
         since = bob.command()["now"]
         ada.command(touch=[1], grab=[1])
         wait(lambda since=since: clients.has_received("bob", 1, since), "bob to receive the tree")
@@ -132,7 +133,7 @@ def test_a_frozen_client_leaves_within_2_5_s_and_rejoins(clients, record_propert
         missed.append(left_at - start)
         wait(lambda left_at=left_at: bob.command()["joined_at"]["ada"] > left_at, "ada to be back")
     record_property("missed after [s]", missed)
-    assert min(missed) < LEAVE_TIMEOUT
+    assert min(missed) < deadline(LEAVE_TIMEOUT)
     now = bob.command()["now"]
     wait(
         lambda: clients.has_received("bob", 1, now) or bob.command()["owner"]["1"] == "bob",
@@ -164,7 +165,7 @@ def test_streams_resume_within_a_second_of_a_server_restart(clients, record_prop
     ada.command(touch=[6])
     wait(lambda: clients.has_received("bob", 6, -math.inf), "bob to receive the tree")
     took: list[float] = []
-    while len(took) < ATTEMPTS and not any(after < RESUME_TIMEOUT for after in took):
+    while len(took) < ATTEMPTS and not any(after < deadline(RESUME_TIMEOUT) for after in took):
         clients.server.kill()
         wait(lambda: ada.command()["trouble"] and bob.command()["trouble"], "both to notice")
         ticks = ada.command()["ticks"]
@@ -174,5 +175,5 @@ def test_streams_resume_within_a_second_of_a_server_restart(clients, record_prop
         ready = bob.command()["now"]
         took.append(wait(lambda ready=ready: clients.has_received("bob", 6, ready), "the stream to resume"))
     record_property("streams again after [s]", took)
-    assert min(took) < RESUME_TIMEOUT
+    assert min(took) < deadline(RESUME_TIMEOUT)
     assert bob.command()["owner"]["6"] == "ada"

@@ -325,6 +325,7 @@ def test_a_hanging_bunch_is_part_of_its_tree_and_received_only_near(world):
     assert after["claim"] == before["claim"]
 
 
+@pytest.mark.long
 def test_a_free_bunch_from_cut_to_ground_to_hand_to_box(world):
     """F76, F77, F78: a stream while it moves; one record when it comes to rest, and not one byte after it."""
     world.settle()

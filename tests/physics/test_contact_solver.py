@@ -554,6 +554,7 @@ def test_waking_is_never_late(seed):
     assert touched <= woken
 
 
+@pytest.mark.long
 def test_more_than_ten_thousand_contacts_are_counted_and_the_deepest_stay():
     """Many canes in one place near fifteen bars: the number of dropped contacts is reported, twice the same."""
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.005, heading=4e-5 * i) for i in range(460)])

@@ -60,6 +60,7 @@ def own_cache(cache, monkeypatch) -> str:
     return cache
 
 
+@pytest.mark.long
 def test_two_processes_build_at_once_and_agree(cache):
     surroundings = os.environ | {"XDG_CACHE_HOME": cache}
     builds = [

@@ -266,6 +266,7 @@ def test_nothing_in_the_world_is_ground_and_sky() -> None:
     assert depth[row, 10] == pytest.approx(sensor_scenes.SMALL.fy / (row - sensor_scenes.SMALL.cy), rel=1e-5)
 
 
+@pytest.mark.long
 def test_depth_of_fine_meshes() -> None:
     """Open3D (Embree) sees berries as icospheres of 1,280 triangles, canes as prisms of 96 sides between such spheres,
     and leaves as sheets of some 6,000.

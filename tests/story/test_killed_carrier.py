@@ -86,6 +86,7 @@ def test_what_a_killed_robot_carried_falls_on_a_client_that_knew_of_it(y, is_lat
     assert_all_lies_on_the_ground(world, place, 1.5)
 
 
+@pytest.mark.long
 def test_what_a_killed_robot_carried_is_found_on_the_ground_by_those_who_come_later():
     """It was alone, and had driven to other cells since it took the box and the bunch."""
     world = World()

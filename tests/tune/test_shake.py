@@ -77,7 +77,7 @@ def test_the_same_seed_gives_the_same_file(tmp_path: pathlib.Path) -> None:
     assert text != (tmp_path / "other").read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_shaken_cane_is_written_read_and_fitted(tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From the command line's plan to a fit whose start is off: the truth lies within three of the expected standard
     deviations, and the oscillator that knows no beam has the frequency of the fitted cane."""

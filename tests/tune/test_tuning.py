@@ -220,6 +220,7 @@ def test_an_experiment_writes_the_track_and_says_what_a_fit_would_know(tmp_path,
     assert fit.estimate("mass").value == pytest.approx(1.0, rel=0.1)
 
 
+@pytest.mark.long
 def test_a_plant_is_tested_on_another_release(track: Trajectory) -> None:
     """Nothing of the plant is fitted: the right one leaves the noise, a stiffer one leaves more and says so."""
     right = tune(cane(), track, ())
@@ -231,6 +232,7 @@ def test_a_plant_is_tested_on_another_release(track: Trajectory) -> None:
     assert wrong.noise > 1.3 * right.noise
 
 
+@pytest.mark.long
 def test_a_force_that_contradicts_the_fit_is_a_fault(track: Trajectory) -> None:
     """A gauge that was read in the wrong unit made a modulus three times too high, or a mass."""
     held = np.where(track.time < 0.2, 1.2, np.nan)

@@ -17,6 +17,7 @@ from tests.support.live_page import (
     press,
     touch_screen,
 )
+from tests.support.long_rows import long
 from tests.support.recorded_pick import PICKED_AT, replay_of_a_pick
 from tests.support.waiting import wait
 from vinesim import frames
@@ -510,7 +511,7 @@ def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile(page):
 
 @pytest.mark.slow
 @pytest.mark.xdist_group("browser")
-@pytest.mark.parametrize("before", ["", OTHER_CARD], ids=["no graphics card", "a slow one"])
+@pytest.mark.parametrize("before", [*long(""), OTHER_CARD], ids=["no graphics card", "a slow one"])
 def test_a_spectator_alone_and_a_slow_browser_are_told_so_and_buttons_follow_who_comes(page, before):
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus) as live, touch_screen(page, 390, 844):
         notices = "document.getElementById('notices').textContent"
