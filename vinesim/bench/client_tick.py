@@ -1,24 +1,36 @@
-"""``vinesim bench tick``: the whole tick of a robot client with the push job, split into its five parts.
+"""``vinesim bench tick``: the whole tick of a robot client with the push job, paced as users have it and in a loop.
 
-The real client steps back to back on a clock that advances by one step a tick, so that it sends as many messages a tick
-as in real time. Its bus is in memory. Sensors and ROS run in other processes and are not part of these times.
+A paced client sleeps until each step is due, 100 times a second. Its caches are cold then, and a step takes two to five
+times as long as back to back. So the paced figures count; those of a loop stand beside them.
 
-Budgets stand beside processor time, which other programs on the machine change little; the wall time of whole ticks is
-given too.
+The real client steps on a clock that advances by one step a tick, so that it sends as many messages a tick as in real
+time. Its bus is in memory. Where a case has subscribers, it writes the records, true poses and snapshots that its ROS
+process and its sensor process ask for while all their topics have subscribers. The processes themselves do not run.
+
+Times are given in processor time, which other programs on the machine change less, and in wall time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
+import os
 import time
-from collections.abc import Iterator
+import types
+from collections.abc import Callable, Iterator
+from multiprocessing import get_context
+from multiprocessing.context import BaseContext
+from typing import Any
+from unittest import mock
 
 import numpy as np
 
 from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
+from vinesim.client.sensing import ros_process, sensor_process
 from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.start_poses import QUEUE_SPACING, find_push_pose, start_pose
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -30,9 +42,11 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.values import Measurement
 
-WARM_UP_TICKS, MEASURED_TICKS = 300, 2000
+WARM_UP_TICKS, MEASURED_TICKS = 300, 1000
 PARTS = ("receive", "control", "step", "sense", "send")
 """Parts of a tick, in their order."""
+TRUTH_PERIOD = 0.1
+"""Simulated time between two true poses of all bunches, as the ROS process asks for them unless set [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,23 +54,43 @@ class Case:
     """One client that is measured, and its budgets [ms, p50]."""
 
     scene: str
-    robots: int
-    has_visitor: bool
+    robots: int = 1
+    has_visitor: bool = False
     """Whether a second client with a robot is near: its copy is simulated here, and states are exchanged."""
-    tick_budget: float
+    has_subscribers: bool = False
+    """Whether all topics of the first robot have subscribers."""
+    tick_budget: float | None = None
     step_budget: float | None = None
+    """Of a step of the physics, back to back."""
+
+    @property
+    def text(self) -> str:
+        """The case in words."""
+        text = f"{self.scene}, {self.robots} robot{'s' * (self.robots > 1)}, one pushes"
+        return text + ", a visitor beside" * self.has_visitor + ", all topics subscribed" * self.has_subscribers
 
 
 CASES = (
-    Case("demo", 1, False, tick_budget=1.2, step_budget=0.6),
-    Case("demo", 1, True, tick_budget=1.2),
-    Case("demo", 10, False, tick_budget=2.0),
-    Case("tendone", 1, False, tick_budget=2.0),
+    Case("demo", has_subscribers=True),
+    Case("demo", tick_budget=1.2, step_budget=0.6),
+    Case("demo", has_visitor=True, tick_budget=1.2),
+    Case("demo", robots=10, tick_budget=2.0),
+    Case("tendone", tick_budget=2.0),
 )
 
 
+@dataclasses.dataclass(frozen=True)
+class TickTimes:
+    """Times of ticks [s]."""
+
+    cpu: np.ndarray
+    """[tick, part + 1] processor time of the thread in each part, and of the whole tick."""
+    wall: np.ndarray
+    """[tick, part + 1] the same in wall time."""
+
+
 def client_measurements() -> Iterator[Measurement]:
-    """Whole ticks and their parts, each beside its budget where there is one."""
+    """Whole ticks and their parts, paced and back to back, each beside its budget where there is one."""
     robot = load_description("vinebot")
     for case in CASES:
         scene = load_scene(case.scene)
@@ -68,7 +102,7 @@ class PushingClient:
 
     def __init__(
         self, scene: Scene, model: Model, robot: RobotDescription, stack: contextlib.ExitStack, *,
-        robots: int = 1, has_visitor: bool = False,
+        robots: int = 1, has_visitor: bool = False, has_subscribers: bool = False,
     ) -> None:  # fmt: skip
         self._hub, self._now = MemoryHub(), 0.0
         bunch, pose = find_push_pose(model, start_pose(scene, 0)[:2])
@@ -80,10 +114,26 @@ class PushingClient:
         if has_visitor:
             behind = frames.compose(pose, frames.pose([-QUEUE_SPACING, 0.0, 0.0]))
             self._visitor = self._add_client(scene, model, robot, "visitor", behind, stack)
+        self._drain: Callable[[], int] = lambda: 0
+        self.taken_steps = 0
+        """Records of steps that the subscribers have taken."""
+        if has_subscribers:
+            self._drain = _subscribe_to_all(client, scene, model, robot, stack)
         rest = client.physics.state.body_q[model.bunch_body[bunch]].copy()
-        client.trace = trace = Trace(model, bunch, rest, WARM_UP_TICKS + MEASURED_TICKS)
+        client.trace = trace = Trace(model, bunch, rest, 1 << 16)
         self.push = PushBunch(client.robot, client.side_of(trace.centre()), trace.centre)
         client.pre_step += [self.push.control, LookAt(client.robot, trace.centre)]
+        self._marks = np.zeros((2 * len(PARTS), 2))
+        """[begin and end of each part, 2] processor time of the thread and wall time [s]."""
+        for i, name in enumerate(PARTS):
+            owner = client.physics if name == "step" else client
+            setattr(owner, name, functools.partial(self._time, i, getattr(owner, name)))
+
+    def _time(self, part: int, work: Callable[..., None], *arguments: Any) -> None:
+        marks = self._marks
+        marks[2 * part] = time.thread_time(), time.perf_counter()
+        work(*arguments)
+        marks[2 * part + 1] = time.thread_time(), time.perf_counter()
 
     def _add_client(
         self, scene: Scene, model: Model, robot: RobotDescription, name: str, pose: np.ndarray,
@@ -93,47 +143,110 @@ class PushingClient:
         return Client(scene, model, robot, bus, name=name, pose=pose, clock=lambda: self._now)
 
     def tick(self) -> np.ndarray:
-        """One tick of both clients; processor times of the parts of the first one's, then its wall time [6] s."""
-        client, now = self.client, self._now
-        start = time.perf_counter()
-        marks = [time.thread_time()]
-        client.receive(now)
-        marks.append(time.thread_time())
-        client.control()
-        marks.append(time.thread_time())
-        client.physics.step()
-        marks.append(time.thread_time())
-        client.sense()
-        marks.append(time.thread_time())
-        client.send(now)
-        marks.append(time.thread_time())
-        wall = time.perf_counter() - start
+        """One tick of both clients; [part + 1, 2] processor and wall time of the first one's parts, and of its whole
+        tick [s]."""
+        client = self.client
+        begin = time.thread_time(), time.perf_counter()
+        client.tick()
+        whole = time.thread_time() - begin[0], time.perf_counter() - begin[1]
         if self._visitor is not None:
             self._visitor.tick()
+        self.taken_steps += self._drain()
         self._hub.advance(client.physics.dt)
         self._now += client.physics.dt
-        return np.append(np.diff(marks), wall)
+        return np.concatenate([self._marks[1::2] - self._marks[::2], [whole]])
+
+    def measure(self, ticks: int, *, is_paced: bool) -> TickTimes:
+        """Times of so many ticks, each begun when it is due in real time, or back to back."""
+        loop = RateLoop(self.client.physics.dt)
+        times = np.zeros((ticks, len(PARTS) + 1, 2))
+        for row in times:
+            if is_paced:
+                loop.begin()
+            row[:] = self.tick()
+            if is_paced:
+                loop.end()
+        return TickTimes(times[..., 0], times[..., 1])
+
+
+class _Demand:
+    """Stands for a process of the client that runs and whose topics all have subscribers; it takes what is written."""
+
+    is_ready, pid, standby_pid, restarts, restart_time = True, 0, None, 0, 0.0
+
+    def __init__(
+        self, title: str, modules: Any, target: Any, config: Any, share: Callable[[BaseContext], Any], receive: Any,
+        **_: Any,
+    ) -> None:  # fmt: skip
+        self.title, self.shared = title, share(get_context())
+        self.process = types.SimpleNamespace(pid=os.getpid())
+
+    def current(self) -> _Demand:
+        """As of a worker process; here it is the run too."""
+        return self
+
+    def send(self, kind: str, value: Any = None) -> None:
+        """Take a message."""
+
+    def wait_until_ready(self, timeout: float) -> None:
+        """It always is."""
+
+    def raise_failure(self) -> None:
+        """There is none."""
+
+    def close(self) -> None:
+        """Release the memory."""
+        self.shared.close()
+
+
+def _subscribe_to_all(
+    client: Client, scene: Scene, model: Model, robot: RobotDescription, stack: contextlib.ExitStack
+) -> Callable[[], int]:
+    """Ask the client for all that the topics of its first robot need; a function that takes the records of steps, and
+    returns how many there were."""
+    with mock.patch.object(ros_process, "WorkerProcess", _Demand):
+        ros = stack.enter_context(ros_process.RosProcess(client.name, model, robot))
+    with mock.patch.object(sensor_process, "WorkerProcess", _Demand):
+        sensors = stack.enter_context(sensor_process.SensorProcess(client.name, scene, model, robot))
+    channel = ros.worker.current().shared
+    channel.wanted["steps"][:] = True
+    channel.wanted["truth_period"][0] = TRUTH_PERIOD
+    sensors.worker.current().shared.wanted["world"][0] = True
+    sensors.attach(client)
+    ros.attach(client)
+
+    def drain() -> int:
+        count = 0
+        while channel.steps.waiting_count:
+            channel.steps.take(0.0)
+            count += 1
+        return count
+
+    return drain
 
 
 def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) -> Iterator[Measurement]:
     """Rows of one case."""
     with contextlib.ExitStack() as stack:
         pushing = PushingClient(
-            scene, model, robot, stack, robots=case.robots, has_visitor=case.has_visitor
+            scene, model, robot, stack, robots=case.robots, has_visitor=case.has_visitor,
+            has_subscribers=case.has_subscribers,
         )  # fmt: skip
-        for _ in range(WARM_UP_TICKS):
-            pushing.tick()
-        *parts, wall = 1e3 * np.array([pushing.tick() for _ in range(MEASURED_TICKS)]).T
-    text = f"{case.scene}, {len(model.bunch_body)} bunches, {case.robots} robot{'s' * (case.robots > 1)}, one pushes"
-    text += ", a visitor beside" * case.has_visitor
-    whole = np.sum(parts, axis=0)
-    yield _row(f"{text}: whole tick, p50", float(np.median(whole)), case.tick_budget)
-    yield _row(f"{text}: whole tick, p99", float(np.percentile(whole, 99)))
-    yield _row(f"{text}: wall time, p50", float(np.median(wall)))
-    yield _row(f"{text}: wall time, p99", float(np.percentile(wall, 99)))
-    for name, times in zip(PARTS, parts, strict=True):
-        budget = case.step_budget if name == "step" else None
-        yield _row(f"{text}: {name}, p50", float(np.median(times)), budget)
+        pushing.measure(WARM_UP_TICKS, is_paced=False)
+        paced = pushing.measure(MEASURED_TICKS, is_paced=True)
+        loop = pushing.measure(MEASURED_TICKS, is_paced=False)
+    yield from _rows(f"{case.text}: paced", paced, case.tick_budget, None)
+    yield from _rows(f"{case.text}: loop", loop, None, case.step_budget)
+
+
+def _rows(text: str, times: TickTimes, tick_budget: float | None, step_budget: float | None) -> Iterator[Measurement]:
+    """Median and 99th percentile of the whole tick and its parts, in processor and wall time."""
+    budgets = {"whole tick": tick_budget, "step": step_budget}
+    for kind, values in (("CPU", times.cpu), ("wall", times.wall)):
+        for name, column in zip((*PARTS, "whole tick"), 1e3 * values.T, strict=True):
+            budget = budgets.get(name) if kind == "CPU" else None
+            yield _row(f"{text}, {kind}, {name}, p50", float(np.median(column)), budget)
+            yield _row(f"{text}, {kind}, {name}, p99", float(np.percentile(column, 99)))
 
 
 def _row(case: str, value: float, budget: float | None = None) -> Measurement:

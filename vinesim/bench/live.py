@@ -122,7 +122,7 @@ def measure_generation() -> Iterator[Measurement]:
 
 
 def measure_tick() -> Iterator[Measurement]:
-    """Whole ticks of clients back to back, without sensors and ROS."""
+    """Whole ticks of clients, paced and back to back."""
     from vinesim.bench.client_tick import client_measurements
 
     return client_measurements()
@@ -142,7 +142,7 @@ ROWS = {
     "tendone": Row("client alone in tendone", 45.0, measure_tendone),
     "start": Row("vinesim render with and without --path, parts of a start", 90.0, measure_start),
     "generate": Row("demo and tendone generated, then read from the cache", 20.0, measure_generation),
-    "tick": Row("whole ticks back to back, of one robot and of ten", 60.0, measure_tick),
+    "tick": Row("whole ticks, paced and back to back, of one robot and of ten", 110.0, measure_tick),
     "link": Row("touch to motion as another client sees it, over an emulated LAN (root)", 60.0, measure_link),
     "cold": Row("client alone with empty caches: compiles every kernel", 180.0, measure_cold),
 }
