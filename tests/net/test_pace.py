@@ -83,6 +83,16 @@ def test_a_client_that_stops_slows_the_others_for_three_seconds_at_most() -> Non
     assert factors.min() > 0.9
 
 
+def test_a_clock_that_was_starved_itself_leaves_nobody_behind() -> None:
+    """It got a processor once in two seconds only: so may its clients, which are not stopped."""
+    clock, ada = WorldClock(0.0), Client("ada", 2.0)
+    run(clock, [ada], 0.0, 5.0)
+    for now in (7.0, 9.0, 11.0):
+        clock.advance(now)
+    assert clock.left_behind == []
+    assert clock.time(11.0) - ada.time < STOP_LAG + 1.0, "but it waits for them"
+
+
 def test_a_client_that_comes_back_far_behind_is_not_waited_for() -> None:
     clock, ada, bob = WorldClock(0.0), Client("ada", 2.0), Client("bob", 2.0)
     run(clock, [ada, bob], 0.0, 5.0)

@@ -121,7 +121,7 @@ class _Span:
 
 
 class PaceMeter:
-    """Measures how fast a loop could make steps of ``dt`` [s], by its idle time: work that waits for a core counts."""
+    """Measures how fast a loop could make steps of ``dt`` [s], by its idle time. Work that waits for a core counts."""
 
     def __init__(self, dt: float) -> None:
         self.limits: list[Callable[[], Limit]] = []
@@ -136,7 +136,7 @@ class PaceMeter:
         self._span = _Span(now)
 
     def idle(self, seconds: float) -> None:
-        """The loop was going to sleep for so long; what it overslept counts as work."""
+        """The loop slept for so long, be it longer than it wanted: a loop that is late sleeps less the next time."""
         if self._span is not None:
             self._span.idle += seconds
 

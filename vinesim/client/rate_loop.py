@@ -136,9 +136,9 @@ class RateLoop:
             self.meter.begin(now)
         while (wait := self._time_to_wait(now)) > self.SHORTEST_SLEEP and not self.is_stopping():
             sleep = min(wait, self.LONGEST_SLEEP)
-            self.meter.idle(sleep)
             time.sleep(sleep)
-            now = time.monotonic()
+            since, now = now, time.monotonic()
+            self.meter.idle(now - since)
             if wait > sleep:
                 self.clock.keep(now)
         while (cause := self.hold()) and not self.is_stopping():

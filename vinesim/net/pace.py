@@ -47,6 +47,10 @@ def describe(factor: float, cause: str) -> str:
     return f"{factor:.2f} of real time" + (f" ({cause})" if cause else "")
 
 
+MAX_STEP = 4.0 * STEP
+"""Most by which the silence of clients grows between two calls of :meth:`WorldClock.advance` [s]."""
+
+
 class PaceReport(NamedTuple):
     """What one client tells the clock of its world."""
 
@@ -65,6 +69,8 @@ class _Client:
     """Real time of its last report [s]."""
     lag: float
     """How far it is behind [s of the world]."""
+    silence: float = 0.0
+    """How long it has reported nothing, as far as this clock itself got a processor meanwhile [s]."""
     is_left_behind: bool = False
 
 
@@ -100,7 +106,7 @@ class WorldClock:
         stays_behind = before is not None and before.is_left_behind and lag >= STOP_LAG
         if before is not None and before.is_left_behind and not stays_behind:
             log.info("%s follows the world's clock again", name)
-        self._clients[name] = _Client(report, now, lag, stays_behind)
+        self._clients[name] = _Client(report, now, lag, is_left_behind=stays_behind)
 
     def forget(self, name: str) -> None:
         """A client has left."""
@@ -108,6 +114,8 @@ class WorldClock:
 
     def advance(self, now: float) -> None:
         """Go on to real time ``now`` [s]; call it several times a second."""
+        for client in self._clients.values():  # a machine that starves the server starves its clients, too
+            client.silence += min(now - self._now, MAX_STEP)
         while self._now < now:
             step = min(STEP, now - self._now)
             self._time += self.factor * step
@@ -119,10 +127,9 @@ class WorldClock:
 
     def _watch(self, name: str, client: _Client, step: float) -> None:
         """Note how far a client without a report is behind now, and leave it behind in the end."""
-        silent = self._now - client.arrived
-        if silent > OVERDUE:
+        if self._now - client.arrived > OVERDUE:
             client.lag += self.factor * step
-        if silent > SILENCE and not client.is_left_behind:
+        if client.silence > SILENCE and not client.is_left_behind:
             client.is_left_behind = True
             log.warning("%s has not answered for %.0f s: the world goes on without waiting for it", name, SILENCE)
 
