@@ -33,7 +33,7 @@ def compiled(process: subprocess.Popen[str]) -> tuple[int, list[str]]:
     return int(words[-1].removeprefix("compiled ")), words[:-1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_of_processes_that_start_together_one_compiles(tmp_path: pathlib.Path) -> None:
     results = [compiled(process) for process in [start(tmp_path) for _ in range(2)]]
     counts = sorted(count for count, _ in results)
