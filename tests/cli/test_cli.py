@@ -165,6 +165,7 @@ def test_recording_needs_a_server_and_a_writable_file(tmp_path):
         assert_refused(vinesim("record", "no/run.mcap", "--connect", server.endpoint, cwd=tmp_path), 5, "no/run.mcap")
 
 
+@pytest.mark.long
 def test_a_second_actor_of_one_name_is_refused():
     with Server("tcp/127.0.0.1:0") as server:
         arguments = ["client", "--connect", server.endpoint, "--name", "twin", "--no-ros", "--status", "json"]

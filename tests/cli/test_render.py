@@ -9,6 +9,7 @@ import pathlib
 import msgspec
 import pytest
 
+from tests.support.long_rows import long
 from vinesim.cli.render import run
 from vinesim.errors import UsageError, WriteError
 
@@ -24,7 +25,7 @@ def files(folder: pathlib.Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in sorted(folder.iterdir())}
 
 
-@pytest.mark.parametrize("kind", ["csv", "json"])
+@pytest.mark.parametrize("kind", ["json", *long("csv")])
 def test_each_viewpoint_of_a_path_gives_the_picture_that_it_gives_alone(kind: str, tmp_path: pathlib.Path) -> None:
     points = [(0.4, 1.2, 1.3, 3.0, 1.0, 1.7), (1.0, 1.3, 1.2, 3.0, 1.0, 1.7), (0.4, 1.2, 1.3, 3.0, 1.0, 1.7)]
     path = tmp_path / f"tour.{kind}"

@@ -1,5 +1,6 @@
 """Commands of vinesim in the pages are accepted as they stand there; short ones run, and so does the Python."""
 
+import functools
 import pathlib
 import re
 import shlex
@@ -27,8 +28,8 @@ RUNS = ("certs ", "experiment ", "render ", "replay run.mcap --out ", "replay ru
 """How commands begin that end by themselves, in seconds."""
 ELSEWHERE = {"docs/gradients.md", "docs/sensors.md", "README.md"}
 """Pages whose Python other tests run: test_gradients, test_reconstruction, test_docs."""
-LONG = {"docs/tuning.md", "docs/tutorials/research.md"}
-"""Pages whose commands compute for long; tests/tune has the same in short."""
+SHORT = {"README.md", "docs/plants.md"}
+"""Pages whose commands ``make test`` runs; those of the others are tested by the commands' own tests too."""
 
 
 def shell_lines(page: pathlib.Path) -> list[str]:
@@ -60,10 +61,16 @@ def commands_in_prose() -> list[str]:
     return sorted(" ".join(line.split()) for line in found if not re.match(r"[.A-Z]", line))
 
 
+@functools.cache
+def typer_command() -> typer.main.TyperCommand:
+    """All commands, built once."""
+    return typer.main.get_command(app)
+
+
 def resolve(line: str) -> tuple[typer.main.TyperCommand, typer.Context, list[str]]:
     """The command that a line names, its context and the words that it is given; a usage error of click's if there is
     none."""
-    command, words = typer.main.get_command(app), shlex.split(line)
+    command, words = typer_command(), shlex.split(line)
     context = command.context_class(command)
     while hasattr(command, "resolve_command") and words and not words[0].startswith("-"):
         name, command, words = command.resolve_command(context, words)
@@ -125,7 +132,7 @@ def pages_that_run() -> list:
         marks = [pytest.mark.ros] if any("--ros" in line for line in lines) else []
         if lines:
             name = str(page.relative_to(ROOT))
-            if name in LONG:
+            if name not in SHORT:
                 marks.append(pytest.mark.long)
             found.append(pytest.param(page, id=name, marks=marks))
     return found

@@ -74,7 +74,7 @@ def compilers_of(pid: int) -> list[int]:
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_of_processes_that_start_together_one_compiles(tmp_path: pathlib.Path) -> None:
     results = [compiled(process) for process in [start(tmp_path) for _ in range(2)]]
     wanted = len(module_names((PACKAGE,)))

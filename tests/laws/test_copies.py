@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 import pytest
 
+from tests.support.long_rows import each_once
 from vinesim import frames
 from vinesim.physics.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
@@ -71,11 +72,11 @@ def test_of_two_opposed_robots_the_stronger_wins(left, right):
         assert -contact == pytest.approx(min(left, right), rel=0.02)
 
 
-@pytest.mark.parametrize("delay", [1, 5, 10])
-@pytest.mark.parametrize(("left", "right"), [(30.0, 80.0), (80.0, 30.0)])
-def test_of_two_opposed_robots_of_two_clients_the_stronger_wins(left, right, delay):
+@pytest.mark.parametrize(("forces", "delay"), each_once([(30.0, 80.0), (80.0, 30.0)], [1, 5, 10]))
+def test_of_two_opposed_robots_of_two_clients_the_stronger_wins(forces, delay):
     """Each client moves its own ram and has a copy of the other, ``delay`` ticks old. The same ram wins on both,
     and the clients differ by the deflection of the spring that carries the force: limit / K."""
+    left, right = forces
     worlds = {"left": RigidWorld(assemble([])), "right": RigidWorld(assemble([]))}
     queue: dict[str, deque] = {name: deque() for name in worlds}
     for rigid in worlds.values():

@@ -167,6 +167,7 @@ def test_one_hand_sends_no_force_and_the_last_of_two_ends_the_messages():
         assert not client.physics.contact_solver.trees_touched_by_copies[0] or client.name == "bob"
 
 
+@pytest.mark.long
 def test_the_other_pull_ends_when_its_client_falls_silent():
     """A client that crashes while it pulls lets go within a fifth of a second."""
     world = TwoHands(0.02)

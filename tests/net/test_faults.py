@@ -118,6 +118,7 @@ def test_a_killed_client_leaves_and_its_trees_get_a_new_owner_or_rest(clients, r
     assert clients.owners(5) <= {None, *clients.processes}
 
 
+@pytest.mark.long
 def test_a_frozen_client_leaves_within_2_5_s_and_rejoins(clients, record_property):
     ada, bob = clients["ada"], clients["bob"]
     missed: list[float] = []
@@ -142,6 +143,7 @@ def test_a_frozen_client_leaves_within_2_5_s_and_rejoins(clients, record_propert
     wait(lambda: clients.agree(1), "all to name the same owner")
 
 
+@pytest.mark.long
 def test_what_a_frozen_client_owned_before_is_not_believed_when_it_comes_back(clients):
     """Another one has grasped its tree meanwhile; the others have gone on."""
     ada, bob, cleo = clients["ada"], clients["bob"], clients["cleo"]

@@ -105,7 +105,7 @@ def apply_action(world: World, name: str, action: str, number: int, picked: set[
 
 
 @given(scenarios, st.integers(0, 2**31), st.sampled_from([0.0, 0.02, 0.3]), st.sampled_from([0.0, 0.3]))
-@settings(max_examples=share(0.15))
+@settings(max_examples=share(0.08))
 def test_after_any_actions_all_agree_and_picked_bunches_stay_picked(scenario, seed, loss, duplicated):
     world = World("ada", "bob", "cleo", delay=0.03, jitter=0.02, loss=loss, duplicated=duplicated, seed=seed)
     world.run(0.4)

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.support.examples import share
 from vinesim import frames
 from vinesim.physics.plants.articulation_solver import ArticulationSolver
 from vinesim.physics.plants.fault_guard import FaultGuard
@@ -109,7 +108,7 @@ def clean_run(count: int) -> tuple[np.ndarray, ...]:
     return tuple(joints)
 
 
-@settings(max_examples=share(1.0), derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     tick=st.integers(0, 30),
     body=st.integers(7, 11),  # not the root: a force on a clamped body moves nothing
@@ -243,7 +242,7 @@ def run_random(
     return plants, guard
 
 
-@settings(max_examples=share(0.2), derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**31))
 def test_any_tree_under_any_load_stays_finite(seed: int) -> None:
     """Any input: no non-finite value survives a tick, faults are counted, stopped trees wake again."""

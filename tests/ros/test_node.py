@@ -133,6 +133,7 @@ def topic_monitor(*topics: str, queue: int = 10) -> Iterator[Callable[[], dict]]
             process.communicate()
 
 
+@pytest.mark.long
 def test_large_messages_reach_another_process():
     """The gate: at 100 Hz ticks, 30 Hz RGB and depth and 10 Hz clouds of 100k points, 95 % arrive."""
     small = ("/clock", "/joint_states", "/tf")
@@ -444,6 +445,7 @@ def test_a_stream_of_bad_commands_does_not_fill_the_log(caplog):
     assert len({record.getMessage() for record in caplog.records}) == MAX_LOGGED
 
 
+@pytest.mark.long
 def test_two_robots_in_one_process_under_namespaces():
     with (
         RobotNode("one", "<robot name='one'/>", namespace="robot_1") as one,

@@ -62,6 +62,7 @@ def record(path: pathlib.Path) -> tuple[Client, float]:
     return client, EPOCH + hub.time
 
 
+@pytest.mark.long
 def test_a_recorded_world_is_heard_in_ros(tmp_path, monkeypatch) -> None:
     """Joints and frames are those of the recorded robot, the clock is that of the recording, and it never goes back."""
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.support import beam_theory
+from tests.support.long_rows import long
 from vinesim import frames
 from vinesim.scene import plant_parameters
 from vinesim.scene import spec as scenes
@@ -367,6 +368,7 @@ def modes(model, tree):
     return square.real[order], shape.real[:, order], inertia
 
 
+@pytest.mark.parametrize("vineyard", ["demo", *long("vsp")], indirect=True)
 def test_shoots_are_stable(vineyard):
     """Every equilibrium is stable, of shoots with none, one and two bunches."""
     model = vineyard[1]

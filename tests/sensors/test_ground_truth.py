@@ -357,6 +357,7 @@ def test_depth_and_lidar_measure_the_same_scene(grove) -> None:
     assert np.median(error) < 2e-3
 
 
+@pytest.mark.long
 def test_registration_recovers_the_motion_between_two_views(grove) -> None:
     """Open3D's ICP on the clouds of two looks finds how the camera moved, within 2 mm and 0.1 degree."""
     o3d = pytest.importorskip("open3d", reason="Open3D is an extra (perception)")

@@ -210,6 +210,7 @@ def test_motion_of_a_hanging_bunch_is_replicated_only_nearby(is_near):
     assert bob.physics.state.bunch_attached.all()
 
 
+@pytest.mark.long
 def test_a_bunch_cut_by_two_in_one_tick_has_one_owner():
     world, ada, bob = two_clients()
     for client in (ada, bob):
@@ -223,6 +224,7 @@ def test_a_bunch_cut_by_two_in_one_tick_has_one_owner():
     assert len([record for _, record in world.server.records if record.object == BUNCH(0)]) == 1
 
 
+@pytest.mark.long
 def test_a_cut_cane_falls_on_every_client_nearby_to_the_same_pose():
     world, ada, bob = two_clients()
     body = int(ada.model.tree_first[1]) + 8

@@ -8,6 +8,7 @@ environment when it imports is that of the server: tests of imports and of compi
 from __future__ import annotations
 
 import array
+import contextlib
 import gc
 import importlib
 import json
@@ -47,8 +48,8 @@ def serve(control: socket.socket) -> None:
                 events.unregister(key.fd)
                 os.close(key.fd)
                 code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-                status.sendall(f"{code}\n".encode())
-                status.close()
+                with status, contextlib.suppress(OSError):  # nobody may wait for it any more
+                    status.sendall(f"{code}\n".encode())
                 continue
             text, ancillary, _, _ = control.recvmsg(MAX_REQUEST, socket.CMSG_SPACE(4 * 4))
             if not text:
@@ -68,7 +69,8 @@ def serve(control: socket.socket) -> None:
             for file in files[:3]:
                 os.close(file)
             status = socket.socket(fileno=files[3])
-            status.sendall(f"{pid}\n".encode())
+            with contextlib.suppress(OSError):
+                status.sendall(f"{pid}\n".encode())
             descriptor = os.pidfd_open(pid)
             running[descriptor] = pid, status
             events.register(descriptor, selectors.EVENT_READ)
