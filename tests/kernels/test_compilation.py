@@ -52,7 +52,7 @@ def test_of_processes_that_start_together_one_compiles(tmp_path: pathlib.Path) -
     assert "lidar" in lines[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cache_that_cannot_be_made_is_replaced_for_this_time(tmp_path: pathlib.Path) -> None:
     (tmp_path / "warp").write_text("not a folder")
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "warp"), "TMPDIR": str(tmp_path)}
