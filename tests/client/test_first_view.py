@@ -46,7 +46,7 @@ def distance_to_line(points, start, end):
     return np.linalg.norm(points - start - along[:, None] * way, axis=1)
 
 
-@pytest.mark.parametrize("back", [6.0, 9.0, 14.0])
+@pytest.mark.parametrize("back", [6.0, *long(9.0, 14.0)])
 def test_of_an_actor_far_away_the_vines_are_in_the_middle_and_large(vineyard, back):
     scene, model, bodies = vineyard
     start = frames.pose(model.tree_pose[0, :3] * [1.0, 1.0, 0.0] - [back, 0.0, 0.0], frames.from_yaw(back))

@@ -161,6 +161,7 @@ def options(file: pathlib.Path, out: pathlib.Path, **changes) -> dict:
     return defaults | {"file": file, "out": out, "pose": None, "scene": None, "seed": None} | changes
 
 
+@pytest.mark.long
 def test_a_replay_is_rendered(robot_recording, tmp_path, capsys):
     assert read_recording(robot_recording).metadata.items() >= {"scene": "demo", "seed": "7"}.items()
     assert replay(**options(robot_recording, tmp_path, end=1.5)) == 0

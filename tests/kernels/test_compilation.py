@@ -107,7 +107,7 @@ def test_compilers_end_with_the_process_that_started_them_and_another_goes_on(
     assert compiled(start(tmp_path)) == (0, [])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cache_that_cannot_be_made_is_replaced_for_this_time(tmp_path: pathlib.Path) -> None:
     (tmp_path / "warp").write_text("not a folder")
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "warp"), "TMPDIR": str(tmp_path)}

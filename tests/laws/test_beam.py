@@ -28,6 +28,7 @@ def test_the_elastica_agrees_with_its_elliptic_integrals(alpha: float) -> None:
     assert beam_theory.elastica(beam) == pytest.approx(beam_theory.elastica_by_integrals(alpha), abs=1e-6)
 
 
+@pytest.mark.long
 def test_elastica_at_any_load() -> None:
     """Tips of 135 canes, alpha 0.05 to 20, by own weight, a bunch, or both, clamped from -57 to 57 degrees: 0.5 %."""
     cases, expected, measured = beam_theory.elastica_sweep()

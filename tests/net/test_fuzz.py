@@ -38,7 +38,7 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import RobotUpdate
 
 
-@pytest.mark.parametrize("kind", ["robot", "human"])
+@pytest.mark.parametrize("kind", ["human", *long("robot")])
 def test_a_flood_of_malformed_messages_is_counted_logged_once_and_leaves_all_in_agreement(caplog, kind):
     """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
     result = message_fuzz.run_storm(3_000, seed=11, kind=kind)
@@ -172,6 +172,7 @@ def test_a_client_with_physics_survives_malformed_messages(kind):
     assert client.replicator.peers == {}
 
 
+@pytest.mark.long
 def test_jumps_of_a_remote_person_do_not_push_a_robot_on_its_wheels():
     """Poses of human size that jump in and about the robot, and corrupted ones of a seed that once pushed it 9 m."""
     hub, now = MemoryHub(), [10.0]

@@ -197,6 +197,7 @@ def _lamps_of(messages: list[MarkerArray]) -> tuple[float, float, float] | str |
     return round(colour.r, 3), round(colour.g, 3), round(colour.b, 3)
 
 
+@pytest.mark.long
 def test_a_low_battery_lights_the_signal_tower(robot: StockNode) -> None:
     """The pattern follows the charge with a margin, and the robot takes the command."""
     told: list[str] = []
@@ -233,6 +234,7 @@ def test_a_low_battery_lights_the_signal_tower(robot: StockNode) -> None:
     robot.node.destroy_publisher(battery)
 
 
+@pytest.mark.long
 def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
     """The turn in the map is the true one; odometry alone is wrong by the slip."""
     from simulation_interfaces.srv import GetEntityState

@@ -17,6 +17,7 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.support import programs
+from tests.support.long_rows import long
 from tests.support.recorded_world import TICK, MinimalClient
 from tests.support.waiting import deadline
 from vinesim.client.recording.recorder import Recorder
@@ -269,7 +270,7 @@ def count_bytes(endpoint: str, path: pathlib.Path | None, distance: float) -> li
         return [client.bus.bytes_out - bytes_out for client, bytes_out in zip((ada, bob), before, strict=True)]
 
 
-@pytest.mark.parametrize("distance", [2.0, 40.0])
+@pytest.mark.parametrize("distance", [2.0, *long(40.0)])
 def test_a_recorder_does_not_change_traffic(tmp_path, distance):
     with Server("tcp/127.0.0.1:0") as server:
         path = tmp_path / "run.mcap"

@@ -52,6 +52,7 @@ def to_camera(picture: CameraFrame, points: np.ndarray) -> np.ndarray:
     return frames.rotate(frames.conjugate(picture.pose[3:]), points - picture.pose[:3])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "distortion",
     [

@@ -45,6 +45,7 @@ def test_modulus_and_damping_are_recovered_from_far_away(seed: int, ratio: float
     assert 0.005 < deviation[1] < 0.08
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, *long(3)])
 def test_an_exact_track_tells_the_modulus_exactly(seed: int) -> None:
     """The bias of the coarse chain, 1.2 %, is taken off to a twentieth of a percent; the truth's own is 0.03 %."""
@@ -204,6 +205,7 @@ def test_a_specimen_that_cannot_be_is_refused(tmp_path, text: str, words: str) -
     assert str(path) in str(refused.value)
 
 
+@pytest.mark.long
 def test_an_experiment_writes_the_track_and_says_what_a_fit_would_know(tmp_path, capsys) -> None:
     """A push with a force gauge, read back from CSV and fitted."""
     (tmp_path / "cane.toml").write_text(specimen_toml(cane(segments=4)))
@@ -245,6 +247,7 @@ def test_a_force_that_contradicts_the_fit_is_a_fault(track: Trajectory) -> None:
         tune(cane(3e9), nothing, ("modulus", "damping", "mass"))
 
 
+@pytest.mark.long
 def test_centimetres_for_millimetres_are_asked_for(track: Trajectory) -> None:
     fit = tune(cane(3e9), dataclasses.replace(track, position=10.0 * track.position))
     assert any("is the unit right" in fault for fault in fit.faults)
