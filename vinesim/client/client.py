@@ -469,7 +469,9 @@ class Client:
             is_remote[tree] = touched_by_copies[tree] = False
             if update.resting:
                 objects.blend_tree(update, 1.0)
-        touched = {tree for tree, actor in self.physics.touched if actor in self.replicators}
+        touched: set[int] = set()
+        if self._remote_trees:
+            touched = {tree for tree, actor in self.physics.touched if actor in self.replicators}
         for tree, update in self._remote_trees.items():
             self.physics.plants.wake(tree)
             touched_by_copies[tree] = tree not in self.couplings.trees  # their forces act here once
@@ -500,9 +502,11 @@ class InterestAudit:
         sent = sum(replicator.counters.environment.bytes_out for replicator in replicators)
         if touching or sent != self._seen:
             there = [position[:2] for replicator in replicators for position in replicator.peer_positions()]
-            here = [client.physics.rigid.actor_position(name)[:2] for name in client.replicators]
-            away = np.linalg.norm(np.reshape(here, (-1, 1, 2)) - np.reshape(there, (1, -1, 2)), axis=-1)
-            if away.min(initial=np.inf) > client.replicator.interest_radius + self.MARGIN:
+            away = np.inf
+            if there:
+                here = [client.physics.rigid.actor_position(name)[:2] for name in client.replicators]
+                away = np.linalg.norm(np.reshape(here, (-1, 1, 2)) - np.reshape(there, (1, -1, 2)), axis=-1).min()
+            if away > client.replicator.interest_radius + self.MARGIN:
                 self.bytes += sent - self._seen
                 self.ticks_touching += touching
         self._seen = sent

@@ -188,6 +188,8 @@ class ObjectSync:
 
     def _hold_resting_objects(self) -> None:
         """Move objects with the remote frames that they rest in; put back those that only remote copies have pushed."""
+        if not self._resting:
+            return
         moving = set(self.physics.support_tracker.moving)
         pushed = {
             number

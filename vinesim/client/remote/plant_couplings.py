@@ -85,6 +85,8 @@ class PlantCouplings:
 
     def apply(self, couplings: Mapping[str, Collection[Coupling]]) -> None:
         """Hold bodies by the couplings of remote actors, and no others; before a step."""
+        if not (couplings or self._ties or self._refused):
+            return
         wanted = {
             (actor, coupling.body): coupling
             for actor, theirs in couplings.items()

@@ -77,6 +77,8 @@ class RosProcess:
         self._missed_truth = 0
         self._intentions = IntentionLog()
         self._gestures = GestureLog()
+        self._had_people = False
+        """Whether there were people after the last step."""
         self._told_run: Run[RosChannel] | None = None
         """The run of the process that knows :attr:`_intentions` and :attr:`_gestures`."""
         self._told_lights: tuple[Run[RosChannel], Color | None] | None = None
@@ -203,10 +205,11 @@ class RosProcess:
             sample = None
             if has_goals or wanted[1:].any():
                 body_sensors = bool((wanted & self._reads_body_sensors).any())
-                sample = self.robot.sample(physics.time, physics.contacts, body_sensors=body_sensors)
                 controllers = self.handler.controllers
                 reference = JointReference(controllers.desired, controllers.desired_velocity)
-                sample = dataclasses.replace(sample, reference=reference)
+                sample = self.robot.measure(
+                    physics.time, physics.contacts, body_sensors=body_sensors, reference=reference
+                )  # fmt: skip
             with channel.steps.put() as record:
                 if record is None:
                     self._lost += wanted
@@ -221,11 +224,14 @@ class RosProcess:
 
     def _tell_of_people(self, client: Client) -> None:
         """Send people's intentions and hand gestures to the ROS process when they change, and to a restarted one."""
-        now = client.physics.time + client.world_time.offset
         people: dict[str, LocalHuman | RemoteHuman] = dict(client.humans)
         people |= {name: one for name, one in client.remote_actors.items() if isinstance(one, RemoteHuman)}
         run = self.worker.current()
         is_new, self._told_run = run is not self._told_run, run
+        had_people, self._had_people = self._had_people, bool(people)
+        if not (is_new or people or had_people):
+            return
+        now = client.physics.time + client.world_time.offset
         if self._intentions.update({name: one.intention for name, one in people.items()}, now) or is_new:
             run.send("intentions", self._intentions.intentions)
         if self._gestures.update({name: one.pose for name, one in people.items() if one.pose is not None}) or is_new:

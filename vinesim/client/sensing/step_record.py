@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
 MAX_CONTACTS = 32
 """Contacts of one robot that a record holds; further ones of the same step are left out and counted."""
 
-_JOINT_ROWS = ("position", "velocity", "effort", "contact")
 _CONTACT = np.dtype([("link", "i4"), ("body", "i4"), ("position", "f8", 3), ("force", "f8", 3), ("distance", "f8")])
 
 
@@ -31,38 +31,45 @@ class StepRecords:
         self.series_stiffness = series_stiffness
         self._imus = tuple((mount.name, mount.frame) for mount in description.imus)
         self._wrenches = tuple((mount.name, mount.frame) for mount in description.wrenches)
-        joints, transforms = len(self.joints), len(self.transforms)
+        self._moving = description.moving_joints
+        joints, imus, wrenches = len(self.joints), len(self._imus), len(self._wrenches)
+        shapes = (
+            *(((joints,),) * 6), (7,), (6,), (7,), (6,), (2, 3, 3), *(((10,),) * imus), *(((6,),) * wrenches),
+        )  # fmt: skip
+        ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
+        self._parts = tuple((slice(e - math.prod(shape), e), shape) for e, shape in zip(ends, shapes, strict=True))
+        """Place in ``state`` and shape of each part of it, in the order in which :meth:`write` puts them there."""
+        self._body_sensors_start = ends[10]
         self.dtype = np.dtype(
             [
                 ("time", "f8"), ("has_state", "?"), ("has_body_sensors", "?"), ("contact_count", "i4"),
-                *((name, "f8", (joints,)) for name in (*_JOINT_ROWS, "desired", "desired_velocity")),
-                ("imu", "f8", (len(self._imus), 10)), ("wrench", "f8", (len(self._wrenches), 6)),
-                ("base_q", "f8", (7,)), ("base_qd", "f8", (6,)), ("odom_q", "f8", (7,)),
-                ("odom_qd", "f8", (6,)), ("odom_covariance", "f8", (2, 3, 3)),
-                ("transform_q", "f8", (transforms, 7)), ("contacts", _CONTACT, (MAX_CONTACTS,)),
+                ("state", "f8", (ends[-1],)), ("contacts", _CONTACT, (MAX_CONTACTS,)),
             ]
         )  # fmt: skip
 
     def write(self, record: Any, time: float, sample: RobotSample | None) -> int:
-        """Fill a record: the time [s], and the state unless None. Returns the number of contacts left out."""
+        """Fill a record: the time [s], and the state unless None. Returns the number of contacts left out.
+
+        What follows from the joints, transforms and elastic elements, is left to :meth:`read`.
+        """
         record["time"], record["has_state"] = time, sample is not None
         if sample is None:
             return 0
         joints = sample.joints
-        record["position"], record["velocity"] = joints.position, joints.velocity
-        record["effort"], record["contact"] = joints.effort, joints.contact
-        record["base_q"], record["base_qd"], record["odom_q"] = sample.base_q, sample.base_qd, sample.odom_q
-        record["odom_qd"], record["odom_covariance"] = sample.odom_qd, sample.odom_covariance
-        record["transform_q"] = sample.transform_q
-        if (reference := sample.reference) is not None:
-            record["desired"], record["desired_velocity"] = reference.position, reference.velocity
-        else:
-            record["desired"], record["desired_velocity"] = joints.position, joints.velocity
-        record["has_body_sensors"] = bool(sample.imus or sample.wrenches)  # they are read when they have subscribers
-        for row, imu in zip(record["imu"], sample.imus, strict=False):
-            row[:4], row[4:7], row[7:] = imu.orientation, imu.angular_velocity, imu.linear_acceleration
-        for row, wrench in zip(record["wrench"], sample.wrenches, strict=False):
-            row[:3], row[3:] = wrench.force, wrench.torque
+        desired: JointSample | JointReference = joints if sample.reference is None else sample.reference
+        parts = [
+            joints.position, joints.velocity, joints.effort, joints.contact, desired.position, desired.velocity,
+            sample.base_q, sample.base_qd, sample.odom_q, sample.odom_qd, sample.odom_covariance.ravel(),
+        ]  # fmt: skip
+        has_body_sensors = bool(sample.imus or sample.wrenches)  # they are read when they have subscribers
+        if has_body_sensors:
+            for imu in sample.imus:
+                parts += imu.orientation, imu.angular_velocity, imu.linear_acceleration
+            for wrench in sample.wrenches:
+                parts += wrench.force, wrench.torque
+        state = record["state"]
+        np.concatenate(parts, out=state if has_body_sensors else state[: self._body_sensors_start])
+        record["has_body_sensors"] = has_body_sensors
         count = min(len(sample.contacts), MAX_CONTACTS)
         record["contact_count"] = count
         if count:
@@ -75,31 +82,34 @@ class StepRecords:
 
     def read(self, record: Any) -> RobotSample:
         """The state in a record that has one."""
-        joints = JointSample(
-            float(record["time"]), self.joints, record["position"], record["velocity"], record["effort"],
-            record["contact"],
-        )  # fmt: skip
+        now, state = float(record["time"]), record["state"]
+        parts = [state[place].reshape(shape) for place, shape in self._parts]
+        position, velocity, effort, contact, desired, desired_velocity = parts[:6]
+        base_q, base_qd, odom_q, odom_qd, covariance = parts[6:11]
+        joints = JointSample(now, self.joints, position, velocity, effort, contact)
         rows = record["contacts"][: int(record["contact_count"])]
         contacts = tuple(
             Contact(self.actor, self.links[row["link"]] if row["link"] >= 0 else "", int(row["body"]), row["position"],
                     row["force"], float(row["distance"]))
             for row in rows
         )  # fmt: skip
+        first_wrench = 11 + len(self._imus)
+        imus, wrenches = parts[11:first_wrench], parts[first_wrench:]
         read = slice(None if record["has_body_sensors"] else 0)
-        now, deflection = joints.time, joints.effort / self.series_stiffness
+        deflection = effort / self.series_stiffness
         return RobotSample(
-            self.actor, joints, record["base_q"], record["base_qd"], record["odom_q"], record["odom_qd"],
-            record["odom_covariance"], self.transforms, record["transform_q"], contacts,
+            self.actor, joints, base_q, base_qd, odom_q, odom_qd, covariance, self.transforms,
+            self._moving.poses(position), contacts,
             elements=ElasticSample(
-                now, self.joints, self.series_stiffness, joints.position + deflection, deflection, joints.effort
+                now, self.joints, self.series_stiffness, position + deflection, deflection, effort
             ),
             wrenches=tuple(
                 Wrench(now, name, frame, row[:3], row[3:])
-                for (name, frame), row in zip(self._wrenches[read], record["wrench"][read], strict=True)
+                for (name, frame), row in zip(self._wrenches[read], wrenches[read], strict=True)
             ),
             imus=tuple(
                 Imu(now, name, frame, row[:4], row[4:7], row[7:])
-                for (name, frame), row in zip(self._imus[read], record["imu"][read], strict=True)
+                for (name, frame), row in zip(self._imus[read], imus[read], strict=True)
             ),
-            reference=JointReference(record["desired"], record["desired_velocity"]),
+            reference=JointReference(desired, desired_velocity),
         )  # fmt: skip

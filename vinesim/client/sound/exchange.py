@@ -118,6 +118,8 @@ class SoundExchange:
     def __init__(self, client: Client) -> None:
         self._client = client
         self._listeners: list[tuple[str, Listener]] = []
+        self._was_open = False
+        """Whether anything listened after the last step."""
         self._speakers: dict[str, _Speaker] = {}
         self._loudspeakers: dict[str, Loudspeaker] = {}
         self._voices: dict[str, Voice] = {}
@@ -162,7 +164,9 @@ class SoundExchange:
 
     def _exchange(self) -> None:
         """Send what was said, and hand on what has arrived."""
-        if not (self._listeners or self._speakers or self._loudspeakers):
+        is_open = any(listener.is_open for _, listener in self._listeners)
+        was_open, self._was_open = self._was_open, is_open
+        if not (is_open or was_open or self._speakers or self._loudspeakers):
             return
         client = self._client
         now = client.replicator.network_time(client.clock())

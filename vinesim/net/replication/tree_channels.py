@@ -7,6 +7,8 @@ distance of a layer, not to a window: a tree that is farther away is not receive
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from vinesim.net.replication import interest
@@ -39,7 +41,7 @@ class TreeChannels:
 
         Publishers are open where the actor can touch a tree, before it does, and where it owns one.
         """
-        moved = self._position is None or float(np.hypot(*(position - self._position)[:2])) > STEP
+        moved = self._position is None or _distance(position, self._position) > STEP
         if not moved and owned == self._owned:
             return
         self._position, self._owned = position.copy(), set(owned)
@@ -59,3 +61,8 @@ class TreeChannels:
                 publishers.pop(cell).close()
             for cell in sorted(touchable - publishers.keys()):
                 publishers[cell] = self._bus.publisher(f"{layer.family}/{cell[0]}/{cell[1]}/{self._bus.name}")
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    """On the ground, of two positions [3] m."""
+    return math.hypot(a[0] - b[0], a[1] - b[1])

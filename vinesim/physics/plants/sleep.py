@@ -110,16 +110,21 @@ class SleepMonitor:
         """Measure the trees that have been slow for long enough; see :meth:`update`."""
         plants, awake = self.plants, self.plants.awake
         slow = awake[self.quiet_steps[awake] >= self.patience]
+        if keep_awake is not None:  # what is at rest and stays awake all the same is measured when it has moved
+            slow = slow[~(keep_awake[slow] & self._is_at_rest[slow])]
         if len(slow) == 0:
             return slow
         speed, distance, is_free = self._equilibrium.residual_motion(slow)
         tolerance = np.where(is_free, self.distance, CONTACT_SHARE * self.distance)
         self._is_at_rest[slow] = (speed < self.speed) & (distance < tolerance)
-        self._find_still(slow[~is_free & (speed < self.speed)])
+        if len(bound := slow[~is_free & (speed < self.speed)]):
+            self._find_still(bound)
         stays = ~self._is_at_rest if keep_awake is None else ~self._is_at_rest | keep_awake
         while len(spread := contact_pairs[stays[contact_pairs[:, 0]] != stays[contact_pairs[:, 1]]]):
             stays[spread] = True
         asleep = slow[~stays[slow]]
+        if len(asleep) == 0:
+            return asleep
         is_alone = is_free if is_coupled is None else is_free & ~is_coupled[slow]
         self._equilibrium.move_to_rest(slow[~stays[slow] & is_alone])
         plants.put_to_sleep(asleep)

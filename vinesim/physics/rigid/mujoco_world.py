@@ -13,7 +13,6 @@ import weakref
 import mujoco
 import numpy as np
 
-from vinesim import frames
 from vinesim.physics.contact import collision_geoms
 from vinesim.physics.contact.effective_mass import EffectiveMass
 from vinesim.physics.contact.hulls import hull_arrays
@@ -190,7 +189,8 @@ class WorldCore:
         else:
             body = self._link_body(name, link)
         self.update_kinematics()
-        return np.concatenate([self.mj_data.xpos[body], frames.from_wxyz(self.mj_data.xquat[body])])
+        w, x, y, z = self.mj_data.xquat[body].tolist()
+        return np.array([*self.mj_data.xpos[body].tolist(), x, y, z, w])  # in Python floats: half the time
 
     def visuals(self) -> tuple[RigidVisual, ...]:
         """All rigid bodies that have a shape; the same tuple until one is added or removed."""

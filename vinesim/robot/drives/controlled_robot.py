@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -230,15 +231,21 @@ class Robot(RobotInstance):
 
     def sample(self, time: float, contacts: Sequence[Contact] = (), *, body_sensors: bool = True) -> RobotSample:
         """State of the robot at ``time`` [s], with wrenches, IMUs and series elastic elements if ``body_sensors``."""
-        sample = super().sample(time, contacts)
-        if not body_sensors:
-            return sample
+        measured = self.measure(time, contacts, body_sensors=body_sensors)
         return dataclasses.replace(
-            sample,
-            elements=elastic_sample(sample.joints, self.series_stiffness),
-            wrenches=self._body_sensors.wrenches(time, sample.contacts),
-            imus=self._body_sensors.imus(time),
+            measured,
+            transform_q=self.description.moving_joints.poses(measured.joints.position),
+            elements=elastic_sample(measured.joints, self.series_stiffness) if body_sensors else None,
         )
+
+    def measure(
+        self, time: float, contacts: Sequence[Contact] = (), *, body_sensors: bool = True, **more: Any
+    ) -> RobotSample:  # fmt: skip
+        """As :meth:`RobotInstance.measure`: series elastic elements are left out, too."""
+        if body_sensors:
+            own = self._own(contacts)
+            more |= {"wrenches": self._body_sensors.wrenches(time, own), "imus": self._body_sensors.imus(time)}
+        return super().measure(time, contacts, **more)
 
     def update(self, time: float) -> RobotUpdate:
         """What other clients receive: actual joint states, never commands."""

@@ -15,6 +15,9 @@ LEAST_VARIANCE = 1e-6
 """[m2, rad2, m2/s2, rad2/s2] Added to every variance, so that filters can invert covariances. GUESSED: of encoders that
 resolve a millimetre."""
 
+_EXACT = np.tile(LEAST_VARIANCE * np.eye(3), (2, 1, 1))
+"""Covariances of tracks that do not slip."""
+
 
 class TrackOdometry:
     """Pose since the start, integrated from the travel of tracks of which the ground loses a constant share."""
@@ -50,18 +53,21 @@ class TrackOdometry:
 
     def velocity(self, base_q: np.ndarray, base_qd: np.ndarray) -> np.ndarray:
         """Velocity [6] in the base's axes as the tracks measure it, at the pose [7] and velocity [6] in the world."""
-        back = frames.conjugate(np.asarray(base_q, float)[3:])
-        measured = np.zeros(6)
-        measured[0] = self._gain[0] * frames.rotate(back, base_qd[:3])[0]
-        measured[5] = self._gain[1] * frames.rotate(back, base_qd[3:])[2]
-        return measured
+        x, y, z, w = base_q[3:].tolist()
+        vx, vy, vz, wx, wy, wz = base_qd.tolist()
+        # along the base's x axis and about its z axis, in Python floats: ten times as fast as frames.rotate
+        ahead = (1.0 - 2.0 * (y * y + z * z)) * vx + 2.0 * (x * y + w * z) * vy + 2.0 * (x * z - w * y) * vz
+        turn = 2.0 * (x * z + w * y) * wx + 2.0 * (y * z - w * x) * wy + (1.0 - 2.0 * (x * x + y * y)) * wz
+        return np.array([self._gain[0] * ahead, 0.0, 0.0, 0.0, 0.0, self._gain[1] * turn])
 
     def covariance(self, velocity: np.ndarray) -> np.ndarray:
         """Covariances [2, 3, 3] in x, y and yaw: of the measured pose, and of the measured ``velocity`` [6]."""
+        if not any(self._slip):
+            return _EXACT
         linear = self._slip[0] * np.array([*self._by_linear, 0.0])
         angular = self._slip[1] * np.array(self._by_angular)
-        found = np.zeros((2, 3, 3))
-        found[0] = np.outer(linear, linear) + np.outer(angular, angular)
-        found[1, 0, 0], found[1, 2, 2] = (self._slip[0] * velocity[0]) ** 2, (self._slip[1] * velocity[5]) ** 2
-        found[:, range(3), range(3)] += LEAST_VARIANCE
+        found = _EXACT.copy()
+        found[0] += np.outer(linear, linear) + np.outer(angular, angular)
+        found[1, 0, 0] += (self._slip[0] * velocity[0]) ** 2
+        found[1, 2, 2] += (self._slip[1] * velocity[5]) ** 2
         return found

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +14,8 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.odometry import TrackOdometry
 from vinesim.scene.values import Contact, JointSample, Lights, RobotSample
 from vinesim.scene.values.signals import Color
+
+_NO_POSES = np.zeros((0, 7))
 
 
 class RobotInstance:
@@ -34,6 +38,7 @@ class RobotInstance:
         """
         self.rigid = rigid
         self.description = description
+        self._joint_names = description.joints
         self.name = name or description.name
         self._index = index
         spec = description.to_spec(self.name, index, pose)
@@ -68,21 +73,32 @@ class RobotInstance:
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
         """State of the robot at ``time`` [s]; of ``contacts`` only its own are kept."""
+        measured = self.measure(time, contacts)
+        return dataclasses.replace(measured, transform_q=self.description.moving_joints.poses(measured.joints.position))
+
+    def measure(self, time: float, contacts: Sequence[Contact] = (), **more: Any) -> RobotSample:
+        """:meth:`sample` without what follows from the joints: :attr:`RobotSample.transform_q` is empty. ``more``:
+        further values of the sample."""
         position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
         odom_q, odom_qd = self._odometry(base_q), self._track_odometry.velocity(base_q, base_qd)
         return RobotSample(
             actor=self.name,
-            joints=JointSample(time, self.description.joints, position, velocity, effort, contact),
+            joints=JointSample(time, self._joint_names, position, velocity, effort, contact),
             base_q=base_q,
             base_qd=base_qd,
             odom_q=odom_q,
             odom_qd=odom_qd,
             odom_covariance=self._track_odometry.covariance(odom_qd),
             transforms=self.description.moving_joints.frames,
-            transform_q=self.description.moving_joints.poses(position),
-            contacts=tuple(c for c in contacts if c.actor == self.name),
+            transform_q=_NO_POSES,
+            contacts=self._own(contacts),
+            **more,
         )
+
+    def _own(self, contacts: Sequence[Contact]) -> tuple[Contact, ...]:
+        """Those of some contacts that are the robot's."""
+        return tuple(c for c in contacts if c.actor == self.name)
 
     def frame_pose(self, frame: str) -> np.ndarray:
         """World pose [7] of a link of the URDF, such as a sensor's frame."""

@@ -105,7 +105,7 @@ class PushBunch:
     @property
     def error(self) -> float:
         """Distance of the fingertips from :attr:`goal` [m]."""
-        return float(np.linalg.norm(self.goal - self.tip))
+        return self.arm.distance_to(self.goal)
 
     def control(self, time: float) -> None:
         """Command the arm for the step that starts at ``time`` [s]; call it before ``robot.control``."""
