@@ -1,7 +1,7 @@
 """simulation_interfaces: how test programs pause, step and reset a simulation, and change what is in it.
 
-Services wait for an answer of the simulation, which is given between two steps; so this node has a thread and a context
-of its own. What is not supported says so: result 0, with a text.
+Services wait for an answer of the simulation, which is given between two steps; so this node has a thread of its own.
+What is not supported says so: result 0, with a text.
 """
 
 from __future__ import annotations
@@ -59,14 +59,16 @@ class SimulationNode(Node):
     ``ask`` sends a request to the simulation; :meth:`answer` takes replies.
     """
 
-    def __init__(self, name: str, namespace: str, ask: Callable[[SimulationRequest], None]) -> None:
+    def __init__(
+        self, name: str, namespace: str, ask: Callable[[SimulationRequest], None], *, beside: Node | None = None
+    ) -> None:
         message_packages.ensure_importable(["simulation_interfaces"])
         self._ask = ask
         # another run of the process may get late answers to requests of this one
         self._numbers = itertools.count(wall.monotonic_ns())
         self._waiting: dict[int, threading.Event] = {}
         self._replies: dict[int, SimulationReply] = {}
-        super().__init__(name, namespace, ())
+        super().__init__(name, namespace, (), beside=beside)
 
     def answer(self, reply: SimulationReply | StepProgress) -> None:
         """Pass on the simulation's answer, or how far it is; called by any thread."""

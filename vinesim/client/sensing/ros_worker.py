@@ -147,7 +147,7 @@ class RosWorker:
         self.simulation = None
         if config.clock:
             name = f"{ros_name(config.name)}_simulation"
-            self.simulation = SimulationNode(name, config.namespace, self._requests.put)
+            self.simulation = SimulationNode(name, config.namespace, self._requests.put, beside=self.node)
         poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
         self.node.publish_environment_static(poles, config.poles)
         self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))

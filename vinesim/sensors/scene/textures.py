@@ -32,10 +32,15 @@ def _digest() -> str:
     return disk_cache.source_digest(pathlib.Path(__file__), pathlib.Path(leaves.__file__), cv2.__version__)
 
 
-def _cached(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
-    """``make``, which computes tables, with what it returns kept on disk and in this process."""
+def _on_disk(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
+    """``make``, which computes tables, with what it returns kept on disk."""
     name = make.__name__.strip("_").replace("_", "-")
-    return functools.cache(lambda: disk_cache.load_or_make(name, _digest(), make))
+    return lambda: disk_cache.load_or_make(name, _digest(), make)
+
+
+def _cached(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
+    """The same, kept in this process, too."""
+    return functools.cache(_on_disk(make))
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +212,7 @@ def _soil_texture() -> disk_cache.Arrays:
     return {"table": np.stack([tone, green, -0.9 * slope_x, -0.9 * slope_y], -1).astype(np.float32)}
 
 
-@_cached
+@_on_disk  # 13 MB, for a moment whenever the sun is elsewhere
 def _sky_layers() -> disk_cache.Arrays:
     """What of the sky no sun changes: ``cloud``, its share; and of ``ridges`` and ``trees`` in front of it, which reach
     up to some row, the shares and the colour of the trees. float64, as they are mixed."""
@@ -262,16 +267,16 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
     Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
     hills in the haze.
     """
-    table = np.empty((SKY_ROWS, SKY_COLUMNS, 3), np.float32)
+    table, layers = np.empty((SKY_ROWS, SKY_COLUMNS, 3), np.float32), _sky_layers()
     for first in range(0, SKY_ROWS, _SKY_BAND):
         rows = slice(first, first + _SKY_BAND)
-        table[rows] = _sky_rows(rows, np.array(sun), np.array(colour_of_sun))
+        table[rows] = _sky_rows(rows, layers, np.array(sun), np.array(colour_of_sun))
     return table
 
 
-def _sky_rows(rows: slice, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
+def _sky_rows(rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
     """Some rows of the sky's table [row, SKY_COLUMNS, 3]; they lie within or beyond :data:`_RIDGE_ROWS`."""
-    (height, azimuth), layers = _sky_directions(), _sky_layers()
+    height, azimuth = _sky_directions()
     height, colour = height[rows], _clear_sky()[rows]
     flat = np.sqrt(1.0 - height**2)
     x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
