@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 
 import numpy as np
@@ -155,6 +156,25 @@ def test_step_response_of_a_copy_takes_a_tenth_of_a_second_without_overshoot(vin
     assert np.argmax(np.array(response) > 0.95) <= 12
     assert max(response) < 1.02
     assert response[-1] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_light_joint_that_catches_up_with_all_its_effort_is_not_thrown(vinebot):
+    """The wrist turns at 2 rad/s, and a correction puts its target 30 mrad ahead at once."""
+    rigid = RigidWorld(assemble([]))
+    copy = RemoteRobot(rigid, vinebot, "anna")
+    wrist = vinebot.joints.index("arm_left_7_joint")
+    drive, rate, ahead = vinebot.drives[wrist], 2.0, 0.03
+    assert drive.stiffness * (ahead + 0.01 * rate) > drive.effort
+    goal, velocity, speeds = vinebot.home.copy(), np.zeros(len(vinebot.home)), []
+    step(rigid)
+    velocity[wrist] = rate
+    for tick in range(40):
+        goal[wrist] += 0.01 * rate + (ahead if tick == 20 else 0.0)
+        copy.follow(dataclasses.replace(update_to(copy, goal), velocity=velocity))
+        step(rigid)
+        speeds.append(rigid.joint_measurements("anna")[1][wrist])
+    assert max(speeds) < rate + ahead / 0.025  # D / K of the servo is 25 ms
+    assert rigid.joint_measurements("anna")[0][wrist] == pytest.approx(goal[wrist], abs=1e-3)
 
 
 def test_a_pushed_copy_deflects_by_f_over_k_and_returns(vinebot):

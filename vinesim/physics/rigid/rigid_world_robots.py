@@ -86,10 +86,12 @@ class RobotAccess(WorldCore):
 
         ``base_q`` [7], ``base_qd`` [6] world axes, ``position`` and ``velocity`` [joint].
         """
-        self.command(name, position, velocity)
+        self._check_joints(name, position=position, velocity=velocity)
         _check_finite(name, "base pose", base_q, 7)
         _check_finite(name, "base velocity", base_qd, 6)
-        self.robot(name).follow_remote(self.mj_data, np.asarray(base_q, float), np.asarray(base_qd, float))
+        self.robot(name).follow_remote(
+            self.mj_data, np.asarray(base_q, float), np.asarray(base_qd, float), position, velocity
+        )
 
     def apply_wrench(self, name: str, link: str, force: np.ndarray, moment: np.ndarray = np.zeros(3)) -> None:
         """Apply a force [3] N and a moment [3] N m at a link's centre of mass, world axes, until the next call."""

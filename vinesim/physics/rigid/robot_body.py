@@ -40,6 +40,8 @@ MAX_HULL_VERTICES = 64
 CONTACT_IMPEDANCE = (0.95, 0.99)
 """[1] Least and largest impedance of a link's contacts (MuJoCo's solimp). TUNED: with MuJoCo's 0.9 and 0.95 an arm that
 pushes against its own torso with all its effort stands 3 mm deep in it, with these less than 1 mm."""
+COPY_EFFORT_SHARE = 0.999
+"""[1] Share of its limit that the servo of a copy uses at most."""
 _PLANAR = ("x", "y", "yaw")
 
 
@@ -212,8 +214,19 @@ class RobotBody:
         self.target[:] = position
         self.target_velocity[:] = 0.0 if velocity is None else velocity
 
-    def follow_remote(self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray) -> None:
-        """Pull the base of a copy to the received state: ``base_q`` [7], ``base_qd`` [6] world axes."""
+    def follow_remote(
+        self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> None:
+        """Pull a copy to the received state: ``base_q`` [7], ``base_qd`` [6] world axes, ``position``, ``velocity``
+        [joint]."""
+        self.command(position, velocity)
+        # MuJoCo does not take a servo as implicit that reaches its limit at the start of the step: a light joint that
+        # catches up would be thrown past its target
+        servo, most, weight = self.servo_limit, self.effort_limit, d.qfrc_gravcomp[self.v]
+        low, high = np.maximum(-servo, -most - weight), np.minimum(servo, most - weight)
+        pull = self.stiffness * (self.target - d.qpos[self.q]) + self.damping * (self.target_velocity - d.qvel[self.v])
+        excess = pull - np.clip(pull, COPY_EFFORT_SHARE * low, COPY_EFFORT_SHARE * high)
+        self.target -= excess / np.where(self.stiffness > 0.0, self.stiffness, np.inf)
         yaw = frames.to_yaw(base_q[3:])
         turns = np.round((d.qpos[self.base_q[2]] - yaw) / (2.0 * np.pi))
         self.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
