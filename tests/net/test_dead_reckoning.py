@@ -49,8 +49,10 @@ def test_single_precision_rounding_gives_no_angle():
     assert dead_reckoning.angle_between(q.astype(np.float32).astype(float), q).max() < 1e-6
 
 
-def test_extrapolation_age_is_limited_to_0_to_150_ms():
-    np.testing.assert_allclose(dead_reckoning.clamp_age(np.array([-1.0, 0.0, 0.1, 0.15, 9.0])), [0, 0, 0.1, 0.15, 0.15])
+def test_extrapolation_age_is_limited_to_150_ms_in_both_directions():
+    np.testing.assert_allclose(
+        dead_reckoning.clamp_age(np.array([-1.0, 0.0, 0.1, 0.15, 9.0])), [-0.15, 0, 0.1, 0.15, 0.15]
+    )
 
 
 def test_an_update_is_due_by_distance_angle_or_time():

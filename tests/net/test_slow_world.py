@@ -31,6 +31,8 @@ class Person(FakeClient):
     def pose(self, now: float) -> HumanUpdate:
         """The velocity is that of simulated time, as a simulation has no other."""
         time = self.replicator.network_time(now)
+        if self.replicator.step_time is not None:
+            time = self.replicator.step_time()
         velocity = np.zeros((len(POINT_NAMES), 6))
         velocity[2, 2] = SWING * RATE * np.cos(RATE * time)
         still = super().pose(now)
@@ -90,6 +92,31 @@ def test_a_copy_in_a_slow_world_is_where_the_hand_is(factor: float) -> None:
         assert client.replicator.network_time(world.hub.time) == pytest.approx(world.time, abs=0.021 * factor)
         assert client.replicator.round_trip == pytest.approx(0.04, abs=DT / factor)
     assert world.run(500) < 0.02
+
+
+def test_copies_move_evenly_although_steps_come_in_bursts() -> None:
+    """Each client makes ten steps at once, ten times a second, in turns: what bob's step shows of ada's hand is where
+    it was at the time of that step, and moves no further in one step than the hand does."""
+    world = World(1.0)
+    world.run(200)
+    times = {client.name: world.time for client in (world.ada, world.bob)}
+    for client in (world.ada, world.bob):
+        client.replicator.step_time = lambda name=client.name: times[name]
+    shown: list[tuple[float, float]] = []
+    for turn in range(100):
+        client = (world.ada, world.bob)[turn % 2]
+        for _ in range(10):
+            client.tick(world.hub.time)
+            if client is world.bob and turn > 20:
+                copy = world.bob.robots["ada"]
+                assert isinstance(copy, HumanUpdate)
+                shown.append((times["bob"], copy.pose.left[2]))
+            times[client.name] += DT
+        world.hub.advance(0.05)
+    time, height = np.array(shown).T
+    assert np.diff(time) == pytest.approx(DT, abs=1e-6)
+    assert np.abs(height - height_of_hand(time)).max() < 0.03
+    assert np.abs(np.diff(height)).max() < 2.0 * SWING * RATE * DT
 
 
 def test_clients_follow_a_server_that_comes_back_with_another_factor() -> None:

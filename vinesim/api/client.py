@@ -141,7 +141,7 @@ class Client:
             loop.begin()
             self.step()
             loop.end()
-        self._client.step_time = None
+        self._client.follow_steps(None)
 
     def page(self, port: int = 0) -> Page:
         """Show this client's vineyard in browsers of this machine, and in a cell of a notebook, until it is closed or

@@ -114,6 +114,8 @@ class Client:
         """Humans that this client simulates, by name."""
         self.meshes = MeshExchange()
         """Meshes of local robots for other clients, and of remote ones for this client."""
+        self.step_time: Callable[[], float] | None = None
+        """Of a client whose steps follow the clock of its server: the world's time at the present step [s]."""
         self.replicators: dict[str, Replicator] = {}
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
         self.objects = ObjectSync(self.physics, self.replicators, self._is_present)
@@ -148,8 +150,6 @@ class Client:
         self.interest_audit = InterestAudit()
         self.world_time = WorldTime(self.physics.dt)
         """Time of the world, in which ROS messages are stamped."""
-        self.step_time: Callable[[], float] | None = None
-        """Of a client whose steps follow the clock of its server: the world's time at the present step [s]."""
         self.pace_text: Callable[[], str] = lambda: ""
         """How fast time passes and what limits it, for people: see :func:`vinesim.net.pace.describe`."""
         self.holds: list[Callable[[], str]] = []
@@ -248,8 +248,16 @@ class Client:
             hand_force=self.physics.parameters.hand_force,
         )  # fmt: skip
 
+    def follow_steps(self, step_time: Callable[[], float] | None) -> None:
+        """Stamp, send and show all of a step for the world's time of that step, ``step_time()`` [s]; None: for the
+        moment at which it is made."""
+        self.step_time = step_time
+        for replicator in self.replicators.values():
+            replicator.step_time = step_time
+
     def _add_replicator(self, name: str, replicator: Replicator) -> None:
         self.replicators[name] = replicator
+        replicator.step_time = self.step_time
         self._share_client()
 
     def _share_client(self) -> None:

@@ -217,7 +217,7 @@ def paced_loop(client: Client, *, is_shared: bool, factor: float | None = None) 
     own, which runs at a fixed real-time ``factor`` or, without one, as fast as this client can follow."""
     if is_shared:
         loop = RateLoop(client.physics.dt, WorldPace(client.replicator), max_lag=WAITING_MAX_LAG)
-        client.step_time = lambda: loop.next_time
+        client.follow_steps(lambda: loop.next_time)
     elif factor is not None:
         loop = RateLoop(client.physics.dt, RealTime(factor))
     else:

@@ -138,7 +138,7 @@ class FakeClient:
                 "pose": record.pose,
             }
         self.released += inbox.released
-        self.robots = dict(inbox.robots)
+        self.robots = {**inbox.robots, **inbox.people}
         grabbed, self.grabbing = self.grabbing, set()
         picked, self.picking = self.picking, set()
         self.carrying |= picked

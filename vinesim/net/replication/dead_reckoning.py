@@ -53,8 +53,9 @@ def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
 
 
 def clamp_age(age: float | np.ndarray) -> float | np.ndarray:
-    """Time [s] by which a state of ``age`` [s] is extrapolated: from 0 to :data:`MAX_EXTRAPOLATION`."""
-    return np.minimum(np.maximum(age, 0.0), MAX_EXTRAPOLATION)
+    """Time [s] by which a state of ``age`` [s] is extrapolated, at most :data:`MAX_EXTRAPOLATION`: forwards, or backwards
+    where the steps of the sender are ahead of those of the receiver."""
+    return np.minimum(np.maximum(age, -MAX_EXTRAPOLATION), MAX_EXTRAPOLATION)
 
 
 def faded_age(age: float | np.ndarray) -> float | np.ndarray:

@@ -60,6 +60,9 @@ class Replicator:
         self._state = ReplicationState(bus, hello, model, interest_radius, jitter_buffer, hand_force)
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
+        self.step_time: Callable[[], float] | None = None
+        """Of a client whose steps follow the world's clock: time of the world at the present step [s]. It counts for
+        all that is sent and shown in that step, however late the step is; without it the moment of the call counts."""
         self._last_sent = -1e9
         self._offset = self.offset
 
@@ -167,8 +170,9 @@ class Replicator:
         it, people of other clients push nothing.
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
-        now = self._state.peers.clock.advance(now)
+        self._state.peers.clock.advance(now)
         self._follow_clock()
+        now = self._own_time(now)
         return self._receiver.receive(now, self.offset, link_centre)
 
     def send(
@@ -207,8 +211,8 @@ class Replicator:
         again, with the place where they are now.
         """
         state = self._state
-        now = state.peers.clock.own(now)
         self._follow_clock()
+        now = self._own_time(now)
         time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
         state.cells.position = np.asarray(pose.base_q[:3], float)
         state.peers.publish_pose(pose, now, time)
@@ -225,6 +229,12 @@ class Replicator:
                 has_body, carried_on,
             )
         )  # fmt: skip
+
+    def _own_time(self, now: float) -> float:
+        """Own time [s] of the present step, which is made at the time ``now`` [s] of the client's clock."""
+        if self.step_time is None or not self.has_clock:
+            return self._state.peers.clock.own(now)
+        return self.step_time() - self.offset
 
     def _by_partner(self, couplings: Iterable[Coupling], now: float) -> dict[str, list[Coupling]]:
         """Couplings by the peer that gets them: the owner of the tree, or who touches the own tree, too."""
