@@ -53,7 +53,7 @@ def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
 
 
 def clamp_age(age: float | np.ndarray) -> float | np.ndarray:
-    """Time [s] by which a state of ``age`` [s] is extrapolated, at most :data:`MAX_EXTRAPOLATION`: forwards, or backwards
+    """Time [s] by which a state of ``age`` [s] is extrapolated, :data:`MAX_EXTRAPOLATION` at most: forwards, or backwards
     where the steps of the sender are ahead of those of the receiver."""
     return np.minimum(np.maximum(age, -MAX_EXTRAPOLATION), MAX_EXTRAPOLATION)
 
