@@ -63,6 +63,12 @@ def faded_age(age: float | np.ndarray) -> float | np.ndarray:
     return TREE_VELOCITY_DECAY * -np.expm1(-clamp_age(age) / TREE_VELOCITY_DECAY)
 
 
+def faded_share(age: float) -> float:
+    """Share of its velocity that a tree still has when it is extrapolated by ``age`` [s]; 0 from
+    :data:`MAX_EXTRAPOLATION` on."""
+    return float(np.exp(-max(age, 0.0) / TREE_VELOCITY_DECAY)) if age < MAX_EXTRAPOLATION else 0.0
+
+
 def extrapolate(q: np.ndarray, rate: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
     """Quaternions [..., 4] after ``dt`` [s] (a number, or with a trailing axis) at a :func:`quaternion_rate`.
 
