@@ -49,7 +49,7 @@ def watch(recording: Recording) -> tuple[list[bytes], dict[int, np.ndarray]]:
         bus.play(TICK)
         spectator.tick()
         states.append(spectator.physics.state.joint_q.tobytes() + spectator.physics.state.joint_qd.tobytes())
-        if 0 in spectator._remote_trees:
+        if 0 in spectator.tree_copies:
             tree[len(states)] = spectator.physics.state.joint_q[bodies].copy()
     return states, tree
 

@@ -1,12 +1,14 @@
 """A touch from contact to the copy on another client, in one process over the bus in memory."""
 
 import concurrent.futures
+import dataclasses
 
 import numpy as np
 import pytest
 
 from vinesim.client.client import Client
-from vinesim.client.recording.bunch_trace import Trace, remote_error, touch_to_motion
+from vinesim.client.recording.bunch_trace import Rows, Trace, remote_error, touch_to_motion
+from vinesim.client.tasks.motions import DriveTo
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot
@@ -166,6 +168,76 @@ def test_two_runs_are_bitwise_equal(world):
             one.tick()
     assert other.picker.trace.displacement > 0.01  # the bunch is being pushed
     assert np.array_equal(world.compared, other.compared)
+
+
+class Approach(World):
+    """The picker pushes again and again while the visitor drives up; their ticks do not begin at the same time."""
+
+    PHASE = 0.4 * DT
+    """By which the visitor's ticks begin later [s]."""
+
+    def __init__(self, distance):
+        super().__init__(visitor_back=distance)
+        self.hub.delay, self.hub.jitter, self.task.repeat = 0.01, 0.008, True
+        drive = DriveTo(self.visitor.robot, spawn_pose(self.scene, 1), may_start=lambda: self.visitor.remote_actors)
+        self.visitor.pre_step.append(drive)
+
+    def tick(self):
+        for client, share in ((self.picker, self.PHASE), (self.visitor, DT - self.PHASE)):
+            client.tick()
+            self.hub.advance(share)
+            self.now += share
+
+    def rows(self):
+        """Traces of both, by simulated time."""
+        own, copied = (client.trace.rows() for client in self.clients.values())
+        return dataclasses.replace(own, clock=own.time), dataclasses.replace(copied, clock=copied.time + self.PHASE)
+
+
+@pytest.fixture(scope="module")
+def approach():
+    """What both had of a bunch that was pushed before the visitor came near, and once after that."""
+    world = Approach(10.5)
+    world.until(lambda: world.task.push_count == 1)
+    world.until(lambda: world.task.push_count == 2)
+    own, copied = world.rows()
+    first = np.flatnonzero(copied.is_remote)[0]
+    assert np.linalg.norm(own.force, axis=1)[:first].max() > 1.0  # it had been pushed
+    assert np.linalg.norm(own.force[first]) == 0.0  # and swings
+    assert copied.is_remote[first:].all()
+    return own, Rows(*(getattr(copied, field.name)[first:] for field in dataclasses.fields(Rows)))
+
+
+SKEW = 0.03
+"""Longest time by which the clients may feel the same later or earlier [s]: twice the delay, and a tick."""
+IMPACT = 5
+"""Steps over which forces are averaged to compare their peaks: the impact of a first touch lasts one or two."""
+
+
+def test_the_force_on_the_copy_is_that_on_the_bunch(approach):
+    own, copied = approach
+    there, here = (np.linalg.norm(rows.force, axis=1) for rows in approach)
+    peaks = [np.convolve(force, np.full(IMPACT, 1.0 / IMPACT)).max() for force in (there, here)]
+    assert peaks[0] > 2.0
+    assert peaks[1] == pytest.approx(peaks[0], rel=0.1)
+    near = np.abs(copied.clock[:, None] - own.clock) < SKEW
+    least, most = np.where(near, there, np.inf).min(1), np.where(near, there, 0.0).max(1)
+    allowed = np.maximum(0.3, 0.25 * most)
+    pressed = (here > 0.0) | (most > 0.0)
+    is_right = (here > least - allowed) & (here < most + allowed)
+    assert is_right[pressed].mean() > 0.95
+
+
+def test_the_copy_moves_whenever_the_bunch_does(approach):
+    own, copied = approach
+    moved = np.stack([np.interp(copied.clock, own.clock, own.displacement[:, k]) for k in range(3)], -1)
+    there, here = (np.linalg.norm(np.diff(way, axis=0), axis=1) / DT for way in (moved, copied.displacement))
+    stands = (there > 0.02) & (here < 0.25 * there)  # 2 cm/s
+    longest = max(map(len, "".join(" #"[still] for still in stands.tolist()).split()), default=0)
+    assert longest <= 3
+    error = remote_error(*approach)
+    assert error["p50"] < 1.0
+    assert error["p95"] < 2.5
 
 
 def test_the_chosen_bunch_is_within_reach():

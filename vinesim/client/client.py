@@ -28,10 +28,11 @@ from vinesim.avatar.local_human import LocalHuman
 from vinesim.client.pace import Limit
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.remote.mesh_exchange import MeshExchange
-from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync
+from vinesim.client.remote.objects import ObjectSync
 from vinesim.client.remote.plant_couplings import PlantCouplings
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.remote.spawner import RemoteSpawner
+from vinesim.client.remote.tree_copies import TreeCopies
 from vinesim.client.signals import show_lights
 from vinesim.client.sound.exchange import SoundExchange
 from vinesim.client.world_time import WorldTime
@@ -50,7 +51,7 @@ from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
-from vinesim.scene.values import Coupling, HumanPose, HumanSpec, HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values import Coupling, HumanPose, HumanSpec, HumanUpdate, RobotUpdate
 from vinesim.scene.wind import wind_of
 
 log = logging.getLogger(__name__)
@@ -158,7 +159,7 @@ class Client:
         """Each says how fast a part that serves this client can follow."""
         self.clock = clock
         self.sound = SoundExchange(self)
-        self._remote_trees: dict[int, TreeUpdate] = {}
+        self.tree_copies = TreeCopies(self.physics, self.objects)
         self.spawner = RemoteSpawner(self.physics.rigid, description, executor, self.meshes)
 
     @property
@@ -182,7 +183,7 @@ class Client:
         self.physics.rigid.mj_data.time = before.time
         self.earlier_faults.update(before.faults | {"couplings_refused": self.couplings.refused})
         self.objects, self.couplings = ObjectSync(self.physics, self.replicators), PlantCouplings(self.physics)
-        self._remote_trees.clear()
+        self.tree_copies = TreeCopies(self.physics, self.objects)
         self.spawner = RemoteSpawner(self.physics.rigid, self._description, self._executor, self.meshes)
         for name, pose in starts.items():
             self._add_robot_body(self.robots[name].description, name, pose)
@@ -328,7 +329,11 @@ class Client:
                     human.follow(update)
         for renewed in self.spawner.renewed():
             self.remote_actors[renewed.name] = renewed
-        self._apply_remote_trees(inbox)
+        self.tree_copies.apply(
+            inbox.trees, self.replicator.received_at, is_owned_remotely=self._is_owned_remotely,
+            local_actors=self.replicators.keys(), coupled_trees=self.couplings.trees,
+        )  # fmt: skip
+        self.objects.receive(inbox)
 
     def control(self) -> None:
         """Run the callbacks of :attr:`pre_step`, then the drives of robots and the poses of humans."""
@@ -348,7 +353,7 @@ class Client:
             for contact in self.physics.contacts:
                 if contact.body in self.trace.bodies:
                     force -= contact.force
-            is_remote = int(self.model.body_tree[body]) in self._remote_trees
+            is_remote = int(self.model.body_tree[body]) in self.tree_copies
             self.trace.add(self.physics.time, self.physics.state.body_q[body], force, is_remote)
         for callback in self.post_step:
             callback(self)
@@ -371,7 +376,7 @@ class Client:
                 is_changed=objects.is_changed,
                 pose_on_support=self.physics.support_tracker.pose_on_support,
                 has_body=self.physics.support_tracker.__contains__,
-                couplings=self.couplings.of_actor(name, self._remote_trees.keys() | self.couplings.trees),
+                couplings=self.couplings.of_actor(name, self.tree_copies.trees | self.couplings.trees),
                 wrenches=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
                 carried_on=carried_on,
             )  # fmt: skip
@@ -461,34 +466,6 @@ class Client:
             self.physics.rigid.set_remote_wrenches(name, wrenches)
         except RobotError as error:
             log.debug("a wrench on an unknown link: %s", error)
-
-    def _apply_remote_trees(self, inbox: Inbox) -> None:
-        """Blend trees of remote owners towards their states, in every tick; local physics goes on beside."""
-        objects, is_remote = self.objects, self.physics.contact_solver.remote_trees
-        touched_by_copies = self.physics.contact_solver.trees_touched_by_copies
-        for update in inbox.trees:
-            if update.tree not in self._remote_trees:
-                self.physics.plants.wake(update.tree)
-                objects.blend_tree(update, 1.0)
-                is_remote[update.tree] = True
-            self._remote_trees[update.tree] = update
-        for tree in [tree for tree in self._remote_trees if not self._is_owned_remotely(tree)]:
-            update = self._remote_trees.pop(tree)
-            is_remote[tree] = touched_by_copies[tree] = False
-            if update.resting:
-                objects.blend_tree(update, 1.0)
-        touched: set[int] = set()
-        if self._remote_trees:
-            touched = {tree for tree, actor in self.physics.touched if actor in self.replicators}
-        for tree, update in self._remote_trees.items():
-            self.physics.plants.wake(tree)
-            touched_by_copies[tree] = tree not in self.couplings.trees  # their forces act here once
-            if tree in touched:
-                blend = objects.touched_blend(update)
-                objects.blend_tree(update, blend, blend)
-            else:
-                objects.blend_tree(update, BLEND_PER_STEP)
-        objects.receive(inbox)
 
 
 class InterestAudit:

@@ -24,8 +24,8 @@ from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
 BLEND_PER_STEP = 0.2
 """Share of the difference to its owner's state by which a copy is corrected in one step."""
 TOUCHED_BLEND_PER_STEP = 0.05
-"""The same of a copy that an actor of this client touches: its own contacts count here, and reach the owner as forces;
-corrections must not pull the copy through the hand. TUNED."""
+"""The same of a copy that an actor touches here, of this client or the copy of another's: corrections must not pull the
+copy through the hand. TUNED."""
 FAR_ANGLE = 0.1
 """Difference of a joint [rad] from which a touched copy is corrected as fast as any other, and between in proportion:
 one of the two has slipped off. TUNED."""
@@ -246,8 +246,7 @@ class ObjectSync:
     def touched_blend(self, update: TreeUpdate) -> float:
         """Share for :meth:`blend_tree` of a tree that an actor of this client touches."""
         here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
-        away = float(dead_reckoning.angle_between(here, update.joint_q).max())
-        return max(TOUCHED_BLEND_PER_STEP, BLEND_PER_STEP * min(1.0, away / FAR_ANGLE))
+        return touched_share(float(dead_reckoning.angle_between(here, update.joint_q).max()))
 
     def blend_tree(self, update: TreeUpdate, blend: float, rate_blend: float = 1.0) -> None:
         """Move a tree, and what was cut off it, towards its owner's state by the share ``blend`` (0 to 1), its rates
@@ -396,6 +395,11 @@ class ObjectSync:
 
     def _tree_of(self, bunch: int) -> int:
         return int(self.physics.model.body_tree[self.physics.model.bunch_body[bunch]])
+
+
+def touched_share(away: float) -> float:
+    """Share by which a touched copy is corrected in one step; ``away`` [rad]: the largest error of a joint."""
+    return max(TOUCHED_BLEND_PER_STEP, BLEND_PER_STEP * min(1.0, away / FAR_ANGLE))
 
 
 def _carrier(parent: str) -> str:

@@ -92,6 +92,7 @@ class TreeStates:
         return [
             TreeUpdate(
                 tree, owner, ownership, authority, self.time, bool(flags & RESTING),
+                bool(flags & TOUCHED),
                 self.joint_q[start:end], self.joint_qd[start:end],
                 self.root[first:last], self.root_x[first:last], self.root_xd[first:last],
             )

@@ -53,8 +53,8 @@ def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
 
 
 def clamp_age(age: float | np.ndarray) -> float | np.ndarray:
-    """Time [s] by which a state of ``age`` [s] is extrapolated, :data:`MAX_EXTRAPOLATION` at most: forwards, or backwards
-    where the steps of the sender are ahead of those of the receiver."""
+    """Time [s] by which a state of ``age`` [s] is extrapolated, :data:`MAX_EXTRAPOLATION` at most: forwards, or
+    backwards where the steps of the sender are ahead of those of the receiver."""
     return np.minimum(np.maximum(age, -MAX_EXTRAPOLATION), MAX_EXTRAPOLATION)
 
 
@@ -62,6 +62,12 @@ def faded_age(age: float | np.ndarray) -> float | np.ndarray:
     """Time [s] by which the joints of a tree are extrapolated after ``age`` [s]: the integral of a velocity that decays
     with :data:`TREE_VELOCITY_DECAY`, for a hand stops a branch, and a branch swings back."""
     return TREE_VELOCITY_DECAY * -np.expm1(-clamp_age(age) / TREE_VELOCITY_DECAY)
+
+
+def faded_share(age: float) -> float:
+    """Share of its velocity that a tree still has when it is extrapolated by ``age`` [s]; 0 from
+    :data:`MAX_EXTRAPOLATION` on."""
+    return float(np.exp(-max(age, 0.0) / TREE_VELOCITY_DECAY)) if age < MAX_EXTRAPOLATION else 0.0
 
 
 def extrapolate(q: np.ndarray, rate: np.ndarray, dt: float | np.ndarray) -> np.ndarray:

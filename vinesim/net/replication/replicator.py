@@ -63,6 +63,8 @@ class Replicator:
         self.step_time: Callable[[], float] | None = None
         """Of a client whose steps follow the world's clock: time of the world at the present step [s]. It counts for
         all that is sent and shown in that step, however late the step is; without it the moment of the call counts."""
+        self.received_at = 0.0
+        """Own time of the last :meth:`receive` [s]: of the states in its inbox."""
         self._last_sent = -1e9
         self._offset = self.offset
 
@@ -172,7 +174,7 @@ class Replicator:
         """
         self._state.peers.clock.advance(now)
         self._follow_clock()
-        now = self._own_time(now)
+        now = self.received_at = self._own_time(now)
         return self._receiver.receive(now, self.offset, link_centre)
 
     def send(

@@ -58,6 +58,8 @@ class TreeUpdate:
     time: float
     resting: bool
     """True in the last, reliable record: silence follows."""
+    touched: bool
+    """Whether its owner, or an object of its owner's, is in contact with it."""
     joint_q: np.ndarray
     """[body of the tree, 4]"""
     joint_qd: np.ndarray

@@ -1,0 +1,128 @@
+"""Copies of trees that other clients own: each moves by its own physics, and the states of its owner correct it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, KeysView
+
+import numpy as np
+
+from vinesim import frames
+from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync, touched_share
+from vinesim.net.replication import dead_reckoning
+from vinesim.physics.step import Physics
+from vinesim.scene.ids import parse_object_name
+from vinesim.scene.values import TreeUpdate
+
+CONTACT_MEMORY = 0.15
+"""A copy counts as pressed for so long after it was [s]: a contact that opens and closes is one. GUESSED."""
+
+
+@dataclasses.dataclass(slots=True)
+class _Copy:
+    """One tree of another client."""
+
+    update: TreeUpdate
+    """The last state of its owner, at the time it arrived."""
+    is_new: bool
+    """It has not corrected the copy yet."""
+    correction: np.ndarray
+    """[body, 3] rad by which the joints must still turn, each in its own frame."""
+    pressed_at: float = -np.inf
+    """When copies of actors or objects last pressed on it [s, own clock]."""
+
+
+class TreeCopies:
+    """The trees that other clients own, as this client simulates them.
+
+    A copy feels its own weight, wind and contacts, also those with the copies of its owner. As long as these are all
+    that its owner's tree feels, the physics predicts it better than any extrapolation, and each state that arrives
+    corrects it once. A copy that lacks a force of its owner's, of a hand that holds it there, is drawn to the
+    extrapolated state in every step.
+    """
+
+    def __init__(self, physics: Physics, objects: ObjectSync) -> None:
+        self.physics, self.objects = physics, objects
+        self._copies: dict[int, _Copy] = {}
+
+    def __contains__(self, tree: int) -> bool:
+        return tree in self._copies
+
+    @property
+    def trees(self) -> KeysView[int]:
+        """Numbers of the trees."""
+        return self._copies.keys()
+
+    def apply(
+        self,
+        updates: Iterable[TreeUpdate],
+        now: float,
+        *,
+        is_owned_remotely: Callable[[int], bool],
+        local_actors: Collection[str],
+        coupled_trees: Collection[int],
+    ) -> None:
+        """Take new states of owners and correct the copies; before every step, ``now`` [s] by the client's own clock.
+
+        ``coupled_trees``: those that couplings of other clients hold here.
+        """
+        solver, copies = self.physics.contact_solver, self._copies
+        for update in updates:
+            if (copy := copies.get(update.tree)) is None:
+                self.physics.plants.wake(update.tree)
+                self.objects.blend_tree(update, 1.0)
+                solver.remote_trees[update.tree] = True
+                copies[update.tree] = _Copy(update, False, np.zeros((len(update.joint_q), 3)))
+            else:
+                copy.update, copy.is_new = update, True
+        for tree in [tree for tree in copies if not is_owned_remotely(tree)]:
+            update = copies.pop(tree).update
+            solver.remote_trees[tree] = solver.trees_touched_by_copies[tree] = False
+            if update.resting:
+                self.objects.blend_tree(update, 1.0)
+        touching: dict[int, set[str]] = {}
+        for tree, actor in self.physics.touched if copies else ():
+            touching.setdefault(tree, set()).add(actor)
+        for tree, copy in copies.items():
+            self.physics.plants.wake(tree)
+            solver.trees_touched_by_copies[tree] = tree not in coupled_trees  # their forces act here once
+            self._correct(copy, now, touching.get(tree, set()), local_actors)
+
+    def _correct(self, copy: _Copy, now: float, touching: set[str], local_actors: Collection[str]) -> None:
+        """Correct one copy, which actors and objects named ``touching`` pressed in the last step."""
+        update, objects = copy.update, self.objects
+        if update.owner in touching or any(parse_object_name(name) is not None for name in touching):
+            copy.pressed_at = now
+        is_pressed = now - copy.pressed_at <= CONTACT_MEMORY
+        if not touching.isdisjoint(local_actors):
+            blend = objects.touched_blend(update)
+            objects.blend_tree(update, blend, blend)
+        elif len(update.root) or (update.touched and not is_pressed):
+            objects.blend_tree(_extrapolated(update, now), BLEND_PER_STEP)
+        else:
+            self._correct_once(copy, is_pressed)
+        copy.is_new = False
+
+    def _correct_once(self, copy: _Copy, is_pressed: bool) -> None:
+        """Turn the joints by a share of what the last state has shown to be wrong, and no further."""
+        update = copy.update
+        here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
+        if copy.is_new:
+            copy.correction = frames.log(frames.multiply(frames.conjugate(here), update.joint_q))
+        away = float(np.sqrt((copy.correction * copy.correction).sum(1).max()))
+        share = touched_share(away) if is_pressed else BLEND_PER_STEP
+        there = frames.multiply(here, frames.exp(copy.correction))
+        self.objects.blend_tree(dataclasses.replace(update, joint_q=there), share, share if copy.is_new else 0.0)
+        copy.correction *= 1.0 - share
+
+
+def _extrapolated(update: TreeUpdate, now: float) -> TreeUpdate:
+    """A state as its owner's clients extrapolate it since it arrived: its velocities fade, and at last it stands."""
+    age = float(dead_reckoning.clamp_age(now - update.time))
+    rate = dead_reckoning.quaternion_rate(update.joint_q, update.joint_qd)
+    return dataclasses.replace(
+        update,
+        joint_q=dead_reckoning.extrapolate(update.joint_q, rate, dead_reckoning.faded_age(age)),
+        joint_qd=update.joint_qd * dead_reckoning.faded_share(age),
+        root_x=update.root_x + age * update.root_xd,
+    )
