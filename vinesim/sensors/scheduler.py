@@ -32,8 +32,6 @@ def load_kernels() -> None:
         wp.load_module(module, device="cpu")
 
 
-HEADROOM = 0.9
-"""Share of real time that rendering may take."""
 LEAST_RATE_MARGIN = 0.9
 """Live sensors are taken so much more often than their least rate asks, since snapshots come at whole steps."""
 COST_GAIN = 0.3
@@ -175,7 +173,7 @@ class SensorScheduler:
         """The largest real-time factor at which the wanted sensors keep the rate that their mode promises, by what
         their frames took lately; infinite if none is wanted."""
         load = sum(self._costs.get(one.name, 0.0) / self._gap(one) for one in self._wanted())
-        return HEADROOM / load if load > 0.0 else np.inf
+        return 1.0 / load if load > 0.0 else np.inf
 
     def _wanted(self) -> list[ScheduledSensor]:
         return [one for one in self.sensors if one.name in self._taken and one.wanted()]
