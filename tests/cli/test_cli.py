@@ -317,7 +317,7 @@ def test_a_human_client_runs_and_writes_its_report(tmp_path):
     done = vinesim("client", "--role", "human", "--reach", "3", "--seconds", "1", "--out", str(tmp_path), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "report.json").read_text())
-    assert report["name"].startswith("human-")
+    assert report["name"] == "human"
     assert report["time"] == pytest.approx(1.0)
 
 

@@ -86,6 +86,11 @@ def robot(monkeypatch, tmp_path) -> Iterator[Robot]:
 def test_the_loop_waits_for_a_process_that_gets_no_turn_and_every_step_arrives(robot):
     pid, first = robot.ros.worker.pid, robot.clocks[-1]
     os.kill(pid, signal.SIGSTOP)
+    waits = robot.ros.worker.current().shared.wanted["waits"]
+    while waits[0]:  # stopped while it waited for its subscriber
+        os.kill(pid, signal.SIGCONT)
+        robot.run_until(lambda: not waits[0])
+        os.kill(pid, signal.SIGSTOP)
     before = robot.loop.ticks
     robot.run_until(robot.ros.held)
     assert robot.ros.held() == "ROS messages"

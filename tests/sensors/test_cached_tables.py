@@ -17,10 +17,11 @@ TABLES = ("leaf_outlines", "leaf_texture", "noise_texture", "soil_texture", "sky
 def test_a_table_is_read_as_it_was_computed(name: str, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("VINESIM_CACHE", str(tmp_path))
     cached = getattr(textures, f"_{name}")
-    cached.cache_clear()
+    forget = getattr(cached, "cache_clear", lambda: None)  # layers of the sky are not kept in the process
+    forget()
     computed = cached()  # the folder is empty
     assert len(list(tmp_path.glob(f"{name.replace('_', '-')}-*.npz"))) == 1
-    cached.cache_clear()
+    forget()
     monkeypatch.setattr(disk_cache, "_write", None)  # from here on it must come from the disk
     read = cached()
     assert read is not computed

@@ -59,7 +59,16 @@ class TestDemo:
         _, summary = run
         error = summary["remote_displacement_error_mm"]
         assert error["peak_displacement"] > 10.0
-        assert error["p50"] < 0.5 * error["peak_displacement"]
+        assert error["p50"] < 2.0, "mm; 0.6 on an idle machine and on busy ones"
+
+    def test_time_slows_down_instead_of_tearing(self, run):
+        """However slow or busy this machine is."""
+        _, summary = run
+        assert 0.0 < summary["real_time_factor"] < 1.02
+        assert summary["steps_skipped"] == 0
+        assert summary["lost"] == 0
+        assert summary["pictures_per_simulated_second"] >= 5.0
+        assert summary["scans_per_simulated_second"] >= 5.0
 
     def test_a_stock_node_receives_every_topic(self, run):
         """In 20 s: at least 10 Hz what every step publishes, several frames of each sensor; the rest at least once."""

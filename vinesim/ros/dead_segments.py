@@ -1,4 +1,4 @@
-"""Removes shared memory of Fast DDS whose process was killed: else 16 MiB a sensor process stay until the next boot.
+"""Removes shared memory of Fast DDS whose process was killed: else 24 MiB a sensor process stay until the next boot.
 
 Fast DDS keeps a lock (flock) on ``NAME_el`` while the owner of segment ``NAME`` lives; its own ``fastdds shm clean``
 goes by the same lock. Readers that still have a removed segment mapped keep it until they unmap it.

@@ -20,7 +20,7 @@ PORT = 7447
 """Where a server listens unless told otherwise."""
 SHARED_MEMORY = pathlib.Path("/dev/shm")
 LEAST_SHARED_MEMORY = 64 << 20
-"""[B] One robot: a segment of 16 MiB for its sensors, and the state of the world."""
+"""[B] One robot: a segment of 24 MiB for its sensors, and the state of the world."""
 ADVISED_SHARED_MEMORY = 256 << 20
 """[B] Several robots with cameras."""
 NETWORK = pathlib.Path("/proc")

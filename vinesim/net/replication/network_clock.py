@@ -108,7 +108,7 @@ class NetworkClock:
         received = self._now - age
         if reply.asked > received:
             return
-        is_first = not self.estimate.pings
+        is_first, settles = not self.estimate.pings, len(self.estimate.pings) < PING_WINDOW
         self.estimate = self.estimate.with_ping(Ping(reply.asked, reply.real, received))
         is_other = len(self.estimate.pings) == 1 and not is_first
         """Whether another server has replied, or one whose clock was set."""
@@ -118,7 +118,7 @@ class NetworkClock:
             return
         self._known = reply.real, reply.world
         self.factor, self.cause = reply.factor, reply.cause
-        if is_first:
+        if settles:  # the first estimates are as wrong as their round trips are long: correct them at once
             self.offset += self._away()
         self._slew()
 
