@@ -33,8 +33,10 @@ def touch(path: pathlib.Path, traces: dict[str, Rows], title: str) -> None:
     force.set_ylabel("contact force [N]")
     shift.set_ylabel("bunch moved from rest [mm]")
     shift.set_xlabel("time [s]")
-    force.set_title(title, fontsize=10)
-    force.legend(frameon=False, loc="upper left")
+    figure.suptitle(title, fontsize=10)
+    force.legend(
+        frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=len(force.get_legend_handles_labels()[0])
+    )
     for axes in (force, shift):
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
