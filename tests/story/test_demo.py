@@ -59,7 +59,7 @@ class TestDemo:
         _, summary = run
         error = summary["remote_displacement_error_mm"]
         assert error["peak_displacement"] > 10.0
-        assert error["p50"] < 2.0, "mm; 0.6 on an idle machine and on busy ones"
+        assert error["p50"] < 2.0, "mm; 0.3 to 0.7 on idle and busy machines"
 
     def test_time_slows_down_instead_of_tearing(self, run):
         """However slow or busy this machine is."""

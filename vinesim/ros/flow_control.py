@@ -1,4 +1,4 @@
-"""Whether the subscribers of what every step publishes keep up: the next step is published when they do.
+"""Flow control of the topics that every step publishes: the next step waits until their subscribers keep up.
 
 A subscriber of rclpy keeps the last ten messages of a topic, and overwrites them when more come before it gets a
 processor. So no more than a few are on their way at once. Fast DDS tells only whether all subscribers have acknowledged
