@@ -88,6 +88,42 @@ def test_steps_of_a_long_stall_are_skipped_and_counted(clock):
     assert np.diff(starts)[-5:] == pytest.approx([0.01] * 5)
 
 
+class AskedClock:
+    """A world's clock that is known only since its last answer, and told again ``answer_after`` s after a stop."""
+
+    cause, factor = "", 1.0
+
+    def __init__(self, fake, answer_after):
+        self.fake, self.answer_after = fake, answer_after
+        self.kept, self.stopped_at, self.slower = fake.now, None, 0.0
+
+    def time(self, now):
+        return now - (self.slower if self.is_current(now) else 0.0)
+
+    def is_current(self, now):
+        return self.stopped_at is None or now - self.stopped_at >= self.answer_after
+
+    def keep(self, now):
+        if now - self.kept > 1.0:
+            self.stopped_at, self.slower = now, 2.5
+        self.kept = now
+
+
+@pytest.mark.parametrize(("answer_after", "skipped"), [(0.03, 750), (1e9, 1100)])
+def test_a_stopped_client_skips_to_the_time_that_the_world_has_now(clock, answer_after, skipped):
+    """The world ran slower while the client was stopped for 10 s, so what the client extrapolates is 2.5 s too far.
+
+    It waits for an answer and then runs at once in real time. A server that does not answer is waited for
+    for a second.
+    """
+    loop = RateLoop(0.01, AskedClock(clock, answer_after), max_lag=1.0)
+    run(loop, clock, [0.001] * 20)
+    clock.now += 10.0
+    starts = run(loop, clock, [0.001] * 20)
+    assert loop.dropped == pytest.approx(skipped, abs=6)
+    assert np.diff(starts)[10:] == pytest.approx([0.01] * 9)
+
+
 def test_a_client_alone_on_a_slow_machine_slows_its_time_and_skips_nothing(clock):
     """Steps that take 25 ms of wall time follow each other evenly, at 0.36 of real time after two seconds."""
     loop = own_pace(clock)

@@ -36,6 +36,10 @@ class StepClock(Protocol):
         """Its time at ``now`` [s]."""
         ...
 
+    def is_current(self, now: float) -> bool:
+        """Whether its time at ``now`` [s] is known, not extrapolated from long ago."""
+        ...
+
     def keep(self, now: float) -> None:
         """Called several times a second, also while no step is made."""
 
@@ -50,6 +54,9 @@ class RealTime:
 
     def time(self, now: float) -> float:
         return self.factor * now
+
+    def is_current(self, now: float) -> bool:
+        return True
 
     def keep(self, now: float) -> None:
         pass
@@ -72,6 +79,9 @@ class OwnPace:
 
     def time(self, now: float) -> float:
         return self._clock.time(now)
+
+    def is_current(self, now: float) -> bool:
+        return True
 
     def keep(self, now: float) -> None:
         self._clock.advance(now)
@@ -96,6 +106,9 @@ class WorldPace:
 
     def time(self, now: float) -> float:
         return self._replicator.network_time(now)
+
+    def is_current(self, now: float) -> bool:
+        return self._replicator.is_clock_current(now)
 
     def keep(self, now: float) -> None:
         self._replicator.keep_clock(now)

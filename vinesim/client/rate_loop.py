@@ -88,6 +88,8 @@ class RateLoop:
     """A step that is due so soon begins now [s]."""
     HOLD_POLL = 0.001
     """Time between two looks whether a step is still held [s]."""
+    CLOCK_PATIENCE = 1.0
+    """Longest wait for a clock that has to be asked, before steps are skipped [s]."""
 
     def __init__(
         self, dt: float, clock: StepClock | None = None, *, max_lag: float = MAX_LAG, capacity: int = 1 << 16
@@ -146,6 +148,7 @@ class RateLoop:
             since, now = now, time.monotonic()
             self.meter.hold(cause, now - since)
             self.clock.keep(now)
+        now = self._wait_for_clock(now)
         self._skip_missed(now)
         self._began = now
 
@@ -163,6 +166,24 @@ class RateLoop:
         if lead > self.FREE_LEAD:
             wait = min(wait, self.period / self.LEAD_RATE - since)
         return max(wait, self.LEAST_SPACING * self.dt - since)
+
+    def _wait_for_clock(self, now: float) -> float:
+        """Wait until the clock knows its time again, if steps are to be skipped by it; the real time then [s].
+
+        A client that was stopped knows only what the world's time was before, and would skip too many steps.
+        """
+        until = now + self.CLOCK_PATIENCE
+        while (
+            self.clock.time(now) - self.next_time > self.max_lag
+            and not self.clock.is_current(now)
+            and now < until
+            and not self.is_stopping()
+        ):
+            time.sleep(self.HOLD_POLL)
+            since, now = now, time.monotonic()
+            self.meter.idle(now - since)
+            self.clock.keep(now)
+        return now
 
     def _skip_missed(self, now: float) -> None:
         lag = self.clock.time(now) - self.next_time

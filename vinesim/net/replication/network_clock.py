@@ -30,6 +30,9 @@ SETTLE_TIMEOUT = 2.0
 MAX_REPLY_AGE = 2.0
 """A reply to an older question says nothing of how fast the world runs now [s]."""
 
+CURRENT_AGE = 0.75
+"""Network time is current if the server has answered a question that is not older than this [s]."""
+
 SLEW_TIME = 0.5
 """Time constant with which own time approaches the world's time [s]."""
 
@@ -61,6 +64,8 @@ class NetworkClock:
         """How fast own time passes, with slewing."""
         self._known: tuple[float, float] | None = None
         """Real time of the server's clock, and the world's time then [s], by its last reply."""
+        self._answered = -math.inf
+        """Real time of the last question that the server has answered [s]."""
         self._pinged, self._ping_count = -math.inf, 0
 
     @property
@@ -84,6 +89,10 @@ class NetworkClock:
         assert self._now is not None
         assert self._started is not None
         return bool(self.estimate.pings) or self._now - self._started > SETTLE_TIMEOUT
+
+    def is_current(self, now: float) -> bool:
+        """Whether the server has told the world's time recently."""
+        return now - self._answered <= CURRENT_AGE
 
     def advance(self, now: float) -> float:
         """Go on to real time ``now`` [s]; the own time then [s]."""
@@ -116,9 +125,12 @@ class NetworkClock:
             self._now - reply.asked > MAX_REPLY_AGE or (self._known is not None and reply.real < self._known[0])
         ):
             return
-        self._known = reply.real, reply.world
+        was_silent = reply.asked - self._answered > MAX_REPLY_AGE
+        self._known, self._answered = (reply.real, reply.world), reply.asked
         self.factor, self.cause = reply.factor, reply.cause
-        if settles:  # the first estimates are as wrong as their round trips are long: correct them at once
+        # The first estimates are as wrong as their round trips are long, and what was extrapolated through a long
+        # silence may be wrong by seconds: correct both at once.
+        if settles or was_silent:
             self.offset += self._away()
         self._slew()
 

@@ -155,6 +155,10 @@ class Replicator:
         """Network time [s] at the time ``now`` [s] of the client's clock."""
         return self._state.peers.clock.own(now) + self.offset
 
+    def is_clock_current(self, now: float) -> bool:
+        """Whether the server has told the world's time so recently that network time at ``now`` [s] is right."""
+        return self._state.peers.clock.is_current(now)
+
     @property
     def has_clock(self) -> bool:
         """Whether a server has told its clock, so that network time is its time."""
