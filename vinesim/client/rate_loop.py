@@ -88,7 +88,7 @@ class RateLoop:
     """A step that is due so soon begins now [s]."""
     HOLD_POLL = 0.001
     """Time between two looks whether a step is still held [s]."""
-    CLOCK_PATIENCE = 1.0
+    CLOCK_PATIENCE = 3.0
     """Longest wait for a clock that has to be asked, before steps are skipped [s]."""
 
     def __init__(
