@@ -56,8 +56,8 @@ class Cast:
     robots: int = 4
     people: int = 2
     records: bool = True
-    real_time_factor: float = 1.0
-    """Of the world; below 1 where the machine cannot hold them at 100 Hz."""
+    real_time_factor: float | None = None
+    """Of the world; as fast as all can follow unless given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +76,7 @@ class SoakResult:
         return [history for (name, _), history in self.histories.items() if name == kind]
 
 
-def soak(minutes: float, real_time_factor: float, announce: Callable[[str], None]) -> Iterator[Measurement]:
+def soak(minutes: float, real_time_factor: float | None, announce: Callable[[str], None]) -> Iterator[Measurement]:
     """Run for ``minutes`` [min] and measure; ``announce`` takes a line now and then."""
     yield from measurements(run_soak(Cast(real_time_factor=real_time_factor), minutes, announce))
 
@@ -151,7 +151,8 @@ class _Run:
         self._folder = folder
         self.server = group.start(
             "server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json",
-            "--state-dir", str(folder / "state"), "--real-time-factor", f"{cast.real_time_factor:g}",
+            "--state-dir", str(folder / "state"),
+            "--real-time-factor", "auto" if cast.real_time_factor is None else f"{cast.real_time_factor:g}",
         )  # fmt: skip
         self._figures: dict[str, Any] = json.loads(self.server.next_line(START_TIMEOUT))
         self._endpoint = self._figures["endpoints"][0]
@@ -175,7 +176,7 @@ class _Run:
         first = start_poses.start_pose(scene, 0)
         pushed = start_poses.find_reachable_bunch(model, first)
         with_ros = middleware.unavailable_reason() is None
-        sensor_hz = SENSOR_HZ / cast.real_time_factor  # of simulated time
+        sensor_hz = SENSOR_HZ / (cast.real_time_factor or 1.0)  # of simulated time
         for i in range(cast.robots):
             name = f"robot_{i + 1}"
             pose = start_poses.start_pose(scene, 0, queue=i)

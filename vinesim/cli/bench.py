@@ -168,8 +168,7 @@ def _announce(line: str) -> None:
 def _soak(minutes: float | None = None, real_time_factor: float | None = None) -> Iterator[Measurement]:
     from vinesim.bench.soak import MINUTES, soak
 
-    factor = 1.0 if real_time_factor is None else real_time_factor
-    return soak(MINUTES if minutes is None else minutes, factor, _announce)
+    return soak(MINUTES if minutes is None else minutes, real_time_factor, _announce)
 
 
 RAISED = {

@@ -19,7 +19,7 @@ def bench(
         float | None, typer.Option(min=0.1, help="Of soak: how long it measures; 60 unless given.")
     ] = None,
     real_time_factor: Annotated[
-        float | None, typer.Option(min=0.01, max=1.0, help="Of soak: of its world; 1 unless given.")
+        float | None, typer.Option(min=0.01, max=1.0, help="Of soak: of its world; found unless given.")
     ] = None,
     plot: Annotated[
         pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
