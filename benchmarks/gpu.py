@@ -23,16 +23,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from vinesim import frames
 from vinesim.bench import scenes
-from vinesim.physics.contact.resident_contacts import ResidentContacts
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.step import Physics
+from vinesim.contact.resident_contacts import ResidentContacts
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
+from vinesim.world import Physics
 
 TICKS = 100
 PER_TREE = 17

@@ -32,9 +32,9 @@ import warp as wp
 
 from vinesim.cli.client_session import SWITCH_INTERVAL, run_loop
 from vinesim.client.client import Client
+from vinesim.client.processes import sensor_process, sensor_worker
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
-from vinesim.client.sensing import sensor_process, sensor_worker
 from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose, start_pose
 from vinesim.kernels.compilation import compile_kernels
@@ -46,7 +46,7 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraOutput
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 
 CAMERAS = 4
 WARM_UP = 3.0

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.bench.support import browser
+from benchmarks.support import browser
 from vinesim.web import array_message
 from vinesim.web.page_server import PageServer
 
@@ -96,9 +96,8 @@ DURATIONS = """(() => {
 
 def record(path: pathlib.Path, name: str) -> None:
     """Write what a page of a scene is sent."""
-    from vinesim import frames
     from vinesim.client.client import Client
-    from vinesim.client.page_world import PageWorld
+    from vinesim.client.page.page_world import PageWorld
     from vinesim.client.tasks.motions import LookAt
     from vinesim.client.tasks.start_poses import (
         PlacementError,
@@ -107,9 +106,10 @@ def record(path: pathlib.Path, name: str) -> None:
         spawn_pose,
         start_pose,
     )
+    from vinesim.core import frames
     from vinesim.kernels.compilation import compile_kernels
     from vinesim.net.transport.memory_bus import MemoryHub
-    from vinesim.physics.rigid.human_posture import standing_pose
+    from vinesim.rigid.human_posture import standing_pose
     from vinesim.robot.description.loader import load_description
     from vinesim.robot.tasks.push import PushBunch
     from vinesim.scene.generation.vineyard import generate
@@ -287,7 +287,7 @@ def _wear(page: browser.Page, world: Recorded, address: str, eyes: tuple[int, in
 
 def _wait_for_scale(page: browser.Page) -> None:
     """Until a headset's page has asked for the same number of pixels for a while."""
-    ask, end = f"[{SCALE}, vinesim.frames]", time.monotonic() + PATIENCE
+    ask, end = f"[{SCALE}, vinesim.core.frames]", time.monotonic() + PATIENCE
     scale, since = page.run(ask)
     while time.monotonic() < end:
         time.sleep(0.2)
@@ -313,9 +313,9 @@ def _errors(page: browser.Page) -> Iterator[dict[str, Any]]:
 
 def _measure(page: browser.Page, case: str, bar: float | None) -> Iterator[dict[str, Any]]:
     time.sleep(SETTLING)
-    before = page.run("[vinesim.frames, vinesim.states, performance.now()]")
+    before = page.run("[vinesim.core.frames, vinesim.states, performance.now()]")
     time.sleep(SECONDS)
-    after = page.run("[vinesim.frames, vinesim.states, performance.now(), vinesim.calls, vinesim.triangles]")
+    after = page.run("[vinesim.core.frames, vinesim.states, performance.now(), vinesim.calls, vinesim.triangles]")
     seconds = 1e-3 * (after[2] - before[2])
     rate = {"case": f"{case}: pictures", "value": (after[0] - before[0]) / seconds, "unit": "Hz"}
     yield rate | ({} if bar is None else {"peer": "bar, at least", "peer_value": bar})

@@ -20,7 +20,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.kernels.raster import ray_cast
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
@@ -30,9 +30,9 @@ from vinesim.scene.values import RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.primitives.ray_caster import RayCaster
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH, pinhole
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
-from vinesim.sensors.scene.ray_caster import RayCaster
 
 VIEWS = {
     "along a row": ((-0.6, 1.0, 1.45), (8.0, 1.35, 1.45)),

@@ -19,7 +19,7 @@ import sys
 import numpy as np
 
 import vinesim
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.physics_parameters import PhysicsParameters
 

@@ -20,7 +20,7 @@ import time
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "ros" / "pick_a_bunch.py"

@@ -3,7 +3,7 @@
 #
 # How much room must the open hand have about a bunch? `reachable_grasps` lists what a hand reaches and the room
 # it has there; `attempt_pick` tries one in a vineyard of its own. Here the freest, the narrowest and one between;
-# `vinesim bench picking` tries all.
+# `python -m benchmarks picking` tries all.
 
 # %%
 import matplotlib.pyplot as plt

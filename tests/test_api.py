@@ -15,8 +15,8 @@ import pytest
 
 import vinesim
 from tests.support.waiting import deadline
-from vinesim import frames
-from vinesim.errors import UsageError
+from vinesim.core import frames
+from vinesim.core.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_writer import RecordingWriter
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vinesim.array_fields import StructOfArrays, array
+from vinesim.core.array_fields import StructOfArrays, array
 
 
 @dataclasses.dataclass

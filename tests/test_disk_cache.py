@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from tests.support.waiting import wait
-from vinesim import disk_cache
-from vinesim.disk_cache import load_or_make, source_digest
+from vinesim.core import disk_cache
+from vinesim.core.disk_cache import load_or_make, source_digest
 
 ARRAYS = {
     "a": np.arange(12, dtype=np.int8).reshape(3, 4),

@@ -14,7 +14,7 @@ from tests.support.waiting import deadline
 from vinesim.cli.client_session import save_report
 from vinesim.cli.demo.progress import PICKER
 from vinesim.cli.demo.summary import write_summary
-from vinesim.errors import WriteError, writing
+from vinesim.core.errors import WriteError, writing
 
 FULL = pathlib.Path("/dev/full")
 pytestmark = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vinesim import frames
+from vinesim.core import frames
 
 G = np.random.default_rng(3)
 A, B = (Rotation.random(200, random_state=k) for k in (1, 2))

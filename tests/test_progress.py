@@ -7,8 +7,8 @@ import logging
 
 import pytest
 
-from vinesim import progress
-from vinesim.progress import ProgressHandler
+from vinesim.core import progress
+from vinesim.core.progress import ProgressHandler
 
 
 class Terminal(io.StringIO):
@@ -20,7 +20,7 @@ class Terminal(io.StringIO):
 
 def say(handler: ProgressHandler, *texts: str) -> None:
     for text in texts:
-        handler.handle(logging.LogRecord("vinesim.progress", logging.INFO, "", 0, text, None, None))
+        handler.handle(logging.LogRecord("vinesim.core.progress", logging.INFO, "", 0, text, None, None))
 
 
 def test_a_terminal_shows_one_line_that_is_erased_at_the_end() -> None:

@@ -1,9 +1,21 @@
-"""Hooks of the documentation site (mkdocs.yml): the first page of decisions lists all of them by their titles."""
+"""Hooks of the documentation site (mkdocs.yml): pages that are lists of what the project has."""
 
 from __future__ import annotations
 
 import pathlib
+import sys
 from typing import Any
+
+from mkdocs.structure.files import File
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+import list_modules
+
+
+def on_files(files: Any, *, config: Any) -> Any:
+    """The files of the site, with a page that lists all modules."""
+    files.append(File.generated(config, "modules.md", content=list_modules.render()))
+    return files
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:

@@ -16,13 +16,13 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from vinesim import frames
+from benchmarks.support.browser import Page, browser_page, emulated_headset
 from vinesim.avatar.gestures import GESTURES
-from vinesim.bench.support.browser import Page, browser_page, emulated_headset
-from vinesim.client.page_world import PageWorld
+from vinesim.client.page.page_world import PageWorld
 from vinesim.client.spectator import Spectator
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.appearance import apply_posture
 from vinesim.scene.generation.vineyard import generate
@@ -30,7 +30,7 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraOutput, HumanSpec
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.web.page_server import PageServer
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
@@ -94,7 +94,7 @@ class Photographer:
 
     def settled(self) -> np.ndarray:
         """The page's picture when so many more were drawn that the shadows are of now."""
-        self.wait(f"vinesim.frames > {self.page.run('vinesim.frames')} + 5")
+        self.wait(f"vinesim.core.frames > {self.page.run('vinesim.core.frames')} + 5")
         return self.page.picture()
 
     def photographs(self, name: str) -> Iterator[tuple[str, np.ndarray]]:

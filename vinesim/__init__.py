@@ -14,10 +14,9 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from vinesim.core.version import __version__
 
 if TYPE_CHECKING:
-    from vinesim import frames as frames
     from vinesim.api.client import Client as Client
     from vinesim.api.energy import Energy as Energy
     from vinesim.api.energy import Momentum as Momentum
@@ -33,7 +32,8 @@ if TYPE_CHECKING:
     from vinesim.api.sensors import look_at as look_at
     from vinesim.api.simulation import Simulation as Simulation
     from vinesim.api.sweep import sweep as sweep
-    from vinesim.errors import UsageError as UsageError
+    from vinesim.core import frames as frames
+    from vinesim.core.errors import UsageError as UsageError
     from vinesim.net.server.server import Server as Server
     from vinesim.robot.drives.controlled_robot import Robot as Robot
     from vinesim.scene.cane import CaneBuilder as CaneBuilder
@@ -70,11 +70,11 @@ _MODULES = {
     "Server": "net.server.server",
     "Simulation": "api.simulation",
     "State": "scene.state",
-    "UsageError": "errors",
+    "UsageError": "core.errors",
     "assemble": "scene.cane",
     "attempt_pick": "api.picking",
     "cane": "scene.cane",
-    "frames": "frames",
+    "frames": "core.frames",
     "generate": "scene.generation.vineyard",
     "import_plant": "scene.plant_import.imported_plant",
     "load_scene": "scene.spec",
@@ -125,7 +125,7 @@ def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module 'vinesim' has no attribute {name!r}; it offers {', '.join(__all__)}")
     module = importlib.import_module(f"vinesim.{_MODULES[name]}")
-    value = module if _MODULES[name] == name else getattr(module, name)
+    value = module if _MODULES[name] == f"core.{name}" else getattr(module, name)
     globals()[name] = value
     return value
 

@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectoryPoint
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.robot.description.loader import load_description
 from vinesim.ros.messages import message_packages
 

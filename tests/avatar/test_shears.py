@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import bunch_scene, cane
-from vinesim import frames
 from vinesim.avatar.local_human import LocalHuman
 from vinesim.avatar.shears import CUT_PULSE, MISS_PULSE
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene import appearance
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import HumanSpec
+from vinesim.world import Physics
 
 AHEAD = frames.from_yaw(0.5 * np.pi)
 """The person looks along y."""

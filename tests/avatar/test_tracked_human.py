@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from vinesim import frames
 from vinesim.avatar.gestures import FIST, OPEN_HAND, shears_grip
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
+from vinesim.core import frames
 
 DT = 0.01
 ROOT = frames.pose(np.array([1.0, 2.0, 0.0]), frames.from_yaw(0.5))

@@ -1,8 +1,8 @@
-"""What ``vinesim bench kill`` makes of its rounds, without programs."""
+"""What ``python -m benchmarks kill`` makes of its rounds, without programs."""
 
 from __future__ import annotations
 
-from vinesim.bench.kill import RESTART_BOUND, Round, _rows
+from benchmarks.kill import RESTART_BOUND, Round, _rows
 
 KINDS = ("server", "sensors")
 

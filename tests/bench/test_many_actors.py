@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vinesim.bench.many_actors import run_crowd
+from benchmarks.many_actors import run_crowd
 from vinesim.robot.description.loader import load_description
 
 

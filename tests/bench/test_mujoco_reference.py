@@ -4,7 +4,7 @@ import numpy as np
 
 from vinesim.bench import scenes as scenes
 from vinesim.bench.mujoco_reference import MujocoScene
-from vinesim.physics.step import Physics
+from vinesim.world import Physics
 
 
 def test_the_mujoco_reference_of_the_contact_bench_has_the_same_contacts() -> None:

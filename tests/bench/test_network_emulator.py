@@ -11,10 +11,10 @@ import time
 
 import pytest
 
+from benchmarks.support import network_emulator
+from benchmarks.support.network_emulator import Count, Link, LinkProfile, NetworkEmulator
 from tests.support.live_server import require_network_emulation, wait
 from tests.support.waiting import deadline
-from vinesim.bench.support import network_emulator
-from vinesim.bench.support.network_emulator import Count, Link, LinkProfile, NetworkEmulator
 
 ECHO = """
 import socket, sys
@@ -93,7 +93,7 @@ def test_links_lose_packets_and_can_be_cut_and_restored():
 
 def test_namespaces_are_removed_also_after_a_kill():
     code = (
-        "import sys, time\nfrom vinesim.bench.support.network_emulator import Link, NetworkEmulator\n"
+        "import sys, time\nfrom benchmarks.support.network_emulator import Link, NetworkEmulator\n"
         "net = NetworkEmulator({'a': Link()})\nprint('ready', flush=True)\ntime.sleep(60)"
     )
     owner = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)

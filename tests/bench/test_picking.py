@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks.picking import class_name, success_measurements
 from vinesim.api.picking import Grasp, PickAttempt, attempt_pick
-from vinesim.bench.picking import class_name, success_measurements
 from vinesim.client.tasks import pick_planning
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.scene.generation.vineyard import generate

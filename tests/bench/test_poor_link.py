@@ -1,11 +1,11 @@
-"""A slow link that loses packets keeps its clients; ``vinesim bench link`` tries all protocols for longer."""
+"""A slow link that loses packets keeps its clients; ``python -m benchmarks link`` tries all protocols for longer."""
 
 from __future__ import annotations
 
 import pytest
 
+from benchmarks.poor_link import run_poor_link
 from tests.support.live_server import require_network_emulation
-from vinesim.bench.poor_link import run_poor_link
 
 
 @pytest.mark.long

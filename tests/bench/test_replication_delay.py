@@ -1,12 +1,12 @@
-"""``vinesim bench sync`` at one delay."""
+"""``python -m benchmarks sync`` at one delay."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from vinesim.bench import replication_delay
-from vinesim.bench.replication_delay import buffered, count_reversals, extrapolation
+from benchmarks import replication_delay
+from benchmarks.replication_delay import buffered, count_reversals, extrapolation
 
 
 @pytest.mark.long

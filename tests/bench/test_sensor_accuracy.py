@@ -1,16 +1,16 @@
-"""``vinesim bench sensors`` on a few of its cases."""
+"""``python -m benchmarks sensors`` on a few of its cases."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from vinesim.bench import sensor_accuracy
-from vinesim.bench.sensor_accuracy import DepthStatistics, depth_noise_formula, measure_plane, measure_ranges
+from benchmarks import sensor_accuracy
+from benchmarks.sensor_accuracy import DepthStatistics, depth_noise_formula, measure_plane, measure_ranges
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.camera.camera import CameraSpec
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 
 
 def test_noise_on_a_plane_is_that_of_the_formula(monkeypatch) -> None:

@@ -1,4 +1,4 @@
-"""``vinesim bench soak``: what it reads from /proc, and a short run of real programs."""
+"""``python -m benchmarks soak``: what it reads from /proc, and a short run of real programs."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from typing import cast
 import numpy as np
 import pytest
 
-from vinesim.bench import soak
+from benchmarks import soak
+from benchmarks.soak import Cast, SoakResult, _Run, measurements, run_soak, settle
 from vinesim.bench.process_memory import ProcessHistory, ProcessSample, ProcessSampler, sample_process
-from vinesim.bench.soak import Cast, SoakResult, _Run, measurements, run_soak, settle
 from vinesim.client.processes.child_process import Process, ProcessFailed
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/smaps_rollup"), reason="needs /proc of Linux")

@@ -1,11 +1,11 @@
-"""What ``vinesim bench link`` says of two clients whose people pull at one bunch, from records with a known answer."""
+"""``python -m benchmarks link`` on two clients whose people pull at one bunch, from records with a known answer."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from vinesim.bench.two_pullers import Seen, outcome
+from benchmarks.two_pullers import Seen, outcome
 
 BEGIN, SECONDS = 100.0, 27.0
 

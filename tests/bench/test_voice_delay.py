@@ -1,8 +1,8 @@
-"""The stages of ``vinesim bench voice``: the first frame of each burst is followed through all of them."""
+"""The stages of ``python -m benchmarks voice``: the first frame of each burst is followed through all of them."""
 
 import numpy as np
 
-from vinesim.bench.voice_delay import STAGES, _stages
+from benchmarks.voice_delay import STAGES, _stages
 
 
 def test_the_stages_of_a_burst_are_those_of_its_first_frame_and_add_up_to_its_way():

@@ -1,21 +1,13 @@
-"""``vinesim bench`` where load generators are not installed."""
+"""Options of ``vinesim bench`` and of ``python -m benchmarks``."""
 
 from __future__ import annotations
 
+import subprocess
 import sys
 
 import pytest
 
-from vinesim.cli.bench import NoSuchBench, run
-
-
-def test_a_bench_that_needs_a_checkout_is_refused_without_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    loaded = [name for name in sys.modules if name.startswith("vinesim.bench.support")]
-    for module in ("vinesim.bench.support", *loaded):
-        monkeypatch.setitem(sys.modules, module, None)
-    monkeypatch.delitem(sys.modules, "vinesim.bench.message_fuzz", raising=False)
-    with pytest.raises(NoSuchBench, match="in a checkout"):
-        run(["fuzz"], as_json=True)
+from vinesim.cli.bench import BENCHES, NoSuchBench, run
 
 
 def test_rows_are_of_the_bench_live_and_have_names() -> None:
@@ -25,6 +17,21 @@ def test_rows_are_of_the_bench_live_and_have_names() -> None:
         run(["plants"], as_json=True, rows=["demo"])
 
 
-def test_minutes_are_of_the_bench_soak() -> None:
-    with pytest.raises(NoSuchBench, match="--minutes is how long the bench soak runs"):
-        run(["plants"], as_json=True, minutes=2.0)
+def test_a_bench_without_such_a_name_is_refused_with_all_names() -> None:
+    with pytest.raises(NoSuchBench, match="no bench 'soak'; there are: plants, contact") as refused:
+        run(["plants", "soak"], as_json=True)
+    assert str(refused.value).count(",") == len(BENCHES) - 1
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["soak", "--minutes", "0"], "--minutes is 0: give more than 0"),
+        (["soak", "--real-time-factor", "2"], "--real-time-factor is 2: give 0.01 to 1"),
+        (["kill", "--times", "0"], "--times is 0: give 1 or more"),
+        (["fuzz", "--lies", "-1"], "--lies is -1: give 0 or more"),
+    ],
+)
+def test_unfit_options_of_a_benchmark_are_refused_in_one_line(words: list[str], message: str) -> None:
+    done = subprocess.run([sys.executable, "-m", "benchmarks", *words], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (2, f"benchmarks: {message}\n")

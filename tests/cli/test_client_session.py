@@ -12,7 +12,7 @@ from tests.support.waiting import wait
 from vinesim.cli import client_session
 from vinesim.cli.client_session import ClientSession
 from vinesim.net.server.server import Server
-from vinesim.physics.plants.device_buffers import DeviceLost
+from vinesim.plants.device_buffers import DeviceLost
 
 
 @pytest.fixture

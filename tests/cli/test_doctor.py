@@ -86,7 +86,7 @@ def test_cores_and_vectors(tmp_path, monkeypatch):
 def test_a_driver_without_a_gpu_and_a_gpu_that_does_not_compute(tmp_path, monkeypatch):
     import warp as wp
 
-    from vinesim.physics.plants import device_buffers
+    from vinesim.plants import device_buffers
 
     driver = tmp_path / "version"
     monkeypatch.setattr(wp, "get_cuda_device_count", lambda: 0)

@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.long_rows import long
 from vinesim.cli.render import run
-from vinesim.errors import UsageError, WriteError
+from vinesim.core.errors import UsageError, WriteError
 
 HEADER = "x,y,z,look_x,look_y,look_z\n"
 

@@ -7,8 +7,8 @@ import pytest
 
 from tests.support import sensor_scenes
 from vinesim.client.composition.domain_randomizer import FOOTPRINT_RADIUS, SceneRandomizer, random_composition
-from vinesim.physics.parameters import PhysicsParameters
 from vinesim.scene.ids import Organ
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
 pytestmark = pytest.mark.slow

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests.support.shared_vineyard import World, cart, vineyard
-from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.faults import count_faults
 from vinesim.client.tasks.entities import BOX_SIZE, WorldEditor
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.ros.commands.types import Entity, EntityArguments, EntityCategory, Refusal, RequestRefused
 from vinesim.scene.ids import Organ

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import long
-from vinesim import frames
-from vinesim.client.first_view import first_view
+from vinesim.client.page.first_view import first_view
 from vinesim.client.spectator import EYE_HEIGHT
 from vinesim.client.tasks.start_poses import start_pose
+from vinesim.core import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 

@@ -10,18 +10,18 @@ import pytest
 from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
 from tests.support.long_rows import long
-from vinesim import frames
 from vinesim.avatar.leg_estimator import LegEstimator
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.cli.human_client import standing_place
 from vinesim.client.client import Client, label_index
 from vinesim.client.remote.remote_human import human_spec
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, start_pose
+from vinesim.core import frames
 from vinesim.net.codec import human as poses
 from vinesim.net.codec.messages import Hello
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.human_shapes import BODY_PARTS
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.human_shapes import BODY_PARTS
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.scene import appearance
@@ -34,7 +34,7 @@ from vinesim.scene.values import HumanPose, HumanUpdate
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 
 pytestmark = pytest.mark.slow
 

@@ -16,10 +16,10 @@ import trimesh
 
 from tests.support.contact_scenes import cane
 from tests.support.waiting import wait
-from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.faults import count_faults
 from vinesim.client.remote.mesh_exchange import MeshExchange
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MeshPart
 from vinesim.net.server.server import Server
@@ -31,7 +31,7 @@ from vinesim.scene.builder import assemble
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.triangles import MAX_FACES, digest_of, encode_triangles
-from vinesim.sensors.scene.rigid_primitives import rigid_batches
+from vinesim.sensors.primitives.rigid_primitives import rigid_batches
 
 OPENED: list[str] = []
 """Names of the files that Python opened since the list was cleared."""

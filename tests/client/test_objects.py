@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.core import frames
 from vinesim.net.codec.messages import RESTING, RetainedRecord, TreeStates, encode_trees
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.transport.memory_bus import MemoryHub

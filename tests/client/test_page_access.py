@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vinesim.client.page_access import print_code
+from vinesim.client.page.page_access import print_code
 
 ADDRESS = "https://192.168.1.23:8443/?token=Zx3-7f_QwErTyUiOpAsDfG"
 HALVES = {" ": (0, 0), "\u2580": (1, 0), "\u2584": (0, 1), "\u2588": (1, 1)}

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from vinesim import frames
 from vinesim.client.tasks import path_planning, pick_planning, start_poses
+from vinesim.core import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import Box, Scene, load_scene, with_seed
 

@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 
-from vinesim.client.sensing.rigid_visual_list import VisualListReceiver, VisualListSender
+from vinesim.client.processes.rigid_visual_list import VisualListReceiver, VisualListSender
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import RigidVisual
 

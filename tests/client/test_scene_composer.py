@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
 from vinesim.client.composition.scene_composer import (
     CRATE_WALL,
     HEAP_DENSITY,
@@ -17,9 +16,10 @@ from vinesim.client.composition.scene_composer import (
     SceneComposer,
     bunch_masses,
 )
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.ids import Organ, label
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.world import Physics
 
 CRATE = CratePlacement(1.3, 1.25, 0.4, 0.35)
 

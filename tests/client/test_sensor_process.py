@@ -17,16 +17,16 @@ import warp as wp
 
 from tests.support.contact_scenes import cane
 from tests.support.waiting import wait
-from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.client.sensing import worker_process
-from vinesim.client.sensing.picture_keeper import RENEWAL_PERIOD, PictureKeeper
-from vinesim.client.sensing.sensor_process import SensorProcess
-from vinesim.client.sensing.worker_process import WorkerError
+from vinesim.client.processes import worker_process
+from vinesim.client.processes.picture_keeper import RENEWAL_PERIOD, PictureKeeper
+from vinesim.client.processes.sensor_process import SensorProcess
+from vinesim.client.processes.worker_process import WorkerError
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.errors import WriteError
+from vinesim.core import frames
+from vinesim.core.errors import WriteError
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene

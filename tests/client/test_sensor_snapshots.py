@@ -14,9 +14,9 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from vinesim.client.client import Client
-from vinesim.client.sensing import sensor_process
-from vinesim.client.sensing.sensor_process import SensorProcess
-from vinesim.client.sensing.sensor_worker import SensorWorker
+from vinesim.client.processes import sensor_process
+from vinesim.client.processes.sensor_process import SensorProcess
+from vinesim.client.processes.sensor_worker import SensorWorker
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description

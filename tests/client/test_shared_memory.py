@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.support.waiting import deadline
-from vinesim.client.sensing.shared_arrays import SharedArrays, SharedSnapshot
-from vinesim.client.sensing.shared_queue import SharedQueue
+from vinesim.client.processes.shared_arrays import SharedArrays, SharedSnapshot
+from vinesim.client.processes.shared_queue import SharedQueue
 
 RECORD = np.dtype([("number", "i8"), ("values", "f8", (5,))])
 LAYOUT = {"number": ((1,), "i8"), "values": ((1000,), "f8")}

@@ -10,13 +10,13 @@ import pytest
 
 from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
-from vinesim import frames
 from vinesim.avatar.gestures import GESTURES
 from vinesim.client.client import Client
 from vinesim.client.signals import GestureLog, IntentionLog
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot

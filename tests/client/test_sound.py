@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.sound_delay import AS_WAVEFORM, LIGHT, TONE_OF_LIGHTS, VOICE, sound
+from benchmarks.support.ear import Ear
 from tests.audio.test_microphone import amplitude
 from tests.support.contact_scenes import cane
-from vinesim import frames
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, SAMPLE_RATE, Codec, to_pcm
 from vinesim.audio.permission import SpectatorsSpeakTo
-from vinesim.bench.sound_delay import AS_WAVEFORM, LIGHT, TONE_OF_LIGHTS, VOICE, sound
-from vinesim.bench.support.ear import Ear
 from vinesim.client.client import Client
 from vinesim.client.sound.exchange import MAX_WAITING
 from vinesim.client.spectator import Spectator
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
@@ -147,7 +147,7 @@ def test_sound_that_a_loudspeaker_or_a_client_that_stands_still_has_no_room_for_
 
 
 def test_an_alarm_is_heard_with_its_light_and_a_voice_later_than_states_but_within_its_budget():
-    """F94, F98; ``vinesim bench sound`` has the figures."""
+    """F94, F98; ``python -m benchmarks sound`` has the figures."""
     took = {row.case.split(": ")[1].split(",")[0]: row.value for row in sound((0.02,), 2) if "largest" in row.case}
     assert took[TONE_OF_LIGHTS] == took[LIGHT]
     assert took[LIGHT] <= took[AS_WAVEFORM] <= took[LIGHT] + 60.0

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import cane
-from vinesim import frames
 from vinesim.client.remote.spawner import RemoteSpawner, resolve_description
+from vinesim.core import frames
 from vinesim.net.codec.messages import Hello
-from vinesim.physics.step import Physics
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
@@ -22,6 +21,7 @@ from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
+from vinesim.world import Physics
 
 
 class DeferredExecutor(concurrent.futures.Executor):

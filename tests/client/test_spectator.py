@@ -11,14 +11,14 @@ import pytest
 from tests.client.test_recorder import World
 from tests.client.test_replay import recorded_trees
 from tests.support.recorded_world import TICK, MinimalClient, vineyard
-from vinesim import frames
 from vinesim.cli.replay import run as replay
 from vinesim.client.client import Client
 from vinesim.client.recording.recorder import Recorder
 from vinesim.client.recording.replay import ReplayBus
 from vinesim.client.spectator import EYE_HEIGHT, FOLLOW_DISTANCE, Spectator, follow_view, standing_view
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.errors import UsageError
+from vinesim.core import frames
+from vinesim.core.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import long
-from vinesim import frames
 from vinesim.client.tasks import start_poses
+from vinesim.core import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
 

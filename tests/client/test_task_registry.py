@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks import start_poses
 from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.ros_command_handler import MAX_LOGGED, RosCommandHandler
 from vinesim.client.tasks.task_registry import UnknownTask, plan_task
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch

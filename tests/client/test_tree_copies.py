@@ -6,8 +6,8 @@ import pytest
 from tests.support.contact_scenes import bunch_scene, held_point
 from vinesim.client.remote.objects import ObjectSync
 from vinesim.client.remote.tree_copies import TreeCopies
-from vinesim.physics.step import Physics
 from vinesim.scene.values import TreeUpdate
+from vinesim.world import Physics
 
 ASIDE = np.array([0.0, 0.06, 0.0])
 """By which the owner draws the bunch aside [3] m."""

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.support.shared_vineyard import World, vineyard
-from vinesim.physics.plants.sway import Sway
 from vinesim.scene.wind import Wind
+from vinesim.wind.sway import Sway
 
 
 def test_clients_that_joined_at_different_times_draw_the_same_trees(tmp_path, monkeypatch) -> None:

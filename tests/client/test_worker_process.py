@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from tests.support.waiting import wait
-from vinesim.client.sensing import worker_process
-from vinesim.client.sensing.worker_process import WorkerProcess
+from vinesim.client.processes import worker_process
+from vinesim.client.processes.worker_process import WorkerProcess
 
 MODULES = ("tests.client.test_worker_process",)
 HANG_TIMEOUT = 2

@@ -18,7 +18,7 @@ import warp as wp
 
 import vinesim.kernels
 from tests.support.waiting import wait
-from vinesim import disk_cache
+from vinesim.core import disk_cache
 from vinesim.kernels import compilation
 from vinesim.kernels.compilation import CompiledModules, compile_kernels, module_names
 

@@ -9,7 +9,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.kernels.contact import distance
 
 KINDS = {

@@ -9,10 +9,10 @@ import scipy.optimize
 import scipy.spatial
 import warp as wp
 
-from vinesim import frames
+from vinesim.core import frames
+from vinesim.core.warp_arrays import SharedArrays
 from vinesim.kernels.contact import distance, hull_distance, structs
-from vinesim.physics.contact.hulls import hull_arrays
-from vinesim.physics.contact.warp_arrays import SharedArrays
+from vinesim.rigid.hulls import hull_arrays
 
 TOLERANCE = 0.002
 

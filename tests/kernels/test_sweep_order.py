@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.contact import structs
 from vinesim.kernels.contact.sweep_order import sort_awake_trees
-from vinesim.physics.contact.warp_arrays import SharedArrays, share
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 17, 64, 1000])

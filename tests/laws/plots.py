@@ -21,7 +21,7 @@ from tests.support import beam_theory
 from tests.support.contact_forces import force_on
 from tests.support.contact_scenes import bunch_scene, grasp, gripper, held_point
 from vinesim.bench.mujoco_reference import MujocoScene
-from vinesim.physics.step import Physics
+from vinesim.world import Physics
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import each_once
-from vinesim import frames
 from vinesim.api.energy import energy
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import TreeBuilder, assemble, solve_rest_pose
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 
@@ -159,7 +159,7 @@ def test_modes_of_two_shoots_on_an_arm(modulus: float, sign: float) -> None:
 @pytest.mark.parametrize(("modulus", "phi", "lean"), each_once((1e7, 1e9, 1e11), (0.5, 0.55), (0.0, 0.8)))
 def test_shoots_on_an_arm_gain_no_energy(modulus: float, phi: float, lean: float) -> None:
     """Undamped, at 100 Hz, on arms of any stiffness: energy, with that of the mass that the scheme adds (see
-    :mod:`vinesim.kernels.articulation.elastic_supports`), is kept for phi 1/2 and falls beyond."""
+    :mod:`vinesim.kernels.wires.elastic_supports`), is kept for phi 1/2 and falls beyond."""
     model = cordon(modulus=modulus, beta=0.0, lean=lean)
     physics = world(model, phi=phi)
     rates = np.random.default_rng(3).normal(size=(4, 3)) * [0.02, 0.2, 0.2]

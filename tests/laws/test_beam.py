@@ -14,7 +14,7 @@ from scipy.special import jv
 
 from tests.support import beam_theory
 from tests.support.beam_theory import Beam
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 
 pytestmark = pytest.mark.slow

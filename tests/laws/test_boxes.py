@@ -8,11 +8,11 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from tests.support.long_rows import each_once
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import GRAVITY, assemble
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import Drive, RobotSpec
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -10,14 +10,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
+from vinesim.scene.physics_parameters import PhysicsParameters
 
 pytestmark = pytest.mark.slow
 

@@ -8,10 +8,10 @@ import pytest
 from tests.support.contact_forces import force_on, ramp
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, held_point, probe
 from tests.support.long_rows import long
-from vinesim import frames
 from vinesim.bench.mujoco_reference import MujocoScene
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import assemble
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

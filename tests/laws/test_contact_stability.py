@@ -8,12 +8,12 @@ import pytest
 from tests.support.contact_forces import force_on, ramp
 from tests.support.contact_scenes import bar, cane, probe
 from tests.support.long_rows import each_once, long
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import Drive
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

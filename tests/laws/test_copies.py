@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import each_once
-from vinesim import frames
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot

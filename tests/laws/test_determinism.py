@@ -13,9 +13,9 @@ import pytest
 
 from tests.support.waiting import deadline
 from vinesim.bench import scenes as scenes
-from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

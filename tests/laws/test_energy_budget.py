@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import long
-from vinesim import frames
-from vinesim.kernels.articulation.energy_budget import CLOSELY, NO_BUDGET, NOW_AND_THEN
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.kernels.plants.energy_budget import CLOSELY, NO_BUDGET, NOW_AND_THEN
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State

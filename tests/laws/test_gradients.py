@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import long
-from vinesim import frames
-from vinesim.physics.plants.rollout import Rollout, Trajectory
+from vinesim.core import frames
+from vinesim.plants.rollout import Rollout, Trajectory
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import each_once
-from vinesim import frames
 from vinesim.api.energy import energy
 from vinesim.api.simulation import Simulation
-from vinesim.physics.plants import ties
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.plants import ties
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

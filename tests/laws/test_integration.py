@@ -9,10 +9,10 @@ import pytest
 
 from tests.support import beam_theory
 from tests.support.beam_theory import Beam
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
 pytestmark = pytest.mark.slow

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import bar, cane, grasp, gripper
-from vinesim import frames
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotSpec
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.support.examples import share
 from tests.support.shared_vineyard import BOX, BUNCH, Server, vineyard
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.replicator import Replicator

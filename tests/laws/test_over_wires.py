@@ -7,10 +7,10 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from tests.support.long_rows import each_once, long
-from vinesim import frames
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -8,12 +8,12 @@ import pytest
 
 from tests.laws.test_sleep import settled
 from tests.support.contact_scenes import cane
-from vinesim import frames
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

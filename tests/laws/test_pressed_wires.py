@@ -21,15 +21,15 @@ from tests.laws.test_wires import (
 from tests.laws.test_wires import ARM as SHOOT
 from tests.support.contact_scenes import cane, probe
 from tests.support.long_rows import each_once, long
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.elastic_supports import WIRE_DAMPING_TIME
-from vinesim.physics.rigid.wire_contacts import WIRE_MASS
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.wire_contacts import WIRE_MASS
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.sensors.primitives.scene_primitives import Primitives
+from vinesim.wires.elastic_supports import WIRE_DAMPING_TIME
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -14,8 +14,8 @@ import pytest
 
 from tests.support import beam_theory
 from tests.support.beam_theory import Beam
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ

@@ -10,9 +10,9 @@ from tests.laws.test_trees import energy, forked
 from tests.support import beam_theory
 from tests.support.beam_theory import Rod
 from tests.support.long_rows import each_once, long
-from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants, copy_state_to_mujoco
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 

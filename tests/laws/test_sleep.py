@@ -10,13 +10,13 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from tests.support.long_rows import each_once, long
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import load_scene
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -8,10 +8,10 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from tests.support.long_rows import long
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import GRAVITY, assemble
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import cane, probe
-from vinesim import frames
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.static_world import MIN_STATIC_RADIUS
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.static_world import MIN_STATIC_RADIUS
 from vinesim.scene.builder import assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanSpec
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

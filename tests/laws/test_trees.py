@@ -10,9 +10,9 @@ import pytest
 
 from tests.support.clustered_trees import fall, momenta
 from tests.support.long_rows import each_once
-from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants, copy_state_to_mujoco
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import GRAVITY, RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State

@@ -9,12 +9,12 @@ import pytest
 
 from tests.support.contact_scenes import bunch_scene
 from tests.support.long_rows import long
-from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.human_shapes import HAND_HALF_THICKNESS
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.human_shapes import HAND_HALF_THICKNESS
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanPose
 

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import each_once
-from vinesim import frames
 from vinesim.api.energy import energy
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import TreeBuilder, assemble
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import load_scene
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 
@@ -173,7 +173,7 @@ def test_a_slow_mode_is_right_within_two_percent() -> None:
 @pytest.mark.parametrize(("tie", "tension", "phi"), each_once((2000.0, 5e4), (50.0, 900.0, 1e5), (0.5, 0.55)))
 def test_shoots_on_a_wire_gain_no_energy(tie: float, tension: float, phi: float) -> None:
     """Undamped, at 100 Hz, with ties and wires of any stiffness: energy, with that of the mass that the scheme adds
-    (see :mod:`vinesim.kernels.articulation.elastic_supports`), is kept for phi 1/2 and falls beyond."""
+    (see :mod:`vinesim.kernels.wires.elastic_supports`), is kept for phi 1/2 and falls beyond."""
     physics = world(row_of_shoots(tie=tie, tension=tension, beta=0.0), phi=phi)
     set_turning(physics, [0.25, -0.15, 0.05, 0.2])
     added = (phi * physics.dt) ** 2 * (tie * np.eye(4) - stiffness_of_ties(ALONG, tie, tension))

@@ -8,7 +8,7 @@ import re
 import pytest
 
 import vinesim
-from vinesim.bench.support.fake_client import FakeClient, tree_row
+from benchmarks.support.fake_client import FakeClient, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.replication.clock_sync import ClockEstimate, Ping
 from vinesim.net.transport.memory_bus import MemoryHub

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.shared_vineyard import vineyard
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.couplings import MAX_COUPLINGS, CouplingMessage, decode_couplings, encode_couplings
 from vinesim.net.codec.messages import Hello, MessageError

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.replication import dead_reckoning
 
 vectors = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.net.transport.endpoints import Endpoint, check_exposure, client_links, default_listen, parse, resolve_ports
 
 

@@ -14,10 +14,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from benchmarks.support.fake_client import FakeClientProcess
 from tests.support import programs
 from tests.support.live_server import ServerProcess, wait
 from tests.support.waiting import deadline
-from vinesim.bench.support.fake_client import FakeClientProcess
 
 pytestmark = pytest.mark.slow
 

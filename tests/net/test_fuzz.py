@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import zenoh
 
+from benchmarks import message_fuzz
+from benchmarks.message_fuzz import ATTACKER, storm
+from benchmarks.support.fake_client import FakeClient, FakeClientProcess, tree_row
 from tests.support import programs
 from tests.support.live_server import ServerProcess, wait
 from tests.support.long_rows import long
 from tests.support.waiting import deadline
-from vinesim.bench import message_fuzz
-from vinesim.bench.message_fuzz import ATTACKER, storm
-from vinesim.bench.support.fake_client import FakeClient, FakeClientProcess, tree_row
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.codec import messages
@@ -40,7 +40,7 @@ from vinesim.scene.values import RobotUpdate
 
 @pytest.mark.parametrize("kind", ["human", *long("robot")])
 def test_a_flood_of_malformed_messages_is_counted_logged_once_and_leaves_all_in_agreement(caplog, kind):
-    """Three thousand here; ``vinesim bench fuzz`` sends a hundred thousand."""
+    """Three thousand here; ``python -m benchmarks fuzz`` sends a hundred thousand."""
     result = message_fuzz.run_storm(3_000, seed=11, kind=kind)
     ada, bob = result.clients
     log_lines = [

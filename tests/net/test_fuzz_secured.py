@@ -10,9 +10,9 @@ import time
 
 import zenoh
 
+from benchmarks.message_fuzz import ATTACKER, storm
+from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support.waiting import wait
-from vinesim.bench.message_fuzz import ATTACKER, storm
-from vinesim.bench.support.fake_client import FakeClient, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.server.server import Server

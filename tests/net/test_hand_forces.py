@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.codec.wrenches import MAX_WRENCH, WrenchMessage, encode_wrenches
 from vinesim.net.counters import Counters

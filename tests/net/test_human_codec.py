@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import (
     decode_human,
@@ -20,7 +20,7 @@ from vinesim.net.codec.human import (
 )  # fmt: skip
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.values import INTENTIONS, POINT_NAMES, HumanUpdate, RobotUpdate
 
 HERE = frames.pose(np.array([31.25, -7.5, 0.4]), frames.from_yaw(2.0))

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim import frames
-from vinesim.bench.support.fake_client import FakeClient, tree_row
+from benchmarks.support.fake_client import FakeClient, tree_row
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import dead_reckoning

@@ -1,6 +1,6 @@
 """Broken messages and well-formed lies against a client with physics and the server's store: no law is broken.
 
-Few here; ``vinesim bench fuzz --messages N --lies N`` sends as many as are wanted.
+Few here; ``python -m benchmarks fuzz --messages N --lies N`` sends as many as are wanted.
 """
 
 from __future__ import annotations
@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.message_fuzz import attack
+from benchmarks.support.fuzz_world import ATTACKER, FuzzWorld, LawBroken
+from benchmarks.support.lies import tell_lies
 from tests.support.long_rows import long
-from vinesim.bench.message_fuzz import attack
-from vinesim.bench.support.fuzz_world import ATTACKER, FuzzWorld, LawBroken
-from vinesim.bench.support.lies import tell_lies
 
 
 @pytest.mark.parametrize(("kind", "is_stranger"), [("human", False), *long(("robot", False), ("human", True))])

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.examples import share
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec import messages, rotation
 from vinesim.net.codec.messages import Hello, MessageError, TreeStates, WrongVersion
 from vinesim.net.pace import PaceReport

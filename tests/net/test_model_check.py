@@ -6,9 +6,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.net.test_replicator import TICK, Client, run, vineyard
-from vinesim import frames
-from vinesim.bench.support.fake_client import FakeClient, tree_row
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError, RetainedRecord, TreeStates
 from vinesim.net.replication.model_check import check_record, check_tree_states

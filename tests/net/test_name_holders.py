@@ -9,8 +9,8 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support.waiting import wait
-from vinesim.bench.support.fake_client import FakeClient, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello, RetainedRecord
 from vinesim.net.replication.authority import Claim

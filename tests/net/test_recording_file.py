@@ -26,7 +26,7 @@ from vinesim.net.recording import mcap_reader, mcap_writer
 from vinesim.net.recording.mcap_reader import InvalidRecording, read_recording
 from vinesim.net.recording.mcap_writer import RecordingStopped, RecordingWriter, free_path
 from vinesim.net.recording.message_json import describe_message
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
 

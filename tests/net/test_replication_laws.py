@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support.examples import share
 from tests.support.shared_vineyard import Server
-from vinesim.bench.support.fake_client import FakeClient, tree_row
 from vinesim.net.codec import messages
 from vinesim.net.replication import interest
 from vinesim.net.transport.memory_bus import MemoryHub

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.support.examples import share
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec import control, messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import dead_reckoning, interest

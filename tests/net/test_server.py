@@ -122,7 +122,7 @@ def test_run_returns_when_stopped():
 
 
 def test_the_server_simulates_nothing():
-    heavy = {"warp", "mujoco", "vinesim.physics", "vinesim.kernels"}
+    heavy = {"warp", "mujoco", "vinesim.interaction", "vinesim.kernels"}
     code = f"import sys, vinesim.net.server.server; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=deadline(300.0), check=True

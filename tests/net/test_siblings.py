@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.bench.support.fake_client import tree_row
+from benchmarks.support.fake_client import tree_row
+from vinesim.core import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.replication.sender import ADOPTION_DELAY

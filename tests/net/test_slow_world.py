@@ -8,10 +8,10 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support.waiting import wait
-from vinesim import frames
-from vinesim.bench.support.fake_client import FakeClient, tree_row
-from vinesim.errors import UsageError
+from vinesim.core import frames
+from vinesim.core.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.server.server import Server
 from vinesim.net.transport.memory_bus import MemoryHub

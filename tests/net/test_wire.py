@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from benchmarks.support.fake_client import FakeClientProcess
+from benchmarks.support.network_emulator import Count, Link, NetworkEmulator
 from tests.support.live_server import ServerProcess, require_network_emulation, wait
-from vinesim.bench.support.fake_client import FakeClientProcess
-from vinesim.bench.support.network_emulator import Count, Link, NetworkEmulator
 from vinesim.scene.ids import ObjectKind, object_id
 
 pytestmark = pytest.mark.slow

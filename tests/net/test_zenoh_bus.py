@@ -16,12 +16,13 @@ import pytest
 
 from tests.support import programs
 from tests.support.waiting import deadline, wait
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.server.server import Server
-from vinesim.net.transport import zenoh_bus, zenoh_entities, zenoh_session
+from vinesim.net.transport import zenoh_bus, zenoh_session
+from vinesim.net.transport import zenoh_bus as zenoh_entities
 from vinesim.net.transport.bus import KEEP_ALL, NameTaken
 from vinesim.net.transport.certificates import create
 from vinesim.net.transport.endpoints import resolve_ports

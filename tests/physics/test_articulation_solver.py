@@ -10,11 +10,10 @@ import warp as wp
 
 from tests.support.clustered_trees import clustered, momenta, moving
 from tests.support.waiting import deadline
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.device_buffers import DeviceBuffers, DeviceUnavailable
-from vinesim.physics.plants.fault_guard import FaultGuard
-from vinesim.physics.plants.kernel_launches import TREES_PER_CHUNK
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import TREES_PER_CHUNK, ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers, DeviceUnavailable
+from vinesim.plants.fault_guard import FaultGuard
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State

@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 
 from tests.support.contact_scenes import bar, bunch_scene, cane, grasp, gripper, probe
 from tests.support.examples import share
-from vinesim import frames
 from vinesim.bench import scenes
+from vinesim.contact.plant_capsules import plant_capsules
+from vinesim.core import frames
 from vinesim.kernels.contact import structs
-from vinesim.physics.contact.plant_capsules import plant_capsules
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.step import Physics
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import HumanSpec
+from vinesim.world import Physics
 
 
 def test_spheres_of_a_bunch_fill_its_spheroid():

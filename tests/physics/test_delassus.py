@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import cane
-from vinesim import frames
 from vinesim.bench import scenes
+from vinesim.contact.row_response import RowResponse
+from vinesim.core import frames
 from vinesim.kernels.contact import structs
 from vinesim.kernels.contact.islands import MOST_SIDES
-from vinesim.physics.contact.row_response import RowResponse
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.step import Physics
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.builder import RodMaterial, assemble
 from vinesim.scene.state import State
+from vinesim.world import Physics
 
 
 def assembled(physics: Physics) -> np.ndarray:

@@ -8,11 +8,11 @@ import pytest
 
 from tests.support.clustered_trees import momenta
 from tests.support.contact_scenes import DOWN, bar, bunch_scene, cane, grasp, gripper
-from vinesim import frames
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Detachment
+from vinesim.world import Physics
 
 
 def momentum(physics: Physics, name: str) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from vinesim.physics.plants.device_buffers import DeviceBuffers
+from vinesim.plants.device_buffers import DeviceBuffers
 
 FIRST, SIZE = np.array([0, 2, 3, 6], np.int32), np.array([2, 1, 3, 2], np.int32)
 

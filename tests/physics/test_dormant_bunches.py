@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support.shared_vineyard import BOX, BUNCH, vineyard
-from vinesim import frames
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.world import Physics
 
 
 def test_many_dormant_bunches_are_added_without_bodies():

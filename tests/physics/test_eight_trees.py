@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.topology import Topologies, group_starts
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver, Topologies, group_starts
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.fault_guard import FaultGuard
-from vinesim.physics.plants.sleep import SleepMonitor
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.fault_guard import FaultGuard
+from vinesim.plants.sleep import SleepMonitor
 from vinesim.scene import spec
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.generation.vineyard import generate

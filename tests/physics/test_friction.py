@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import bar, cane
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid.pair_friction import PairFriction
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.pair_friction import PairFriction
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.materials import Material, pair_table
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.world import Physics
 
 INERTIAL = '<inertial><mass value="50"/><inertia ixx="5" iyy="5" izz="5" ixy="0" ixz="0" iyz="0"/></inertial>'
 TRAY = f"""<robot name="tray"><link name="base">{INERTIAL}</link><link name="tray">{INERTIAL}
@@ -170,7 +170,7 @@ def test_a_bar_stands_as_deep_in_a_cane_as_the_stiffness_of_their_materials_says
             table[Material.BARK, Material.UNKNOWN] = table[Material.UNKNOWN, Material.BARK] = stiffness
         return table
 
-    monkeypatch.setattr("vinesim.physics.contact.collision_arrays.pair_table", listed)
+    monkeypatch.setattr("vinesim.contact.collision_arrays.pair_table", listed)
     physics = Physics(assemble([cane((0.0, 0.0, 1.0), pieces=8, beta=0.05)]))
     physics.add_robot(bar((0.4375, -0.045, 0.95), stiffness=5000.0, damping=300.0))  # at the middle of a piece
     physics.rigid.command("bar", np.array([0.02]))

@@ -9,15 +9,15 @@ import pytest
 
 from tests.physics.test_human_body import eva, put
 from tests.support.contact_scenes import bunch_scene, cane, gripper, probe
-from vinesim import frames
 from vinesim.avatar.haptics import HapticFeedback
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.rigid.human_shapes import HAND_HALF_THICKNESS
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.rigid.human_shapes import HAND_HALF_THICKNESS
 from vinesim.scene.builder import assemble
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.scene.values import POINT_NAMES, Drive, HumanPose, HumanSpec
+from vinesim.world import Physics
 
 FORWARD = frames.multiply(frames.from_yaw(0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
 """Fingers up, palm along +y."""

@@ -9,8 +9,8 @@ import pytest
 
 from tests.physics.test_human_body import eva, put, soft_arm
 from tests.physics.test_rigid_world import HOME, arm, step, yard
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.rigid.urdf import RobotError
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.rigid.urdf import RobotError
 
 
 def pushing() -> RigidWorld:

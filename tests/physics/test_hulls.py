@@ -9,9 +9,9 @@ import pytest
 import scipy.spatial
 
 from tests.support.contact_scenes import bar, cane
-from vinesim.physics.step import Physics
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotSpec
+from vinesim.world import Physics
 
 CYLINDER = '<cylinder radius="0.03" length="0.6"/>'
 

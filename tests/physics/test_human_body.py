@@ -11,16 +11,16 @@ import pytest
 
 from tests.physics.test_rigid_world import arm, step, yard
 from tests.support.contact_scenes import probe
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid import static_world
-from vinesim.physics.rigid.human_body import HumanError
-from vinesim.physics.rigid.human_posture import VISUAL_PARTS, body_posture, standing_pose
-from vinesim.physics.rigid.human_shapes import BODY_PARTS, HAND_HALF_THICKNESS
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid import static_world
+from vinesim.rigid.human_body import HumanError
+from vinesim.rigid.human_posture import VISUAL_PARTS, body_posture, standing_pose
+from vinesim.rigid.human_shapes import BODY_PARTS, HAND_HALF_THICKNESS
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import POINT_NAMES, Drive, HumanPose, HumanSpec
 
 POLE = 3.0 - 0.05

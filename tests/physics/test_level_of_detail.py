@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import DOWN, bar
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.sensors.primitives.scene_primitives import Primitives
+from vinesim.world import Physics
 
 DETAIL_STEPS = PhysicsParameters().steps(PhysicsParameters().detail_duration)
 

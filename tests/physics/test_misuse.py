@@ -13,15 +13,15 @@ from tests.physics.test_hand_grasp import human_at_bunch, move
 from tests.physics.test_human_body import eva
 from tests.physics.test_rigid_world import HOME, arm
 from tests.support.contact_scenes import cane
-from vinesim.physics.parameters import ParameterError, PhysicsParameters
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.rollout import Rollout
-from vinesim.physics.plants.ties import TieLimitError
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.step import Physics
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.rollout import Rollout
+from vinesim.plants.ties import TieLimitError
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.builder import assemble
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import ParameterError, PhysicsParameters
 from vinesim.scene.state import State
+from vinesim.world import Physics
 
 NAN, INF = float("nan"), float("inf")
 

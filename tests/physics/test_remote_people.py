@@ -10,10 +10,10 @@ import pytest
 from tests.physics.test_human_body import contact_force, crate_yard, eva
 from tests.physics.test_rigid_world import ARM, arm, step, yard
 from tests.support.long_rows import each_once
-from vinesim.physics.rigid.human_body import MAX_REMOTE_FORCE
-from vinesim.physics.rigid.human_shapes import BODY_PARTS
-from vinesim.physics.rigid.mujoco_sleep import wake_body
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.rigid.human_body import MAX_REMOTE_FORCE
+from vinesim.rigid.human_shapes import BODY_PARTS
+from vinesim.rigid.mujoco_sleep import wake_body
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import POINT_NAMES
 
 

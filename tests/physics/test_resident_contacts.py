@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import each_once
-from vinesim import frames
-from vinesim.physics.contact.resident_contacts import ResidentContacts
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.rigid import static_world
-from vinesim.physics.step import Physics
+from vinesim.contact.resident_contacts import ResidentContacts
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers
+from vinesim.rigid import static_world
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.materials import Material
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
+from vinesim.world import Physics
 
 PARAMETERS = PhysicsParameters(sleep=False)
 BARS = np.array([(0.3, -1.0, 1.975), (0.6, -1.0, 1.9)], np.float32)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from vinesim.bench import scenes
-from vinesim.physics.contact.impulse_solver import ImpulseSolver
-from vinesim.physics.step import Physics
+from vinesim.contact.impulse_solver import ImpulseSolver
+from vinesim.world import Physics
 
 CANES = 12
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import cane
-from vinesim import frames
-from vinesim.physics.rigid import free_bunch, static_world
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.rigid.urdf import RobotError
+from vinesim.core import frames
+from vinesim.rigid import free_bunch, static_world
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.rigid.urdf import RobotError
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.support.clustered_trees import clustered
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.rollout import Rollout, RolloutDiverged
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.rollout import Rollout, RolloutDiverged
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.state import State

@@ -5,15 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.plants.sleep import SleepMonitor
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers
+from vinesim.plants.sleep import SleepMonitor
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.scene.wind import Wind
+from vinesim.world import Physics
 
 
 def row(count: int) -> ArticulationSolver:

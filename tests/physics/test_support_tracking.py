@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tests.support.shared_vineyard import BOX, BUNCH, cart, vineyard
-from vinesim import frames
-from vinesim.physics.rigid.support_tracking import SupportTracker
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.interaction.support_tracking import SupportTracker
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.world import Physics
 
 DECK = frames.pose([0.0, 0.0, 0.253])
 

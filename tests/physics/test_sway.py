@@ -10,16 +10,16 @@ import pytest
 from tests.physics.test_wind import leafy
 from tests.support.contact_scenes import bar
 from tests.support.long_rows import long
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants import sway
-from vinesim.physics.plants.shelter import ATTENUATION, TreeDrag, height_profile
-from vinesim.physics.plants.sway import Sway, windblown
-from vinesim.physics.step import Physics
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
 from vinesim.scene.wind import Wind
+from vinesim.wind import sway
+from vinesim.wind.shelter import ATTENUATION, TreeDrag, height_profile
+from vinesim.wind.sway import Sway, windblown
+from vinesim.world import Physics
 
 
 @pytest.fixture(autouse=True)

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import bar
-from vinesim import frames
-from vinesim.kernels.articulation.forces import AIR_DENSITY
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.shelter import TreeDrag
-from vinesim.physics.plants.wind import FADE_DURATION, WindOnPlants
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.kernels.plants.forces import AIR_DENSITY
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.scene.wind import Wind
+from vinesim.wind.plant_wind import FADE_DURATION, WindOnPlants
+from vinesim.wind.shelter import TreeDrag
+from vinesim.world import Physics
 
 CHECK_STEPS = PhysicsParameters().steps(PhysicsParameters().wind_check_period)
 FADE_STEPS = PhysicsParameters().steps(2.0 * FADE_DURATION)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.admittance_controller import AdmittanceController
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support.prioritized_ik import solve_prioritized_ik as reference
-from vinesim import frames
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.cartesian_controller import CartesianController, InverseKinematics, axes_of_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot

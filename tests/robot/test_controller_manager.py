@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.controller_manager import ControllerManager, GoalResult
 from vinesim.robot.control.trajectory_controller import Outcome, Trajectory
 from vinesim.robot.description.errors import DescriptionError

@@ -14,12 +14,11 @@ import trimesh
 import yourdfpy
 from lxml import etree
 
-from vinesim import frames
+from vinesim.core import data_files, frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.urdf_model import parse_robot
-from vinesim.scene import data_files
 
 
 @pytest.fixture(scope="module")

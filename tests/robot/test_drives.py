@@ -9,9 +9,8 @@ import pytest
 
 from tests.support.contact_scenes import bunch_scene
 from tests.support.robot_yard import Yard
-from vinesim import frames
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError, CommandInterface
@@ -19,6 +18,7 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Contact, RobotUpdate
+from vinesim.world import Physics
 
 
 @pytest.fixture(scope="module")

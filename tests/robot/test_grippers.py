@@ -7,13 +7,13 @@ import pytest
 
 from tests.support.contact_scenes import bunch_scene
 from tests.support.robot_yard import Yard, hand_of, wrench_of
-from vinesim import frames
-from vinesim.physics.rigid.free_bunch import FreeBunch
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.free_bunch import FreeBunch
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.world import Physics
 
 
 @pytest.fixture(scope="module")

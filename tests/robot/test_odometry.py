@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.support.robot_yard import Yard
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 

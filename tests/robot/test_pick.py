@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from tests.support.contact_forces import pressed_on_ground
-from vinesim import frames
 from vinesim.client.tasks import pick_planning, start_poses
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError
@@ -22,6 +21,7 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.scene.spec import with_seed
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -7,11 +7,11 @@ import pytest
 
 from tests.support.contact_scenes import bunch_scene
 from tests.support.robot_yard import Yard, centre_of_hand, hand_of, wrench_of
-from vinesim import frames
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.world import Physics
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from vinesim import frames
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description

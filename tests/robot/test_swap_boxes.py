@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from vinesim.client.tasks import start_poses, swap_planning
-from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
@@ -16,6 +15,7 @@ from vinesim.robot.tasks.swap_boxes import LIFT_HEIGHT, SwapBoxes, SwapPlan
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene as load_scene
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed

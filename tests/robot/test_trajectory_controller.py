@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.trajectory_controller import (
     MAX_SPLINES,
     GoalHandle,

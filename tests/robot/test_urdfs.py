@@ -14,9 +14,9 @@ import trimesh
 
 from tests.support.long_rows import long
 from tests.support.robot_yard import Yard
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec.robot import decode_robot, encode_robot
-from vinesim.physics.rigid.urdf import shapes_of
+from vinesim.rigid.urdf import shapes_of
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.package_resources import find_installed

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vinesim import frames
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.waypoint_follower import STUCK_TIMEOUT, WaypointFollower
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot

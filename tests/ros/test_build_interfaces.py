@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.support.waiting import TIMEOUT
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages, package_build
 

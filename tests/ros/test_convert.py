@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.ros import middleware
 
 pytestmark = pytest.mark.ros

@@ -22,10 +22,10 @@ from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
 from tests.support.stock_subscriber import TYPES, StockSubscriber, stock_subscriber
 from vinesim.client.client import Client
+from vinesim.client.processes.ros_process import RosProcess
+from vinesim.client.processes.ros_worker import QUEUE_CAPACITY, Pace
+from vinesim.client.processes.worker_process import HOLD_TIMEOUT
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.sensing.ros_process import RosProcess
-from vinesim.client.sensing.ros_worker import QUEUE_CAPACITY, Pace
-from vinesim.client.sensing.worker_process import HOLD_TIMEOUT
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
@@ -226,7 +226,7 @@ def test_no_more_messages_are_on_their_way_than_a_subscriber_keeps(caplog):
 @pytest.mark.parametrize("rate", [30.0, 100.0, 1000.0])
 def test_steps_that_have_waited_come_few_at_once_and_little_faster_than_the_world_makes_them(monkeypatch, rate):
     now, published = 0.0, []
-    monkeypatch.setattr("vinesim.client.sensing.ros_worker.time.monotonic", lambda: now)
+    monkeypatch.setattr("vinesim.client.processes.ros_worker.time.monotonic", lambda: now)
     pace = Pace()
     while now < 4.0:
         # a hundred steps wait all the time

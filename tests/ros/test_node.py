@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.ros import middleware
 
 pytestmark = pytest.mark.ros

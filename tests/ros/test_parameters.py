@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.ros import middleware
 
 pytestmark = pytest.mark.ros

@@ -30,11 +30,11 @@ from std_msgs.msg import Float64MultiArray
 from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.client.client import Client
+from vinesim.client.processes import ros_worker
+from vinesim.client.processes.robot_processes import RobotProcesses
+from vinesim.client.processes.ros_worker import RosChannel, RosConfig, RosWorker
+from vinesim.client.processes.step_record import MAX_CONTACTS, StepRecords
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.sensing import ros_worker
-from vinesim.client.sensing.robot_processes import RobotProcesses
-from vinesim.client.sensing.ros_worker import RosChannel, RosConfig, RosWorker
-from vinesim.client.sensing.step_record import MAX_CONTACTS, StepRecords
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub

@@ -37,14 +37,14 @@ from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
 from tests.support import sensor_scenes
 from tests.support.contact_scenes import cane
 from tests.support.stock_node import StockNode, wait_until
-from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.client.processes.robot_processes import RobotProcesses
+from vinesim.client.processes.ros_process import RosProcess
 from vinesim.client.rate_loop import RateLoop
-from vinesim.client.sensing.robot_processes import RobotProcesses
-from vinesim.client.sensing.ros_process import RosProcess
 from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.ros.messages.bunches import BUNCH_POINT
 from vinesim.ros.sensor_node import SensorNode
@@ -55,7 +55,7 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, CameraOutput, HumanSpec
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 CAMERA = "/head_front_camera"

@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
+from vinesim.core import frames
+from vinesim.core.data_files import find_data_file
 from vinesim.kernels.shading import materials
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.human_shapes import BODY_PARTS, body_shapes, hand_shapes
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.rigid.static_world import CRATE_WALL
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.human_shapes import BODY_PARTS, body_shapes, hand_shapes
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.rigid.static_world import CRATE_WALL
 from vinesim.robot.description.loader import load_description
 from vinesim.scene import appearance
 from vinesim.scene.appearance import AppearanceError
-from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import HumanSpec, Mesh, RigidVisual, Shape
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene import rigid_primitives
+from vinesim.sensors.primitives import rigid_primitives
 
 TOLERANCE = 0.06
 """[m] Collision shapes may extend so far beyond visual ones: hips are wider than a waist in trousers."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.support import beam_theory
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene import builder
 from vinesim.scene.ids import Organ
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from vinesim.scene.data_files import DataFileNotFound, data_dir, find_data_file
+from vinesim.core.data_files import DataFileNotFound, data_dir, find_data_file
 
 
 def test_a_name_finds_a_shipped_file():

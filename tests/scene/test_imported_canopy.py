@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import vinesim
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene import leaves
 from vinesim.scene.generation.vineyard import generate_uncached
 from vinesim.scene.ids import Organ

@@ -7,11 +7,11 @@ import pathlib
 import numpy as np
 import pytest
 
-from vinesim.physics.rigid.urdf import collision_materials
+from vinesim.core.toml_loader import DataError
+from vinesim.rigid.urdf import collision_materials
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.ids import Organ
 from vinesim.scene.materials import Material, materials_of_organs, pair_numbers, pair_table
-from vinesim.scene.toml_loader import DataError
 
 NUMBER = 'unit = "{unit}", grade = "GUESSED", source = "a file of this test" }}'
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene import builder
 
 WOOD = builder.RodMaterial(1e9, 900.0)

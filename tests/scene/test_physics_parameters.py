@@ -11,12 +11,12 @@ import pytest
 
 import vinesim
 from tests.physics.test_contact_solver import rows_of_canes
-from vinesim.physics.parameters import ParameterError, PhysicsParameters
-from vinesim.physics.step import Physics
+from vinesim.core.data_files import data_dir
 from vinesim.scene import physics_parameters
-from vinesim.scene.data_files import data_dir
 from vinesim.scene.materials import pair_numbers
+from vinesim.scene.physics_parameters import ParameterError, PhysicsParameters
 from vinesim.scene.spec import SceneError, load_scene
+from vinesim.world import Physics
 
 FIELDS = [field.name for field in msgspec.structs.fields(PhysicsParameters)]
 

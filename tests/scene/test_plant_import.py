@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 import vinesim
-from vinesim import frames
 from vinesim.cli import app
+from vinesim.core import frames
 from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.ids import Organ
 from vinesim.scene.plant_import.imported_plant import load_imported_plant

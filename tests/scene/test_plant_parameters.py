@@ -6,9 +6,9 @@ import re
 
 import pytest
 
+from vinesim.core.data_files import find_data_file
+from vinesim.core.toml_loader import DataError
 from vinesim.scene import plant_parameters
-from vinesim.scene.data_files import find_data_file
-from vinesim.scene.toml_loader import DataError
 
 
 def numbers(part):

@@ -5,8 +5,8 @@ import pathlib
 
 import pytest
 
+from vinesim.core.data_files import data_dir
 from vinesim.scene import spec
-from vinesim.scene.data_files import data_dir
 from vinesim.scene.spec import Sun, sun_direction
 
 GOOD = """

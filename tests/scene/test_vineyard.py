@@ -12,7 +12,7 @@ import pytest
 
 from tests.support import beam_theory
 from tests.support.long_rows import long
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene import plant_parameters
 from vinesim.scene import spec as scenes
 from vinesim.scene.berries import VARIETIES

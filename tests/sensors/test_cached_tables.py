@@ -7,8 +7,8 @@ import pathlib
 import numpy as np
 import pytest
 
-from vinesim import disk_cache
-from vinesim.sensors.scene import textures
+from vinesim.core import disk_cache
+from vinesim.sensors.primitives import textures
 
 TABLES = ("leaf_outlines", "leaf_texture", "noise_texture", "soil_texture", "sky_layers")
 

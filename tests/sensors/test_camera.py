@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
+from vinesim.core import frames
+from vinesim.core.data_files import find_data_file
 from vinesim.scene.camera_geometry import measured_points, project_points
-from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
+from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.camera_rasterizer import pinhole
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.spec_file import SensorError
-from vinesim.sensors.truth import ground_truth
 
 SUN = (0.4, 0.5, 0.77)
 

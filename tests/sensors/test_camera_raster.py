@@ -6,7 +6,7 @@ import trimesh
 
 from tests.support import sensor_scenes
 from tests.support.long_rows import each_once, long
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.export.images import look_at

@@ -24,9 +24,9 @@ from tests.support.waiting import deadline
 from vinesim.cli.render import run as render
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.client.composition.scene_composer import PlacementError
-from vinesim.errors import UsageError, WriteError
+from vinesim.core.data_files import DataFileNotFound
+from vinesim.core.errors import UsageError, WriteError
 from vinesim.robot.description.errors import DescriptionError
-from vinesim.scene.data_files import DataFileNotFound
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import annotations, dataset

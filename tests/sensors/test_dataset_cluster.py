@@ -12,7 +12,7 @@ import pytest
 from tests.sensors.test_dataset import SCENE
 from tests.support.waiting import wait
 from vinesim.cli.dataset import run
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.sensors.export import dataset
 
 IMAGES = 11  # of three vineyards

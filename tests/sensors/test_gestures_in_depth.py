@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
 from vinesim.avatar.gestures import GESTURES
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import HumanSpec
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at

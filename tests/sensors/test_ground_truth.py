@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.berries import VARIETIES, lay_out_berries, segment_of
 from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame, CameraInfo, RigidVisual
+from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.primitive_arrays import SPHEROID
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
-from vinesim.sensors.truth import ground_truth
 
 
 def _frame(labels: np.ndarray, depth: np.ndarray) -> CameraFrame:

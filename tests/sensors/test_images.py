@@ -8,12 +8,12 @@ from tests.support import sensor_scenes
 from vinesim.scene.ids import Organ
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export import images
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 
 
 def test_looking_is_level_and_right_handed() -> None:
     pose = images.look_at(np.array([1.0, 2.0, 1.0]), np.array([1.0, 5.0, 1.0]))
-    from vinesim import frames
+    from vinesim.core import frames
 
     axes = frames.to_matrix(pose[3:])
     assert axes[:, 2] == pytest.approx([0, 1, 0])  # forward

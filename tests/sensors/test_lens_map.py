@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
+from vinesim.core import frames
+from vinesim.core.data_files import find_data_file
 from vinesim.scene import lens_distortion
-from vinesim.scene.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo
+from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import dataset
+from vinesim.sensors.primitives.ray_caster import RayCaster
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.lens_map import lens_map
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
-from vinesim.sensors.scene.ray_caster import RayCaster
 from vinesim.sensors.spec_file import SensorError
-from vinesim.sensors.truth import ground_truth
 
 BARREL = (-0.28, 0.09, 0.0011, -0.0008, -0.012)
 PINCUSHION = (0.09, -0.02, -0.001, 0.0015, 0.003)

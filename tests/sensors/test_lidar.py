@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
-from vinesim.scene.data_files import find_data_file
+from vinesim.core import frames
+from vinesim.core.data_files import find_data_file
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.spec_file import SensorError
 
 AT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])

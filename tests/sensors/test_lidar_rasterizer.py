@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer
-from vinesim.sensors.scene.ray_caster import RayCaster
+from vinesim.sensors.primitives.ray_caster import RayCaster
 
 LASERS = np.radians([-15.0, 1.0, -13.0, 3.0, -11.0, 5.0, -9.0, 7.0, -7.0, 9.0, -5.0, 11.0, -3.0, 13.0, -1.0, 15.0])
 STEP = -0.0034

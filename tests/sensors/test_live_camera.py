@@ -8,17 +8,17 @@ import warp as wp
 
 from tests.support import sensor_scenes
 from tests.support.long_rows import each_once
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.kernels.launch import ThreadPool
-from vinesim.kernels.sensing import stereo_depth
+from vinesim.kernels.stereo import stereo_depth
 from vinesim.scene.values import CameraFrame, CameraOutput
 from vinesim.sensors.camera.camera import QUALITIES, Camera, CameraSpec
 from vinesim.sensors.camera.stereo import Stereo
 from vinesim.sensors.camera.sunlight import Sunlight
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.camera_rasterizer import pinhole
 from vinesim.sensors.raster.primitive_arrays import LEAF
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 from vinesim.sensors.spec_file import noise_rng
 
 SPEC = CameraSpec.load("d435")

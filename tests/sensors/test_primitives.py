@@ -7,12 +7,12 @@ import pytest
 import trimesh
 
 from tests.support import sensor_scenes
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.berries import lay_out_berries
 from vinesim.scene.ids import Organ, label
+from vinesim.sensors.primitives.bunch_primitives import Ripeness
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.primitive_arrays import SPHEROID
-from vinesim.sensors.scene.bunch_primitives import Ripeness
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from vinesim import frames
 from vinesim.cli.render import run
+from vinesim.core import frames
 
 pytestmark = pytest.mark.long
 

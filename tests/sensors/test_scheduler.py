@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim.client.sensing.sensor_process import time_of_snapshot
+from vinesim.client.processes.sensor_process import time_of_snapshot
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraOutput, SensorMode, SensorPacing
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitives import rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler
 
 TINY = sensor_scenes.IDEAL.info("optical", 0.1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.ids import Organ, label
 from vinesim.sensors.lidar.lidar import MAX_SHARED_ROTATION, MAX_SHARED_TRANSLATION, Lidar, LidarSpec
 from vinesim.sensors.lidar.spinning_scan import PoseHistory, SpinningScan

@@ -6,9 +6,9 @@ import pytest
 import warp as wp
 
 from tests.support import sensor_scenes
-from vinesim import frames
-from vinesim.kernels.sensing import stereo_input
-from vinesim.scene.data_files import find_data_file
+from vinesim.core import frames
+from vinesim.core.data_files import find_data_file
+from vinesim.kernels.stereo import stereo_input
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.values import CameraFrame
 from vinesim.sensors import spec_file

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vinesim.scene import leaves
-from vinesim.sensors.scene import textures
+from vinesim.sensors.primitives import textures
 
 
 def test_outlines_have_the_area_of_the_leaf() -> None:

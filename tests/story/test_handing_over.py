@@ -5,20 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from vinesim import frames
 from vinesim.avatar.local_human import LocalHuman
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.cli.human_client import pick_and_give
 from vinesim.client.tasks.meet_planning import plan_meeting
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.meet_person import MeetPerson
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanSpec
+from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.support.shared_vineyard import BOX, BUNCH, DT, REACH, World, bytes_sent, pose_of, position_difference
-from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.core import frames
 
 pytestmark = pytest.mark.slow
 

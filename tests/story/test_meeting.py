@@ -9,25 +9,25 @@ import threading
 import numpy as np
 import pytest
 
+from benchmarks.support.browser import AS_RECORDED, browser_page, microphone, write_tone
+from benchmarks.support.ear import Ear
 from tests.audio.test_microphone import amplitude
 from tests.support.waiting import wait
-from vinesim import frames
 from vinesim.avatar.gestures import Gestures
 from vinesim.avatar.tracked_human import TrackedHuman
-from vinesim.bench.support.browser import AS_RECORDED, browser_page, microphone, write_tone
-from vinesim.bench.support.ear import Ear
 from vinesim.client.client import Client, label_index
-from vinesim.client.page_sound import PageSound
-from vinesim.client.page_world import PageWorld
+from vinesim.client.page.page_sound import PageSound
+from vinesim.client.page.page_world import PageWorld
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.tasks.start_poses import bunch_centres
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.camera.camera import Camera, CameraSpec
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.web.page_server import PageServer
 
 pytestmark = pytest.mark.slow

@@ -17,9 +17,9 @@ from tests.support.shared_vineyard import (
     position_difference,
     vineyard,
 )
-from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.ids import ObjectKind, Organ, parse_object_name
 from vinesim.scene.values import HumanPose
 

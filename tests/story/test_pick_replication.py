@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tests.support.contact_forces import pressed_on_ground
-from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks import pick_planning, start_poses
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.pick import PickBunch

@@ -12,9 +12,9 @@ import pytest
 
 from tests.support import programs
 from tests.support.waiting import deadline
-from vinesim import frames
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import QUEUE_SPACING, bunch_centres, find_reachable_bunch, spawn_pose, start_pose
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description as load_robot
 from vinesim.robot.tasks.push import PushBunch

@@ -5,6 +5,7 @@ import functools
 import pathlib
 import re
 
+from benchmarks.__main__ import BENCHMARKS
 from vinesim.cli.bench import BENCHES
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -41,11 +42,14 @@ def faults(section, text, evidence):
         yield f"'{section}' is no section"
     if not text:
         yield "no claim"
-    spans = re.findall(r"`((?:tests/|vinesim bench )[^`]*)`", evidence)
+    spans = re.findall(r"`((?:tests/|vinesim bench |python -m benchmarks )[^`]*)`", evidence)
     for span in spans:
         path, _, name = span.partition("::")
         if span.startswith("vinesim"):
             if span.removeprefix("vinesim bench ") not in BENCHES:
+                yield f"there is no `{span}`"
+        elif span.startswith("python"):
+            if span.removeprefix("python -m benchmarks ") not in BENCHMARKS:
                 yield f"there is no `{span}`"
         elif name not in names_in(path):
             yield f"make test runs no {span}"

@@ -1,6 +1,6 @@
 """No cycle in the graph of modules: what a module imports, at its top or in a function, never imports it back.
 
-Imports under ``if TYPE_CHECKING`` are left out: they only name the types of arguments.
+Imports under ``if TYPE_CHECKING`` count: a type that two modules need from each other is a cycle of concepts, too.
 """
 
 import ast
@@ -15,8 +15,6 @@ def imports_of(path: pathlib.Path, modules: set[str]) -> set[str]:
     waiting: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while waiting:
         node = waiting.pop()
-        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
-            continue
         # an import is a statement: what is inside an expression need not be looked at
         waiting += [child for child in ast.iter_child_nodes(node) if not isinstance(child, ast.expr)]
         if isinstance(node, ast.Import):

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from vinesim.client.sensing.spawned_process import ROS_MODULES
+from vinesim.client.processes.spawned_process import ROS_MODULES
 
 HEAVY = ("warp", "mujoco", "zenoh", "rclpy", "taichi", "cv2", "numpy", "open3d")
 
@@ -24,7 +24,7 @@ def test_the_server_simulates_nothing():
 
 
 def test_physics_needs_no_network_and_no_ros():
-    assert modules_after("import vinesim.physics.step").isdisjoint({"zenoh", "rclpy", "cv2"})
+    assert modules_after("import vinesim.world").isdisjoint({"zenoh", "rclpy", "cv2"})
 
 
 def test_the_ros_process_needs_no_physics_and_no_renderer():

@@ -15,8 +15,8 @@ from scipy.linalg import eig, eigh
 from scipy.optimize import brentq, curve_fit
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.state import State
 

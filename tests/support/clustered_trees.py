@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import GRAVITY, RodMaterial, TreeBuilder, assemble, solve_rest_pose
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model

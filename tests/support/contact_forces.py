@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from vinesim.physics.step import Physics
+from vinesim.world import Physics
 
 
 def pressed_on_ground(physics: Physics, box: int) -> float:

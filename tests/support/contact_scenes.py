@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble, segment_bunches
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model

@@ -23,7 +23,6 @@ from tests.net import test_messages
 from tests.robot.test_pick import picker, vineyard
 from vinesim.client.tasks import start_poses
 from vinesim.net.codec import messages
-from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
@@ -31,7 +30,8 @@ from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene as load_scene
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
+from vinesim.world import Physics
 
 
 def _hash(*parts: bytes) -> str:

@@ -8,12 +8,12 @@ import threading
 import numpy as np
 
 from tests.support.waiting import wait
-from vinesim import frames
 from vinesim.avatar.gestures import GESTURES, Gestures
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
-from vinesim.client.page_world import MAX_PRIMITIVES, PageWorld
+from vinesim.client.page.page_world import MAX_PRIMITIVES, PageWorld
 from vinesim.client.spectator import Spectator
+from vinesim.core import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 from vinesim.web.page_server import PageServer
@@ -122,5 +122,5 @@ def touch_screen(page, width, height):
 
 def is_drawn_anew(page):
     """Wait until pictures begun from now on are drawn."""
-    drawn = page.run("vinesim.frames")
-    wait(lambda: page.run("vinesim.frames") > drawn + 1, "two pictures later")
+    drawn = page.run("vinesim.core.frames")
+    wait(lambda: page.run("vinesim.core.frames") > drawn + 1, "two pictures later")

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import pytest
 
+from benchmarks.support import network_emulator
 from tests.support import programs
 from tests.support.waiting import wait as wait
-from vinesim.bench.support import network_emulator
 
 
 @functools.cache

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any, cast
 
-from vinesim.bench.support.browser import Page
+from benchmarks.support.browser import Page
 from vinesim.web.page_server import PageServer, World
 
 

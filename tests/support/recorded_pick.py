@@ -6,7 +6,7 @@ import pathlib
 
 from vinesim.cli.replay import make_page_replay
 from vinesim.client.client import Client
-from vinesim.client.recording.page_replay import PageReplay
+from vinesim.client.page.page_replay import PageReplay
 from vinesim.client.recording.recorder import Recorder
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose
 from vinesim.net.codec import messages

@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator

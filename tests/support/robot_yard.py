@@ -6,8 +6,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import assemble

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
@@ -16,9 +16,9 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo, RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import CameraSpec
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.primitives.ray_caster import RayCaster
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
-from vinesim.sensors.scene.ray_caster import RayCaster
 
 IDEAL = CameraSpec.load("pinhole")
 SMALL = IDEAL.info("optical", 0.5)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import cane
-from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL

@@ -10,10 +10,10 @@ import pytest
 
 from tests.support.long_rows import long
 from tests.support.tuning import bunch, cane, number
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
-from vinesim.physics.plants.device_buffers import DeviceBuffers
-from vinesim.physics.plants.rollout import Rollout
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import DeviceBuffers
+from vinesim.plants.rollout import Rollout
 from vinesim.scene.builder import assemble
 from vinesim.scene.state import State
 from vinesim.tune import Experiment, extract_features, measure

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.support import sensor_scenes
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.values import CameraFrame
 from vinesim.sensors.camera.camera import Camera, CameraSpec

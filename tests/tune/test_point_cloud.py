@@ -10,10 +10,10 @@ import pytest
 
 from tests.support.tuning import cane, hanging, number, scan
 from vinesim.cli.tune import run
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
+from vinesim.core.toml_loader import DataError
 from vinesim.scene.plant_import.skeleton import PlantFileError
 from vinesim.scene.plant_parameters import load_specimen
-from vinesim.scene.toml_loader import DataError
 from vinesim.tune import Experiment, measure, tune, with_cloud
 from vinesim.tune.fit import specimen_toml
 from vinesim.tune.point_cloud import trace_axis

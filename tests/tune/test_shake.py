@@ -12,9 +12,9 @@ import pytest
 
 from tests.support.tuning import cane, number
 from vinesim.cli.tune import plan
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
+from vinesim.core.toml_loader import DataError
 from vinesim.scene.plant_parameters import load_specimen
-from vinesim.scene.toml_loader import DataError
 from vinesim.tune import Experiment, Trajectory, TrajectoryError, extract_features, measure, read_trajectory, tune
 from vinesim.tune.base_motion import SampledMotion, Sweep
 from vinesim.tune.fit import specimen_toml

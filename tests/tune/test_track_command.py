@@ -18,7 +18,7 @@ from tests.support.long_rows import long
 from tests.support.tuning import cane
 from vinesim.cli.tune import run as run_tune
 from vinesim.cli.tune import track as track_markers
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.recorded_pictures import LEVEL_POSE, RecordedPicturesError, read_pictures

@@ -13,11 +13,11 @@ from tests.support.long_rows import long
 from tests.support.tuning import bunch, cane, number
 from vinesim.bench.tuning_cases import draw_case
 from vinesim.cli.tune import plan, run
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
+from vinesim.core.toml_loader import DataError
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.plant_parameters import load_plant, load_specimen
 from vinesim.scene.spec import load_scene
-from vinesim.scene.toml_loader import DataError
 from vinesim.tune import Experiment, Trajectory, TrajectoryError, measure, read_trajectory, tune
 from vinesim.tune.fit import specimen_toml
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from vinesim.bench.support.browser import Page, browser_page
+from benchmarks.support.browser import Page, browser_page
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import threading
 import numpy as np
 import pytest
 
+from benchmarks.support.browser import emulated_headset
 from tests.support.live_page import (
     BUNCH,
     CONTROLS,
@@ -20,13 +21,12 @@ from tests.support.live_page import (
 from tests.support.long_rows import long
 from tests.support.recorded_pick import PICKED_AT, replay_of_a_pick
 from tests.support.waiting import wait
-from vinesim import frames
 from vinesim.avatar.gestures import GESTURES
-from vinesim.bench.support.browser import emulated_headset
-from vinesim.client.page_world import LOADED, PageWorld
+from vinesim.client.page.page_world import LOADED, PageWorld
 from vinesim.client.tasks.start_poses import bunch_centres
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import INTENTIONS, HumanSpec
@@ -343,8 +343,8 @@ def pinch(page, place):
     """Open the emulated right hand, move it to a place [3] m above the floor, and pinch there."""
     for script in ("updatePinchValue(0)", f"position.set{place}", "updatePinchValue(1)"):
         page.run(f"device.hands.right.{script}, 0")
-        drawn = page.run("vinesim.frames")
-        wait(lambda drawn=drawn: page.run("vinesim.frames") > drawn + 1, "two pictures later")
+        drawn = page.run("vinesim.core.frames")
+        wait(lambda drawn=drawn: page.run("vinesim.core.frames") > drawn + 1, "two pictures later")
 
 
 @pytest.mark.slow

@@ -7,9 +7,9 @@ import pytest
 
 from tests.support.live_page import CONTROLS, LiveVineyard, is_drawn_anew, open_page, touch_screen
 from tests.support.waiting import wait
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanSpec
 
 LEAST_CONTRAST, LEAST_OF_LARGE = 4.5, 3.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.page_module import page_module
-from vinesim import frames
+from vinesim.core import frames
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 

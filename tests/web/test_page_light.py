@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tests.support.waiting import wait
-from vinesim import frames
-from vinesim.client.page_world import PageWorld
+from vinesim.client.page.page_world import PageWorld
 from vinesim.client.spectator import Spectator
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ, unlabel
@@ -17,7 +17,7 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraOutput
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.web.page_server import PageServer
 
 VIEWS = {"demo": ((-0.6, 0.3, 1.5), (0.4, 0.75, 1.78)), "vsp": ((0.4, 1.0, 0.95), (0.5, 0.0, 1.0))}
@@ -63,8 +63,8 @@ def page_picture(page, client, eye, target):
         page.run("['frame', 'names'].forEach((id) => { document.getElementById(id).style.visibility = 'hidden'; })")
         page.look(eye, target)
         page.run("vinesim.viewer.world.listedAt = null, 0")
-        drawn = page.run("vinesim.frames")
-        wait(lambda: page.run("vinesim.frames") > drawn + 5, "a picture with shadows of what is drawn")
+        drawn = page.run("vinesim.core.frames")
+        wait(lambda: page.run("vinesim.core.frames") > drawn + 5, "a picture with shadows of what is drawn")
         failed = (
             "vinesim.viewer.renderer.info.programs.filter(({ diagnostics }) => diagnostics?.runnable === false).length"
         )

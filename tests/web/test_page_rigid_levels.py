@@ -6,9 +6,9 @@ import pytest
 from tests.support.live_page import LiveVineyard, is_drawn_anew, open_page
 from tests.support.page_module import page_module
 from tests.support.waiting import wait
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.values import HumanSpec
 

@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.waiting import deadline, wait
-from vinesim.client import page_access
-from vinesim.errors import UsageError
+from vinesim.client.page import page_access
+from vinesim.core.errors import UsageError
 from vinesim.web import page_files
 from vinesim.web.page_input import decode_input
 from vinesim.web.page_server import WINDOW, PageServer

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from vinesim import frames
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
-from vinesim.client.page_world import ELSE_LOADED, LOADED, PageWorld
+from vinesim.client.page.page_world import ELSE_LOADED, LOADED, PageWorld
 from vinesim.client.spectator import Spectator, standing_view
 from vinesim.client.tasks.start_poses import bunch_centres
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
@@ -17,9 +17,9 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
 from vinesim.scene.values import INTENTIONS, LightPattern
-from vinesim.scene.wire_segments import wire_segments
 from vinesim.web.array_message import decode
 from vinesim.web.page_input import PageInput, TrackedHand, TrackedPerson
+from vinesim.wires.wire_segments import wire_segments
 
 
 class OnePage:

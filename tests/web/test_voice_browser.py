@@ -5,19 +5,19 @@ import time
 import numpy as np
 import pytest
 
+from benchmarks.support.browser import AS_RECORDED, browser_page, microphone, write_tone
+from benchmarks.support.ear import Ear
 from tests.audio.test_microphone import amplitude
 from tests.support.contact_scenes import cane
 from tests.support.live_page import SteppedPage
 from tests.support.waiting import wait
-from vinesim import frames
 from vinesim.audio import opus
 from vinesim.audio.frame import SAMPLE_RATE, to_pcm
 from vinesim.avatar.tracked_human import TrackedHuman
-from vinesim.bench.support.browser import AS_RECORDED, browser_page, microphone, write_tone
-from vinesim.bench.support.ear import Ear
 from vinesim.client.client import Client
-from vinesim.client.page_sound import PageSound
-from vinesim.client.page_world import PageWorld
+from vinesim.client.page.page_sound import PageSound
+from vinesim.client.page.page_world import PageWorld
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble

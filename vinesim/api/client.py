@@ -22,13 +22,13 @@ from vinesim.client.client import Client as RobotClient
 from vinesim.client.rate_loop import paced_loop
 from vinesim.client.tasks.start_poses import start_pose
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
+from vinesim.world import Physics
 
 if TYPE_CHECKING:
     from vinesim.api.page import Page

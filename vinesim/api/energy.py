@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ import html
 from collections.abc import Callable
 
 from vinesim.client.client import Client
-from vinesim.client.page_world import PageWorld
+from vinesim.client.page.page_world import PageWorld
 from vinesim.web import page_files
 from vinesim.web.page_server import PageServer
 

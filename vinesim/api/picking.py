@@ -15,13 +15,13 @@ import numpy as np
 
 from vinesim.client.tasks import pick_planning
 from vinesim.client.tasks.start_poses import start_pose
-from vinesim.physics.step import Physics
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch, PickPlan
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, load_scene
+from vinesim.world import Physics
 
 ROBOT = "vinebot"
 """Whose hand and arms grasps are planned for."""

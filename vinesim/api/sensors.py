@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from vinesim.api.simulation import Simulation, base_pose
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.values import CameraFrame, CameraInfo, LidarScan
 from vinesim.sensors.camera import camera as rgbd

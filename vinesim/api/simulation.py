@@ -4,7 +4,7 @@
     simulation.step(500)
     print(simulation.tip(), simulation.energy().total)
 
-Positions are in m, forces in N, in world axes (:mod:`vinesim.frames`).
+Positions are in m, forces in N, in world axes (:mod:`vinesim.core.frames`).
 """
 
 from __future__ import annotations
@@ -16,11 +16,9 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from vinesim import frames
 from vinesim.api.energy import Energy, Momentum, energy, momentum
-from vinesim.errors import UsageError, checked_index
-from vinesim.physics.plants.sway import Sway
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.core.errors import UsageError, checked_index
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import TreeBuilder
@@ -33,9 +31,11 @@ from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.state import State
 from vinesim.scene.values import Contact, Detachment, Snapshot
 from vinesim.scene.wind import wind_of
+from vinesim.wind.sway import Sway
+from vinesim.world import Physics
 
 if TYPE_CHECKING:
-    from vinesim.sensors.scene.primitives import Primitives
+    from vinesim.sensors.primitives.scene_primitives import Primitives
 
 Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]
 """What can be simulated: a model, a scene or the name or path of one, canes."""
@@ -309,7 +309,7 @@ class Simulation:
     def primitives(self) -> Primitives:
         """What cameras and lidars see, at the current time (built once)."""
         if self._primitives is None:
-            from vinesim.sensors.scene.primitives import Primitives
+            from vinesim.sensors.primitives.scene_primitives import Primitives
 
             self._primitives = Primitives(self.model, device=self.device)
         self._primitives.update(self._sway.apply(self.snapshot()))

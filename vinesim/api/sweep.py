@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, TypeVar
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 
 log = logging.getLogger(__name__)
 

@@ -1,5 +1,5 @@
 """People that this client moves: a person, its haptic feedback and shears, finger poses, estimated legs, a script.
 
-Their bodies in the physics are in ``vinesim.physics.rigid``; copies of other clients' people in
+Their bodies in the physics are in ``vinesim.rigid``; copies of other clients' people in
 ``vinesim.client.remote``.
 """

@@ -19,7 +19,7 @@ from typing import Annotated
 
 import msgspec
 
-from vinesim.scene.toml_loader import DataError, load_toml
+from vinesim.core.toml_loader import DataError, load_toml
 
 FingerBend = tuple[float, float, float, float, float]
 """[1] One number for each finger, from the thumb on; see :class:`vinesim.scene.values.HumanPose`."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim.physics.step import Physics
 from vinesim.scene.values import Haptic
+from vinesim.world import Physics
 
 
 class HapticFeedback:

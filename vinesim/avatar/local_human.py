@@ -7,12 +7,12 @@ from collections.abc import Callable, Container
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.avatar.haptics import HapticFeedback
 from vinesim.avatar.shears import Closure, Shears
-from vinesim.physics.rigid.human_shapes import SIDES
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.human_shapes import SIDES
 from vinesim.scene.values import INTENTIONS, POINT_NAMES, Haptic, HumanPose, HumanSpec, HumanUpdate
+from vinesim.world import Physics
 
 _HEAD, _HANDS = POINT_NAMES.index("head"), [POINT_NAMES.index(side) for side in SIDES]
 

@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.avatar.gestures import finger_bend
 from vinesim.avatar.leg_estimator import LegEstimator
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanPose
 
 WALK_SPEED = 1.1

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from vinesim.physics.step import Physics
 from vinesim.scene import appearance
 from vinesim.scene.values import Haptic, HumanPose
+from vinesim.world import Physics
 
 CUT_PULSE, MISS_PULSE = (1.0, 0.1), (0.3, 0.03)
 """Amplitude [1] and duration [s] of the vibration when shears have cut something, and when they have not. GUESSED."""

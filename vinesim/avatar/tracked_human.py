@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.avatar.gestures import OPEN_HAND, FingerBend, Gestures, shears_grip
 from vinesim.avatar.leg_estimator import LegEstimator
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanPose
 
 MAX_PERIOD = 0.1

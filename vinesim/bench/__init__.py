@@ -1,1 +1,1 @@
-"""Benchmarks beside peers: ``vinesim bench``. Nothing here runs in the product."""
+"""Measurements that users may want to repeat on their machine, each compared with a peer: ``vinesim bench``."""

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from vinesim import frames
 from vinesim.bench.scenes import interleaved_medians
+from vinesim.core import frames
 from vinesim.kernels.launch import MAX_THREADS, usable_cores
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
@@ -28,9 +28,9 @@ from vinesim.scene.values import CameraInfo, CameraOutput, Measurement
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.camera.stereo import Stereo
 from vinesim.sensors.export.images import look_at
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.primitive_arrays import CONE, LEAF, SPHEROID
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
 
 _ROUNDS = 7
 

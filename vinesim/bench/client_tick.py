@@ -26,13 +26,13 @@ from unittest import mock
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.client.client import Client
+from vinesim.client.processes import ros_process, sensor_process
 from vinesim.client.rate_loop import RateLoop
 from vinesim.client.recording.bunch_trace import Trace
-from vinesim.client.sensing import ros_process, sensor_process
 from vinesim.client.tasks.motions import LookAt
 from vinesim.client.tasks.start_poses import QUEUE_SPACING, find_push_pose, start_pose
+from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description

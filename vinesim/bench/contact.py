@@ -15,15 +15,15 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from vinesim import frames
 from vinesim.bench import scenes as scenes
 from vinesim.bench.mujoco_reference import MujocoScene
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement, RobotSpec
+from vinesim.world import Physics
 
 CANE_COUNTS = (64, 256)
 STEPS_PER_ROUND = (20, 5)

@@ -16,8 +16,8 @@ from vinesim.bench.camera import demo_scene, embree_scene, median_cpu_times, tri
 from vinesim.scene.values import Measurement
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer
-from vinesim.sensors.scene.primitives import rest_snapshot
-from vinesim.sensors.scene.ray_caster import RayCaster
+from vinesim.sensors.primitives.ray_caster import RayCaster
+from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
 _STAND = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
 """Between two rows, level."""

@@ -128,13 +128,6 @@ def measure_tick() -> Iterator[Measurement]:
     return client_measurements()
 
 
-def measure_link() -> Iterator[Measurement]:
-    """A touch as another client sees it over an emulated LAN; needs root and a checkout."""
-    from vinesim.bench.touch_latency import LAN, line_measurements
-
-    return line_measurements(LAN)
-
-
 ROWS = {
     "demo": Row("vinesim demo: start, ticks, sensors, 100 Hz topics, losses", 45.0, measure_demo),
     "camera": Row("client alone, camera: start to first picture, rate, age, tick", 35.0, measure_camera),
@@ -143,7 +136,6 @@ ROWS = {
     "start": Row("vinesim render with and without --path, parts of a start", 90.0, measure_start),
     "generate": Row("demo and tendone generated, then read from the cache", 20.0, measure_generation),
     "tick": Row("whole ticks, paced and back to back, of one robot and of ten", 110.0, measure_tick),
-    "link": Row("touch to motion as another client sees it, over an emulated LAN (root)", 60.0, measure_link),
     "cold": Row("client alone with empty caches: compiles every kernel", 180.0, measure_cold),
 }
 """By the name that ``--row`` takes, in the order in which they are measured."""

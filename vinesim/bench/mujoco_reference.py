@@ -9,14 +9,14 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.contact.plant_capsules import plant_capsules
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.rigid.robot_body import RobotBody
-from vinesim.physics.rigid.static_world import FIXED, ROBOT_CODES, build_static_world, contact_friction
+from vinesim.contact.plant_capsules import plant_capsules
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.rigid.robot_body import RobotBody
+from vinesim.rigid.static_world import FIXED, ROBOT_CODES, build_static_world, contact_friction
 from vinesim.scene.builder import GRAVITY
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.scene.values import RobotSpec
 
@@ -75,7 +75,7 @@ class MujocoScene:
     Bunches that have berry clusters are always fine: each cluster is a body with its own capsule.
 
     Robots touch plants; plants do not touch each other (in ours they may, so MuJoCo has less to compute). Commands are
-    given to ``rigid``, as to that of a :class:`vinesim.physics.step.Physics`. The scheme of ``discrete`` adds dt K of
+    given to ``rigid``, as to that of a :class:`vinesim.world.Physics`. The scheme of ``discrete`` adds dt K of
     damping, which is subtracted from the model's, down to zero.
 
     ``contact_time_constant`` [s] of every contact (solref); the default of MuJoCo, 0.02, is soft: at 3 m/s bodies

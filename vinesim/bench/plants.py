@@ -10,10 +10,10 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
 from vinesim.bench.scenes import interleaved_times
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model

@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import Drive, RobotSpec
+from vinesim.world import Physics
 
 SPACING = 0.15
 """[m] Between canes."""

@@ -48,7 +48,7 @@ scene = load_scene(sys.argv[1])
 start = time.perf_counter()
 model = generate(scene)
 lap("generate")
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 primitives = Primitives(model)
 lap("primitives")
 import numpy as np

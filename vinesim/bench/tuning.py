@@ -16,12 +16,12 @@ import msgspec
 import mujoco
 import numpy as np
 
-from vinesim import frames
 from vinesim.bench.mujoco_reference import compile_plants
 from vinesim.bench.tuning_cases import DAMPING_BAR, MODULUS_BAR, Case, draw_case
 from vinesim.bench.tuning_peers import peer_rows, stein_rows
 from vinesim.bench.tuning_pictures import film
 from vinesim.bench.tuning_rods import is_installed, rod_track
+from vinesim.core import frames
 from vinesim.scene.builder import assemble
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.scene.values import Measurement

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 import msgspec
 import numpy as np
 
-from vinesim import frames
 from vinesim.bench.tuning_cases import Case
+from vinesim.core import frames
 from vinesim.scene.builder import assemble
 from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.ids import Organ
@@ -23,7 +23,7 @@ from vinesim.scene.plant_parameters import Specimen
 from vinesim.scene.values import CameraFrame, CameraOutput, RigidVisual, Shape, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.tune import Trajectory, measure
 from vinesim.tune.marker_track import track_marker
 from vinesim.tune.specimen import TIP, build_tree

@@ -21,7 +21,6 @@ from typing import Annotated
 
 import typer
 
-from vinesim import allocator, progress
 from vinesim.cli.commands.client import client
 from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, render, scene_import_plant, scene_show
@@ -29,6 +28,7 @@ from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
 from vinesim.cli.commands.tools import bench, certs_new, doctor, ros_build_interfaces, ros_play, ros_record
 from vinesim.cli.commands.tuning import experiment, track, tune
+from vinesim.core import allocator, progress
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False,

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import pathlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
-from vinesim.errors import UsageError
 from vinesim.scene.values import Measurement
 
 
@@ -37,23 +35,10 @@ def _tick() -> Iterator[Measurement]:
     yield from step_measurements(robot.to_spec("robot"), raised)
 
 
-def _asleep() -> Iterator[Measurement]:
-    from vinesim.bench.vineyard import sleeping_measurements
-    from vinesim.robot.description.loader import load_description
-
-    return sleeping_measurements(load_description("vinebot").to_spec("robot"))
-
-
 def _start() -> Iterator[Measurement]:
     from vinesim.bench.start import start_measurements
 
     return start_measurements()
-
-
-def _picking() -> Iterator[Measurement]:
-    from vinesim.bench.picking import picking
-
-    return picking()
 
 
 def _camera() -> Iterator[Measurement]:
@@ -68,51 +53,6 @@ def _lidar() -> Iterator[Measurement]:
     return lidar()
 
 
-def _sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
-    from vinesim.bench.sensor_accuracy import sensors
-
-    return sensors(plot)
-
-
-def _sync(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
-    from vinesim.bench.replication_delay import sync
-
-    return sync(plot=plot)
-
-
-def _traffic() -> Iterator[Measurement]:
-    from vinesim.bench.traffic import traffic
-
-    return traffic()
-
-
-def _load() -> Iterator[Measurement]:
-    from vinesim.bench.router_load import load
-
-    return load()
-
-
-def _actors() -> Iterator[Measurement]:
-    from vinesim.bench.many_actors import actors
-
-    return actors()
-
-
-def _fuzz(messages: int = 100_000, lies: int = 0) -> Iterator[Measurement]:
-    from vinesim.bench.message_fuzz import fuzz
-
-    for option, value in (("messages", messages), ("lies", lies)):
-        if value < 0:
-            raise UsageError(f"--{option} is {value}: give 0 or more")
-    return fuzz(messages, lies)
-
-
-def _link() -> Iterator[Measurement]:
-    from vinesim.bench.touch_latency import link
-
-    return link()
-
-
 def _live(rows: Sequence[str] = ()) -> Iterator[Measurement]:
     from vinesim.bench.live import ROWS, live
 
@@ -121,38 +61,10 @@ def _live(rows: Sequence[str] = ()) -> Iterator[Measurement]:
     return live(rows, _announce)
 
 
-def _sound() -> Iterator[Measurement]:
-    from vinesim.bench.sound_delay import sound
-
-    return sound()
-
-
-def _page() -> Iterator[Measurement]:
-    from vinesim.bench.page_latency import page
-
-    return page()
-
-
-def _voice() -> Iterator[Measurement]:
-    from vinesim.bench.voice_delay import voice
-
-    return voice()
-
-
 def _ros() -> Iterator[Measurement]:
     from vinesim.bench.ros_topics import ros
 
     return ros(_announce)
-
-
-def _kill(times: int = 50, seed: int = 1) -> Iterator[Measurement]:
-    from vinesim.bench.kill import kill
-
-    if times < 1:
-        raise UsageError(f"--times is {times}: give 1 or more")
-    if seed < 0:
-        raise UsageError(f"--seed is {seed}: give 0 or more")
-    return kill(times, seed, _announce)
 
 
 def _tune() -> Iterator[Measurement]:
@@ -165,12 +77,6 @@ def _announce(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
-def _soak(minutes: float | None = None, real_time_factor: float | None = None) -> Iterator[Measurement]:
-    from vinesim.bench.soak import MINUTES, soak
-
-    return soak(MINUTES if minutes is None else minutes, real_time_factor, _announce)
-
-
 RAISED = {
     "torso_lift_joint": 0.45,
     **{f"arm_{side}_{i}_joint": q for side in ("left", "right") for i, q in ((1, 0.6), (2, 0.1), (4, 1.8))},
@@ -181,25 +87,11 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "plants": _plants,
     "contact": _contact,
     "tick": _tick,
-    "asleep": _asleep,
     "start": _start,
-    "picking": _picking,
     "camera": _camera,
     "lidar": _lidar,
-    "sensors": _sensors,
     "live": _live,
     "ros": _ros,
-    "page": _page,
-    "voice": _voice,
-    "sound": _sound,
-    "sync": _sync,
-    "link": _link,
-    "traffic": _traffic,
-    "load": _load,
-    "actors": _actors,
-    "fuzz": _fuzz,
-    "kill": _kill,
-    "soak": _soak,
     "tune": _tune,
 }
 
@@ -208,61 +100,26 @@ class NoSuchBench(ValueError):
     """There is no benchmark of that name; the text lists all."""
 
 
-def _measurements(
-    name: str,
-    plot: pathlib.Path | None,
-    rows: Sequence[str],
-    minutes: float | None,
-    real_time_factor: float | None,
-    times: int,
-    seed: int,
-    messages: int,
-    lies: int,
-) -> Iterator[Measurement]:
-    drawn = {"sync": _sync, "sensors": _sensors}.get(name)
-    try:
-        if name == "live":
-            yield from _live(rows)
-        elif name == "soak":
-            yield from _soak(minutes, real_time_factor)
-        elif name == "kill":
-            yield from _kill(times, seed)
-        elif name == "fuzz":
-            yield from _fuzz(messages, lies)
-        else:
-            yield from drawn(plot) if drawn else BENCHES[name]()
-    except ModuleNotFoundError as missing:
-        if not (missing.name or "").startswith(("vinesim.bench.support", "hypothesis")):
-            raise
-        raise NoSuchBench(
-            f"bench {name} needs load generators that are not installed; run it in a checkout of vinesim"
-        ) from None
+def print_measurement(one: Measurement, as_json: bool) -> None:
+    """One line on standard output."""
+    if as_json:
+        print(json.dumps(dataclasses.asdict(one)), flush=True)
+        return
+    peer = f"   {one.peer} {one.peer_value:.4g} {one.unit}, ratio {one.ratio:.3g}" if one.ratio is not None else ""
+    print(f"{one.bench:10s} {one.case:44s} {one.value:10.4g} {one.unit}{peer}", flush=True)
 
 
-def run(
-    names: list[str], as_json: bool, plot: pathlib.Path | None = None, rows: Sequence[str] = (),
-    minutes: float | None = None, real_time_factor: float | None = None, times: int = 50, seed: int = 1,
-    messages: int = 100_000, lies: int = 0,
-) -> int:  # fmt: skip
+def run(names: list[str], as_json: bool, rows: Sequence[str] = ()) -> int:
     """Run the named benchmarks in order and print their measurements as they come; the exit code.
 
-    ``plot``: the file that sync draws, or the folder for the plots of sensors; ``rows`` of live, all if there are none;
-    ``minutes`` and ``real_time_factor`` of soak; ``times`` and ``seed`` of kill; ``messages`` and ``lies`` of fuzz.
+    ``rows`` of live: all if there are none.
     """
     if rows and "live" not in names:
         raise NoSuchBench("--row chooses rows of the bench live; leave it out")
-    if minutes is not None and "soak" not in names:
-        raise NoSuchBench("--minutes is how long the bench soak runs; leave it out")
-    if real_time_factor is not None and "soak" not in names:
-        raise NoSuchBench("--real-time-factor is how fast the world of the bench soak runs; leave it out")
     for name in names:
         if name not in BENCHES:
             raise NoSuchBench(f"no bench {name!r}; there are: {', '.join(BENCHES)}")
     for name in names:
-        for m in _measurements(name, plot, rows, minutes, real_time_factor, times, seed, messages, lies):
-            if as_json:
-                print(json.dumps(dataclasses.asdict(m)), flush=True)
-            else:
-                beside = f"   {m.peer} {m.peer_value:.4g} {m.unit}, ratio {m.ratio:.3g}" if m.ratio is not None else ""
-                print(f"{m.bench:10s} {m.case:44s} {m.value:10.4g} {m.unit}{beside}", flush=True)
+        for one in _live(rows) if name == "live" else BENCHES[name]():
+            print_measurement(one, as_json)
     return 0

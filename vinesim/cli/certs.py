@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.net.transport.access_control import SERVER, Role
 from vinesim.net.transport.certificates import create as new_certificate
 

@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 from collections.abc import Collection
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.scene.values import SensorMode
 
 ROLES = ("robot", "human", "spectator")
@@ -143,7 +143,7 @@ def check_options(options: ClientOptions) -> None:
         )
     if options.params_file is not None and not options.params_file.is_file():
         raise UsageError(f"--params-file {options.params_file}: there is no such file; give a ROS 2 parameter file")
-    from vinesim.physics.plants.device_buffers import find_device
+    from vinesim.plants.device_buffers import find_device
     from vinesim.scene import appearance
     from vinesim.sensors.raster import renderer_selection
 

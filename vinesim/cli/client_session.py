@@ -13,7 +13,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Self, TypeVar
 
-from vinesim import allocator
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions, check_options
 from vinesim.cli.signals import stop_at_signals
@@ -22,12 +21,13 @@ from vinesim.client.rate_loop import RateLoop, paced_loop
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
 from vinesim.client.tasks.start_poses import with_start_pose
-from vinesim.errors import writing
+from vinesim.core import allocator
+from vinesim.core.errors import writing
 from vinesim.kernels.compilation import PHYSICS_PACKAGES, SENSOR_PACKAGES, compile_kernels
 from vinesim.net.pace import describe
 from vinesim.net.transport.bus import Bus
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.plants.device_buffers import DeviceLost, device_fault
+from vinesim.plants.device_buffers import DeviceLost, device_fault
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
@@ -124,13 +124,13 @@ class ClientSession:
                 return
             port = 0
         page_files.check()
-        from vinesim.client.page_sound import PageSound
-        from vinesim.client.page_world import PageWorld
+        from vinesim.client.page.page_sound import PageSound
+        from vinesim.client.page.page_world import PageWorld
         from vinesim.web.page_server import PageServer
 
         world, sound = PageWorld(client, person), PageSound(client)
         if self.options.page_lan:
-            from vinesim.client.page_access import network_access, print_code
+            from vinesim.client.page.page_access import network_access, print_code
 
             access = network_access()
             server = self.enter(

@@ -18,9 +18,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from vinesim.cli.render import parse_size
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
-from vinesim.errors import UsageError, WriteError
+from vinesim.core.errors import UsageError, WriteError
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
-from vinesim.physics.plants.device_buffers import find_device
+from vinesim.plants.device_buffers import find_device
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan

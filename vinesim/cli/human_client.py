@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.avatar.gestures import Gestures
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.avatar.tracked_human import TrackedHuman
@@ -15,8 +14,9 @@ from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
 from vinesim.client.tasks.meet_planning import REACH
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch
-from vinesim.errors import writing
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.core.errors import writing
+from vinesim.world import Physics
 
 GIVING_HEIGHT = 0.70
 """Height of the hand above the bottom of a box when it lets a bunch go [m]. GUESSED."""

@@ -12,7 +12,7 @@ import time
 
 from vinesim.cli.signals import stop_at_signals
 from vinesim.client.recording.recorder import FAMILIES, Observer, Recorder, observer_grid
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.net.recording.mcap_writer import RecordingWriter, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from vinesim.errors import UsageError, WriteError
+from vinesim.core.errors import UsageError, WriteError
 
 if TYPE_CHECKING:
     from vinesim.client.composition.scene_composer import SceneComposer
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from vinesim.scene.spec import Scene
     from vinesim.scene.values import CameraInfo, Snapshot
     from vinesim.sensors.camera.camera import CameraSpec
-    from vinesim.sensors.scene.primitives import Primitives
-    from vinesim.sensors.scene.ray_caster import RayCaster
+    from vinesim.sensors.primitives.ray_caster import RayCaster
+    from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -70,7 +70,7 @@ def run(
     """
     viewpoints = _viewpoints(at, look, path)
     if device != "cpu":  # these imports cost half a second
-        from vinesim.physics.plants.device_buffers import find_device
+        from vinesim.plants.device_buffers import find_device
 
         find_device(device)
     from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
@@ -79,9 +79,9 @@ def run(
     from vinesim.scene.wind import wind_of
     from vinesim.sensors.camera.camera import CameraSpec
     from vinesim.sensors.export.dataset import resized_intrinsics
+    from vinesim.sensors.primitives.ray_caster import RayCaster
+    from vinesim.sensors.primitives.scene_primitives import Primitives
     from vinesim.sensors.raster import renderer_selection
-    from vinesim.sensors.scene.primitives import Primitives
-    from vinesim.sensors.scene.ray_caster import RayCaster
 
     renderer_selection.check_renderer(renderer, device)
     spec = CameraSpec.load(camera)
@@ -93,7 +93,7 @@ def run(
     model = generate(plan)
     view = staged.compose(model, plan.physics)
     if (wind := wind_of(plan)) is not None:
-        from vinesim.physics.plants.sway import windblown  # the kernels of plants: half a second
+        from vinesim.wind.sway import windblown  # the kernels of plants: half a second
 
         view = windblown(model, view, wind, time)
     primitives = Primitives(model, renderer=renderer, device=device)
@@ -157,10 +157,10 @@ class _Stage:
     def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
         """The picture from a viewpoint, and in words what is in sight."""
         from vinesim.scene.camera_geometry import depth_millimetres
+        from vinesim.sensors import ground_truth
         from vinesim.sensors.camera.camera import Camera
         from vinesim.sensors.export import annotations as formats
         from vinesim.sensors.export import images as picture
-        from vinesim.sensors.truth import ground_truth
 
         pose = picture.look_at(viewpoint.eye, viewpoint.target)
         seen = ground_truth.render_buffers(self.primitives, self.info, pose)
@@ -201,7 +201,7 @@ class _Stage:
 def _check_not_enclosed(primitives: Primitives, viewpoint: Viewpoint) -> None:
     """:class:`UsageError` if a camera stands inside something."""
     from vinesim.scene.ids import unlabel
-    from vinesim.sensors.scene.ray_caster import enclosing_primitive
+    from vinesim.sensors.primitives.ray_caster import enclosing_primitive
 
     inside = enclosing_primitive(primitives, viewpoint.eye)
     if inside >= 0:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vinesim.cli.signals import stop_at_signals
-from vinesim.errors import UsageError, writing
+from vinesim.core.errors import UsageError, writing
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.keys import sender_of
@@ -21,7 +21,7 @@ from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_
 from vinesim.net.transport.endpoints import check_exposure
 
 if TYPE_CHECKING:
-    from vinesim.client.recording.page_replay import PageReplay
+    from vinesim.client.page.page_replay import PageReplay
     from vinesim.client.recording.replay import ReplayBus
     from vinesim.client.spectator import Spectator
     from vinesim.scene.model import Model
@@ -117,7 +117,7 @@ def make_page_replay(
     speed: float = 1.0, start: float = 0.0, end: float | None = None,
 ) -> PageReplay:  # fmt: skip
     """A recording for pages; arguments as of :func:`run`."""
-    from vinesim.client.recording.page_replay import PageReplay
+    from vinesim.client.page.page_replay import PageReplay
 
     plan, model = _vineyard(tape, scene, seed)
 
@@ -214,7 +214,7 @@ def _vineyard(tape: Recording, scene: str | None, seed: int | None) -> tuple[Sce
 
 def _eyes(tape: Recording, model: Model, pose: tuple[float, float, float] | None) -> np.ndarray:
     """Pose [7] of eyes that stand at a ``pose``, unless given behind the first robot."""
-    from vinesim.client.first_view import first_view
+    from vinesim.client.page.first_view import first_view
     from vinesim.client.spectator import standing_view
 
     if pose is not None:

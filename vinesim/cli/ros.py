@@ -7,7 +7,7 @@ import threading
 import time
 
 from vinesim.cli.signals import stop_at_signals
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.net.recording.mcap_writer import free_path
 from vinesim.ros import middleware
 

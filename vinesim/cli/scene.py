@@ -9,8 +9,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from vinesim import frames
-from vinesim.errors import WriteError
+from vinesim.core import frames
+from vinesim.core.errors import WriteError
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.plant_import.imported_plant import import_plant
 from vinesim.scene.plant_import.wood import build_model
@@ -18,7 +18,7 @@ from vinesim.scene.plant_parameters import load_plant
 from vinesim.scene.spec import load_scene, with_seed
 from vinesim.scene.summary import summary_rows as rows_of
 from vinesim.sensors.export.images import render_overview
-from vinesim.sensors.scene.primitives import rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
 
 def write_imported_plant(file: pathlib.Path, out: pathlib.Path | None, **options: Any) -> int:

@@ -9,7 +9,7 @@ from typing import Any
 
 from vinesim.audio.permission import SpectatorsSpeakTo
 from vinesim.cli.signals import stop_at_signals
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.net.pace import describe
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.retained_store import Quota

@@ -8,7 +8,7 @@ from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession
 from vinesim.client.spectator import PictureWriter, Spectator, standing_view
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.errors import writing
+from vinesim.core.errors import writing
 
 
 def run(options: ClientOptions) -> int:

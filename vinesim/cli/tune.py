@@ -9,7 +9,7 @@ import pathlib
 import sys
 from typing import TYPE_CHECKING
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 
 if TYPE_CHECKING:
     from vinesim.tune.experiment import Experiment

@@ -22,8 +22,6 @@ from concurrent.futures import Executor
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.allocator import release_free_memory
 from vinesim.avatar.local_human import LocalHuman
 from vinesim.client.pace import Limit
 from vinesim.client.recording.bunch_trace import Trace
@@ -36,14 +34,15 @@ from vinesim.client.remote.tree_copies import TreeCopies
 from vinesim.client.signals import show_lights
 from vinesim.client.sound.exchange import SoundExchange
 from vinesim.client.world_time import WorldTime
+from vinesim.core import frames
+from vinesim.core.allocator import release_free_memory
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.urdf import RobotError
-from vinesim.physics.step import Physics
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.urdf import RobotError
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.robot.drives.controlled_robot import Robot
@@ -53,6 +52,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 from vinesim.scene.values import Coupling, HumanPose, HumanSpec, HumanUpdate, RobotUpdate
 from vinesim.scene.wind import wind_of
+from vinesim.world import Physics
 
 log = logging.getLogger(__name__)
 

@@ -7,20 +7,20 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.client.client import Client, label_index
-from vinesim.errors import writing
+from vinesim.core import frames
+from vinesim.core.errors import writing
 from vinesim.net.codec.messages import Hello
 from vinesim.net.replication.replication_state import SPECTATOR
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
-from vinesim.physics.plants.sway import Sway
 from vinesim.robot.description.description import RobotDescription
 from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import images
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.scheduler import load_kernels
+from vinesim.wind.sway import Sway
 
 EYE_HEIGHT = 1.6
 """Height of a standing person's eyes above the ground [m]."""

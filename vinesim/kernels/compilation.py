@@ -28,22 +28,22 @@ from collections.abc import Sequence
 import warp as wp
 
 import vinesim.kernels
-from vinesim import disk_cache, progress
+from vinesim.core import disk_cache, progress
+from vinesim.core.progress import ProgressLine
 from vinesim.kernels.launch import usable_cores
-from vinesim.progress import ProgressLine
 
 log = logging.getLogger(__name__)
 
 PHYSICS_PACKAGES = (
     "shared_launch",
-    "articulation",
+    "plants",
+    "wires",
     "contact",
-    "joint_servos",
-    "inverse_kinematics",
-    "human_kinematics",
+    "rigid",
+    "robot",
 )
 """Kernels that a step needs."""
-SENSOR_PACKAGES = ("raster", "sensing", "shading")
+SENSOR_PACKAGES = ("raster", "lidar", "stereo", "shading")
 """Kernels of cameras and lidars."""
 TIMEOUT = 600.0
 """How long other processes may take to compile, before this one compiles as well [s]."""
@@ -61,14 +61,14 @@ _PREFIX = "vinesim.kernels."
 _KERNEL = re.compile(rb"^@wp\.kernel|_kernel\(__name__,", re.MULTILINE)
 """What defines a kernel."""
 _CUDA_ONLY = (
-    "articulation.lean_prediction",
+    "plants.lean_prediction",
     "contact.tree_delassus",
     "contact.tree_islands",
     "contact.tree_narrowphase",
     "raster.cuda_raster",
 )
 _CPU_ONLY = (
-    "articulation.eight_trees",
+    "plants.eight_trees",
     "contact.delassus",
     "contact.forces",
     "contact.islands",
@@ -78,9 +78,9 @@ _CPU_ONLY = (
     "contact.projected_gauss_seidel",
     "contact.sleeping_trees",
     "contact.sweep_order",
-    "contact.wire_contacts",
-    "contact.wire_shapes",
-    "joint_servos",
+    "rigid.joint_servos",
+    "wires.wire_contacts",
+    "wires.wire_shapes",
 )
 """Modules whose kernels are never launched on a GPU; some have vectors of a CPU in native code."""
 

@@ -13,9 +13,9 @@ import pathlib
 
 import numpy as np
 
-from vinesim import disk_cache, frames
-from vinesim.frames import normalize
-from vinesim.scene import plant_parameters, portable_math
+from vinesim.core import disk_cache, frames, portable_math
+from vinesim.core.frames import normalize
+from vinesim.scene import plant_parameters
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.errors import checked_index
-from vinesim.scene import berries, plant_parameters, portable_math
+from vinesim.core import frames, portable_math
+from vinesim.core.errors import checked_index
+from vinesim.scene import berries, plant_parameters
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
@@ -424,7 +424,7 @@ def _without_curvature(theta: np.ndarray, torque: np.ndarray) -> np.ndarray:
     """K theta [n, 3] of springs at rotation vectors theta [n, 3] rad that hold a torque [n, 3] N m in middle axes.
 
     The inverse of torque = s K theta + (1 - s) n n^T K theta, see ``spring_torque`` in
-    :mod:`vinesim.kernels.articulation.forces`.
+    :mod:`vinesim.kernels.plants.forces`.
     """
     half = 0.5 * np.linalg.norm(theta, axis=1, keepdims=True)
     along = theta / np.maximum(2.0 * half, 1e-12)

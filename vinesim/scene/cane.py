@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene import builder
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.model import Model

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.plant_parameters import Leaf
 from vinesim.scene.spec import Scene
 

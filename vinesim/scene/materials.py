@@ -8,10 +8,10 @@ import functools
 import msgspec
 import numpy as np
 
-from vinesim.scene.data_files import find_data_file
+from vinesim.core.data_files import find_data_file
+from vinesim.core.toml_loader import DataError, load_toml
 from vinesim.scene.ids import Organ
 from vinesim.scene.plant_parameters import Number
-from vinesim.scene.toml_loader import DataError, load_toml
 
 
 class Material(enum.IntEnum):

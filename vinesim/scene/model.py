@@ -16,8 +16,8 @@ import hashlib
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.array_fields import StructOfArrays, array
+from vinesim.core import frames
+from vinesim.core.array_fields import StructOfArrays, array
 from vinesim.scene.ids import Organ
 
 _UNIT_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)

@@ -1,7 +1,7 @@
 """Parameters of the physics: one frozen value with the unit and the source of each number.
 
 It stands beside the scene's file format because a scene may override it, in a table ``[physics]``; the package
-``vinesim.physics`` reads it. Times are in seconds and distances in metres, so all of them keep their meaning when
+``vinesim.interaction`` reads it. Times are in seconds and distances in metres, so all of them keep their meaning when
 ``dt``
 changes. READ: from the source named; DERIVED: computed from others; TUNED: chosen by experiment with this solver;
 GUESSED: nothing better is known.

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from vinesim.scene.data_files import find_data_file
-from vinesim.scene.toml_loader import DataError, load_toml
+from vinesim.core.data_files import find_data_file
+from vinesim.core.toml_loader import DataError, load_toml
 
 AXIS_LENGTH = 0.05
 """[1] By how much the length of a specimen's axis may differ from its measured length."""

@@ -1,7 +1,7 @@
 """What a scene file says: a vineyard's layout, season, fruit, boxes, sun, and where robots start.
 
-Lengths in metres, angles in radians, axes as in :mod:`vinesim.frames`. The first vine of the first row stands at the
-origin; vines follow along +x, rows along +y, so that a longer row or one row more moves no other vine.
+Lengths in metres, angles in radians, axes as in :mod:`vinesim.core.frames`. The first vine of the first row stands at
+the origin; vines follow along +x, rows along +y, so that a longer row or one row more moves no other vine.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from vinesim.core.data_files import DataFileNotFound, find_data_file
+from vinesim.core.toml_loader import DataError, load_toml
 from vinesim.scene import plant_parameters
 from vinesim.scene.berries import VARIETIES
-from vinesim.scene.data_files import DataFileNotFound, find_data_file
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
-from vinesim.scene.toml_loader import DataError, load_toml
 
 MAX_ROBOTS = 10
 """Robots that may meet in one vineyard (CANOPIES D6.4 section 2.3)."""
@@ -115,7 +115,7 @@ def sun_direction(hour: float, declination: float, latitude: float) -> tuple[flo
 
 
 class Wind(_Part, frozen=True, kw_only=True):
-    """How the air moves; see :class:`vinesim.physics.plants.wind.Wind`. Calm unless said."""
+    """How the air moves; see :class:`vinesim.wind.plant_wind.Wind`. Calm unless said."""
 
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """[m/s] World axes, at the top of the canopy before the first row."""

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from vinesim.array_fields import StructOfArrays, array
+from vinesim.core.array_fields import StructOfArrays, array
 from vinesim.scene.model import Model
 
 

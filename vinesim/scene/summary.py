@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene import leaves
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.spec import Scene
 
 GUST_WAVES = 48

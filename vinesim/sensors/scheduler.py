@@ -13,16 +13,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.raster import lidar_raster, transform_primitives
-from vinesim.kernels.sensing import lidar_echoes
-from vinesim.physics.plants.sway import Sway
+from vinesim.kernels.lidar import lidar_echoes, lidar_raster
+from vinesim.kernels.raster import transform_primitives
 from vinesim.scene.model import Model
 from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, SensorMode, SensorPacing, Snapshot
 from vinesim.sensors.camera.camera import Camera, load_camera_kernels
+from vinesim.sensors.ground_truth import visible_bunches
 from vinesim.sensors.lidar.lidar import Lidar
 from vinesim.sensors.lidar.spinning_scan import SpinningScan
-from vinesim.sensors.scene.primitives import Primitives
-from vinesim.sensors.truth.ground_truth import visible_bunches
+from vinesim.sensors.primitives.scene_primitives import Primitives
+from vinesim.wind.sway import Sway
 
 
 def load_kernels() -> None:

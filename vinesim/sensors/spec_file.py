@@ -10,8 +10,8 @@ from typing import Literal, TypeVar
 import msgspec
 import numpy as np
 
-from vinesim.scene.data_files import find_data_file
-from vinesim.scene.toml_loader import DataError, load_toml
+from vinesim.core.data_files import find_data_file
+from vinesim.core.toml_loader import DataError, load_toml
 
 T = TypeVar("T", bound=msgspec.Struct)
 

@@ -1,6 +1,6 @@
 """Many candidates of one specimen at once: trees of one launch, each with its own stiffness, damping, mass and pull.
 
-The dynamics are those of :class:`~vinesim.physics.plants.articulation_solver.ArticulationSolver`. A run begins in the
+The dynamics are those of :class:`~vinesim.plants.articulation_solver.ArticulationSolver`. A run begins in the
 static equilibrium under a pull at the tip, found by the same solver in long steps, and lets go. A base that is shaken
 is the origin of a frame that moves without turning: in it the base rests, every body has the weight of minus the base's
 acceleration beside its own, and the air streams past.
@@ -15,8 +15,8 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from vinesim import frames
-from vinesim.physics.plants.articulation_solver import ArticulationSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.scene.builder import assemble
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.scene.state import State

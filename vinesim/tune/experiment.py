@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.tune.base_motion import Sweep
 from vinesim.tune.candidates import COLUMNS, Candidates

@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from vinesim.errors import writing
-from vinesim.scene.data_files import find_data_file
+from vinesim.core.data_files import find_data_file
+from vinesim.core.errors import writing
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.tune.features import Features
 from vinesim.tune.posterior import Z90, Posterior, Sample

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from scipy import ndimage
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.camera_geometry import back_project
 from vinesim.scene.values import CameraFrame
 from vinesim.tune.specimen import TIP

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vinesim.errors import writing
+from vinesim.core.errors import writing
 from vinesim.tune.fit import Fit
 from vinesim.tune.posterior import Z90
 

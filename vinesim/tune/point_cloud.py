@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.scene.plant_import.ply import read_points
 from vinesim.scene.plant_parameters import AXIS_LENGTH, Specimen
 
@@ -38,7 +38,7 @@ def with_cloud(specimen: Specimen, cloud: str | pathlib.Path | np.ndarray) -> Sp
         cloud: points [n, 3] m, world axes (z up), of this cane alone, the end that is clamped nearest to the origin;
             or a file of them: PLY, or text with x, y and z in a line.
 
-    :class:`~vinesim.errors.UsageError` if the points are not those of one cane of that length.
+    :class:`~vinesim.core.errors.UsageError` if the points are not those of one cane of that length.
     """
     if specimen.organ != "cane":
         raise UsageError(f"the specimen is a {specimen.organ}; only a cane takes its shape from a point cloud")
@@ -59,7 +59,7 @@ def with_cloud(specimen: Specimen, cloud: str | pathlib.Path | np.ndarray) -> Sp
 def trace_axis(points: np.ndarray, source: str = "the point cloud") -> np.ndarray:
     """The axis [k, 3] m of one cane from points [n, 3] m on or about it; it begins at the origin.
 
-    The base is the end nearest to the origin. :class:`~vinesim.errors.UsageError` if the points are not one cane.
+    The base is the end nearest to the origin. :class:`~vinesim.core.errors.UsageError` if the points are not one cane.
     """
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise UsageError(f"{source}: points have the shape {points.shape}; give [n, 3] finite numbers")

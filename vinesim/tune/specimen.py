@@ -7,8 +7,8 @@ import itertools
 import msgspec
 import numpy as np
 
-from vinesim import frames
-from vinesim.errors import UsageError
+from vinesim.core import frames
+from vinesim.core.errors import UsageError
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.ids import Organ

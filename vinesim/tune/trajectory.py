@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 
-from vinesim.errors import writing
+from vinesim.core.errors import writing
 from vinesim.tune.specimen import TIP
 
 MIN_SAMPLES = 8

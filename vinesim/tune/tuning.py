@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.tune.candidates import COLUMNS
 from vinesim.tune.features import Features, extract_features, robust_deviation
@@ -56,7 +56,7 @@ def tune(
         pushed: the track is one of a push: from rest, a steady force begins to act at ``release``.
 
     :class:`~vinesim.tune.trajectory.TrajectoryError` for a track that cannot belong to the specimen,
-    :class:`~vinesim.errors.UsageError` for other parameters. A fit that has failed is returned and says so.
+    :class:`~vinesim.core.errors.UsageError` for other parameters. A fit that has failed is returned and says so.
     """
     fitted = _columns(parameters)
     if specimen.axis and "rest" in parameters:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 import pathlib
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 
 PAGE = pathlib.Path(__file__).parent / "page"
 THREE = PAGE / "vendor" / "three.module.js"

@@ -18,7 +18,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 from aiohttp import WSMsgType, web
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.web import page_files
 from vinesim.web.https_site import HttpsSite
 from vinesim.web.page_files import PAGE

@@ -148,7 +148,7 @@ def client(
     check_role(role, {option for option in values if _is_given(ctx, option)})
     options = ClientOptions(**values)
     if role == "robot":
-        from vinesim.client.sensing.spawned_process import sensor_modules, start_early
+        from vinesim.client.processes.spawned_process import sensor_modules, start_early
 
         start_early("sensor process", sensor_modules(ros))
         from vinesim.cli.robot_client import run

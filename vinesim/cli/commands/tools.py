@@ -9,40 +9,19 @@ import typer
 
 
 def bench(
-    names: Annotated[list[str], typer.Argument(help="plants, camera, sync; several are run one after the other.")],
+    names: Annotated[list[str], typer.Argument(help="plants, camera, live; several are run one after the other.")],
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
     row: Annotated[
         list[str] | None,
-        typer.Option(help="Of live: demo, camera, lidar, tendone, start, generate, tick, link, cold; may repeat."),
+        typer.Option(help="Of live: demo, camera, lidar, tendone, start, generate, tick, cold; may repeat."),
     ] = None,
-    minutes: Annotated[
-        float | None, typer.Option(min=0.1, help="Of soak: how long it measures; 60 unless given.")
-    ] = None,
-    real_time_factor: Annotated[
-        float | None, typer.Option(min=0.01, max=1.0, help="Of soak: of its world; found unless given.")
-    ] = None,
-    plot: Annotated[
-        pathlib.Path | None, typer.Option(help="Where sync (.png) or sensors (a folder) draw what they measured.")
-    ] = None,
-    times: Annotated[int, typer.Option(help="Of kill: how many programs are killed.")] = 50,
-    seed: Annotated[int, typer.Option(help="Of kill: of the order and the moments.")] = 1,
-    messages: Annotated[int, typer.Option(help="Of fuzz: corrupted messages.")] = 100_000,
-    lies: Annotated[int, typer.Option(help="Of fuzz: series of well-formed lies (needs hypothesis).")] = 0,
 ) -> None:
-    """Measure, beside a peer that runs in the same process on the same scene.
+    """Measure vinesim on this machine, and a peer in the same process on the same scene.
 
-    What a user waits for: start. Of physics: plants, contact, tick, asleep. Of jobs: picking (every bunch in reach, in
-    simulated time). Of sensors: camera and lidar (speed),
-    sensors (what they measure, beside the truth). Of the whole: live (demo, clients and commands as users start them,
-    beside budgets). Of ROS: ros (topics of every step in another process, one subscriber stopped; actions). Of
-    browsers: page (input of a person to the state that shows it), voice (from the microphone of one browser to the
-    sound of another; needs Chromium), sound (how late alarms are seen and heard, and voices, in simulated time). Of the
-    network: sync (what delay does, in simulated time), link (real clients over emulated links;
-    needs root), traffic (bytes a client receives), load (many clients), actors (64 with bodies, equal on all), fuzz
-    (broken messages and well-formed lies), kill (programs killed at random moments, while all others go on).
-    Of fits: tune (recovery over 50 seeds, MuJoCo as the truth; beside scipy, CMA-ES, Stein particles;
-    needs scipy and cma).
-    Of a long run: soak (memory, threads and open files of robots, people and a recorder; Linux).
+    Physics: plants, contact, tick (whole steps of a client). Sensors: camera, lidar. What a user waits for: start. The
+    whole: live (demo, clients and commands as users start them, with budgets). ROS: ros (topics of every step in
+    another process, one subscriber stopped; actions; resets). Fits: tune (recovery over 50 seeds, MuJoCo as the truth,
+    compared with scipy, CMA-ES and Stein particles; needs scipy and cma).
 
     \b
     Examples:
@@ -51,15 +30,10 @@ def bench(
       vinesim bench live --json
       vinesim bench live --row demo --row camera
       vinesim bench ros --json
-      vinesim bench kill --times 12 --json
-      vinesim bench fuzz --messages 1000000 --lies 2000
-      vinesim bench sync --json --plot docs/pictures/network-sync.png
-      vinesim bench sensors --plot docs/pictures
-      vinesim bench soak --minutes 20 --real-time-factor 0.1 --json
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json, plot, row or (), minutes, real_time_factor, times, seed, messages, lies))
+    raise typer.Exit(run(names, json, row or ()))
 
 
 def doctor(

@@ -6,6 +6,6 @@ from __future__ import annotations
 def check_device(device: str) -> None:
     """Refuse a device that is not there: DeviceUnavailable. For the CPU nothing is imported, which takes a second."""
     if device != "cpu":
-        from vinesim.physics.plants.device_buffers import find_device
+        from vinesim.plants.device_buffers import find_device
 
         find_device(device)

@@ -16,7 +16,7 @@ from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, free_port, process_group
 from vinesim.client.processes.ros_listener import RosListener
-from vinesim.errors import writing
+from vinesim.core.errors import writing
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware

@@ -17,7 +17,7 @@ from vinesim.cli.demo.progress import PICKER, VISITOR
 from vinesim.client.rate_loop import TickLog
 from vinesim.client.recording import contact_force_plot
 from vinesim.client.recording.bunch_trace import Rows, remote_error
-from vinesim.errors import writing
+from vinesim.core.errors import writing
 
 SMALL_TOPICS = ("/clock", "/joint_states", "/tf")
 """Topics that every step publishes, and every ROS program needs."""

@@ -16,7 +16,7 @@ from vinesim.client.processes.child_process import START_TIMEOUT, process_group
 from vinesim.client.tasks.meet_planning import plan_meeting
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.client.tasks.task_registry import UnknownTask
-from vinesim.errors import writing
+from vinesim.core.errors import writing
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
 from vinesim.scene.generation.vineyard import generate

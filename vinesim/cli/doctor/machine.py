@@ -81,7 +81,7 @@ def gpu(driver: pathlib.Path = pathlib.Path("/proc/driver/nvidia/version")) -> F
     """NVIDIA GPUs: seen by the system, seen by Warp, and able to compute."""
     import warp as wp
 
-    from vinesim.physics.plants.device_buffers import device_fault
+    from vinesim.plants.device_buffers import device_fault
 
     count = wp.get_cuda_device_count()
     if count == 0:

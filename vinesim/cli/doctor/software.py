@@ -11,9 +11,9 @@ import sys
 import tempfile
 from collections.abc import Iterable
 
-import vinesim
-from vinesim import disk_cache
 from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding, amount, size_of
+from vinesim.core import disk_cache
+from vinesim.core.version import __version__
 
 FREE_SPACE = 1 << 30
 """[B] Compiled kernels and tables take up to this."""
@@ -37,7 +37,7 @@ def python(version: tuple[int, ...] = sys.version_info[:3]) -> Finding:
         )
     if ".".join(map(str, version)) not in SpecifierSet(wanted):
         return Finding("python", ERROR, found, f"vinesim needs {wanted}: make a venv with another Python")
-    return Finding("python", OK, f"{found}, vinesim {vinesim.__version__}, {platform.system()} {platform.release()}")
+    return Finding("python", OK, f"{found}, vinesim {__version__}, {platform.system()} {platform.release()}")
 
 
 def packages(requirements: Iterable[str] | None = None) -> Finding:

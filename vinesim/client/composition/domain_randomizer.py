@@ -17,14 +17,14 @@ from vinesim.client.composition.scene_composer import (
     RobotPlacement,
     SceneComposer,
 )
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.plants.sway import Sway
-from vinesim.physics.step import Physics
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import Snapshot
 from vinesim.scene.wind import Wind
+from vinesim.wind.sway import Sway
+from vinesim.world import Physics
 
 ROBOT_NAMES = ("vinebot", "logistic")
 FOOTPRINT_RADIUS = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}

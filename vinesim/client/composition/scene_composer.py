@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.parameters import PhysicsParameters
-from vinesim.physics.rigid.human_posture import standing_pose
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description
 from vinesim.scene import appearance
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import HumanSpec, Snapshot
-from vinesim.sensors.scene.primitives import rest_snapshot
+from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
 if TYPE_CHECKING:
-    from vinesim.physics.step import Physics
+    from vinesim.world import Physics
 
 HEAP_DENSITY = 330.0
 """Bulk density of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
@@ -99,7 +99,7 @@ class SceneComposer:
         """
         furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
-            from vinesim.physics.step import Physics  # the kernels of plants: half a second that few pictures need
+            from vinesim.world import Physics  # the kernels of plants: half a second that few pictures need
 
             return self.populate(Physics(furnished, parameters=parameters))
         rigid = RigidWorld(furnished, parameters=parameters)  # no robot picks: the plants need not move

@@ -1,1 +1,1 @@
-"""Commands as child processes, and a stock ROS node that listens to them: for demonstrations and benchmarks."""
+"""The process that renders a robot's sensors and runs its ROS node."""

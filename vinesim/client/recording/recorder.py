@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.codec.human import decode_pose
 from vinesim.net.codec.messages import Hello, MessageError

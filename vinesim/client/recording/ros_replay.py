@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.client.client import Client
-from vinesim.client.sensing.ros_process import TRUTH_ORGANS
-from vinesim.client.sensing.ros_worker import truth_frame
+from vinesim.client.processes.ros_process import TRUTH_ORGANS
+from vinesim.client.processes.ros_worker import truth_frame
+from vinesim.core import frames
 from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.ros.world_node import WorldNode
 from vinesim.scene.ids import Organ

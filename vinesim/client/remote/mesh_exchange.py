@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from vinesim import disk_cache
+from vinesim.core import disk_cache
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MeshPart, MessageError
 from vinesim.net.transport.bus import Bus

@@ -10,16 +10,16 @@ from collections.abc import Callable, Collection, Container, Iterable
 
 import numpy as np
 
+from vinesim.interaction.support_tracking import GROUND
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.authority import wins
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots
-from vinesim.physics.rigid.support_tracking import GROUND
-from vinesim.physics.step import Physics
 from vinesim.scene.ids import ObjectKind, is_tree, object_id, parse_object_name, split_object_id
 from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
+from vinesim.world import Physics
 
 BLEND_PER_STEP = 0.2
 """Share of the difference to its owner's state by which a copy is corrected in one step."""

@@ -16,10 +16,10 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.plants.ties import TieLimitError
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.plants.ties import TieLimitError
 from vinesim.scene.values import Coupling
+from vinesim.world import Physics
 
 STIFFNESS = 300.0
 """Stiffness of a coupling [N/m]; the same for all clients, since anchors are computed from it."""

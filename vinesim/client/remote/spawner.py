@@ -14,8 +14,8 @@ import numpy as np
 from vinesim.client.remote.mesh_exchange import MeshExchange
 from vinesim.client.remote.remote_human import RemoteHuman, human_spec
 from vinesim.net.codec.messages import Hello, is_valid_name
-from vinesim.physics.rigid.mujoco_world import CompiledWorld
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.rigid.mujoco_world import CompiledWorld
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description

@@ -7,12 +7,12 @@ from collections.abc import Callable, Collection, Iterable, KeysView
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.client.remote.objects import BLEND_PER_STEP, ObjectSync, touched_share
+from vinesim.core import frames
 from vinesim.net.replication import dead_reckoning
-from vinesim.physics.step import Physics
 from vinesim.scene.ids import parse_object_name
 from vinesim.scene.values import TreeUpdate
+from vinesim.world import Physics
 
 CONTACT_MEMORY = 0.15
 """A copy counts as pressed for so long after it was [s]: a contact that opens and closes is one. GUESSED."""

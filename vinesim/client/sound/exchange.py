@@ -9,19 +9,21 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, Codec
 from vinesim.audio.loudspeaker import Loudspeaker
 from vinesim.audio.permission import may_hear
+from vinesim.avatar.local_human import LocalHuman
+from vinesim.client.world_time import WorldTime
 from vinesim.net.codec.voice import VoiceFrame
+from vinesim.net.replication.replicator import Replicator
 from vinesim.net.replication.voices import ROBOT_MOUTH
 from vinesim.robot.drives.robot_instance import RobotInstance
-
-if TYPE_CHECKING:
-    from vinesim.client.client import Client
+from vinesim.world import Physics
 
 MAX_WAITING = 100
 """Frames of one actor that wait for the next step: two seconds; older ones are dropped."""
@@ -112,10 +114,33 @@ class _Speaker:
         return time
 
 
+class SoundClient(Protocol):
+    """What the exchange needs of the client whose sound it carries."""
+
+    @property
+    def post_step(self) -> list[Callable[[Any], None]]: ...
+    @property
+    def clock(self) -> Callable[[], float]: ...
+    @property
+    def physics(self) -> Physics: ...
+    @property
+    def world_time(self) -> WorldTime: ...
+    @property
+    def replicator(self) -> Replicator: ...
+    @property
+    def replicators(self) -> Mapping[str, Replicator]: ...
+    @property
+    def robots(self) -> Mapping[str, RobotInstance]: ...
+    @property
+    def humans(self) -> Mapping[str, LocalHuman]: ...
+    @property
+    def remote_actors(self) -> Mapping[str, object]: ...
+
+
 class SoundExchange:
     """See the module; one of each client."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: SoundClient) -> None:
         self._client = client
         self._listeners: list[tuple[str, Listener]] = []
         self._was_open = False

@@ -12,12 +12,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.client.client import Client, label_index
 from vinesim.client.remote.remote_human import RemoteHuman
+from vinesim.core import frames
 from vinesim.net.codec.messages import is_valid_name
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.physics.rigid.human_posture import standing_pose
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.ros.commands.types import (
     Entity,
     EntityArguments,

@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.client.tasks.path_planning import find_path
 from vinesim.client.tasks.start_poses import PlacementError, bunch_centres, ground_clearance
+from vinesim.core import frames
 from vinesim.robot.tasks.pick import PickPlan
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Spawn
 

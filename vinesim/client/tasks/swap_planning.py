@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
 from vinesim.client.tasks.path_planning import find_path
 from vinesim.client.tasks.start_poses import PlacementError, ground_clearance
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.robot.tasks.swap_boxes import SwapPlan
 from vinesim.scene.model import Model
+from vinesim.world import Physics
 
 TURNING_RADIUS = 0.92
 """[m] A carrier with a box at either end needs this distance around its centre to turn."""

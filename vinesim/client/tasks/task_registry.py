@@ -8,13 +8,13 @@ from collections.abc import Callable
 import numpy as np
 
 from vinesim.client.tasks import meet_planning, pick_planning, swap_planning
-from vinesim.physics.step import Physics
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.meet_person import MeetPerson
 from vinesim.robot.tasks.pick import PickBunch
 from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
 from vinesim.robot.tasks.task import Task
 from vinesim.scene.model import Model
+from vinesim.world import Physics
 
 TASKS = ("pick", "exchange", "meet")
 """Names of the tasks that :func:`plan_task` plans."""

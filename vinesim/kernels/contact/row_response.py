@@ -8,9 +8,9 @@ groups of ten: three rows of each are thirty columns, and eight columns are comp
 
 import warp as wp
 
-from vinesim.kernels.articulation.structs import ArticulationModel, Factors
 from vinesim.kernels.contact.islands import padded
 from vinesim.kernels.contact.structs import SideGroups
+from vinesim.kernels.plants.structs import ArticulationModel, Factors
 
 wp.set_module_options({"enable_backward": False})
 

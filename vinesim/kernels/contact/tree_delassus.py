@@ -6,13 +6,13 @@ From what the joints were factored into, in one pass outward for the tree and on
 
 import warp as wp
 
-from vinesim.kernels.articulation.spatial import cross_rows, symmetric
-from vinesim.kernels.articulation.structs import ArticulationModel, Factors
 from vinesim.kernels.contact.jacobians import row_columns
 from vinesim.kernels.contact.structs import Contacts, Rows
 from vinesim.kernels.contact.tree_narrowphase import TreeContacts
 from vinesim.kernels.contact.tree_solver import TreeSystem
 from vinesim.kernels.contact.tree_views import tree_and_entry, view_contacts, view_rows, view_system
+from vinesim.kernels.plants.spatial import cross_rows, symmetric
+from vinesim.kernels.plants.structs import ArticulationModel, Factors
 
 wp.set_module_options({"enable_backward": False})
 

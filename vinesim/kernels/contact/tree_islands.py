@@ -9,18 +9,6 @@ is read once outward for the tree, and once inward for each contact beyond it.
 
 import warp as wp
 
-from vinesim.kernels.articulation.prediction import predict_tree
-from vinesim.kernels.articulation.structs import (
-    AppliedForces,
-    ArticulationModel,
-    BodyState,
-    Factors,
-    JointState,
-    Prediction,
-    Scratch,
-    SolverParameters,
-    WrenchScratch,
-)
 from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
 from vinesim.kernels.contact.jacobians import write_rows
@@ -58,6 +46,18 @@ from vinesim.kernels.contact.tree_views import (
     view_search,
     view_system,
     view_warm_start,
+)
+from vinesim.kernels.plants.prediction import predict_tree
+from vinesim.kernels.plants.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    Factors,
+    JointState,
+    Prediction,
+    Scratch,
+    SolverParameters,
+    WrenchScratch,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -146,7 +146,7 @@ def apply_loaded_wrenches(
 ):
     """Add to the prediction of one standing tree what wrenches on its ``count`` loaded bodies, in order, do over a step.
 
-    :func:`vinesim.kernels.articulation.impulse_response.apply_tree_wrenches` with little traffic to memory: sums go on in
+    :func:`vinesim.kernels.plants.impulse_response.apply_tree_wrenches` with little traffic to memory: sums go on in
     registers from a body to the next, and through records where the tree branches.
     """
     first = model.tree_first[tree]

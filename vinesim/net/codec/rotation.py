@@ -1,7 +1,7 @@
 """Rotations as they are quantised on the wire: rotation vectors, and "smallest three" quaternions in 32 bits.
 
-Quaternions are xyzw as in :mod:`vinesim.frames`. The conversions here repeat two of its functions without their checks,
-because they run for every moving joint in every step, and their bits are part of the wire format.
+Quaternions are xyzw as in :mod:`vinesim.core.frames`. The conversions here repeat two of its functions without their
+checks, because they run for every moving joint in every step, and their bits are part of the wire format.
 
 Source of "smallest three": G. Fiedler, Snapshot Compression, Gaffer on Games 2015.
 """

@@ -21,8 +21,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import ChunkIndex
 from mcap.writer import Writer
 
-from vinesim import __version__
-from vinesim.errors import WriteError
+from vinesim.core.errors import WriteError
+from vinesim.core.version import __version__
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.recording.mcap_reader import METADATA_NAME

@@ -17,7 +17,7 @@ from typing import Any, Self
 import zenoh
 
 from vinesim.audio.permission import SpectatorsSpeakTo
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.net import pace
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError, is_valid_name
@@ -93,7 +93,7 @@ class Server:
         again when its files change. ``real_time_factor``: how many times as fast as real time its worlds run; None:
         each as fast as its clients can follow, at most 1.
 
-        Raises :class:`PortTaken`, :class:`vinesim.errors.UsageError` for an invalid endpoint or combination,
+        Raises :class:`PortTaken`, :class:`vinesim.core.errors.UsageError` for an invalid endpoint or combination,
         :class:`vinesim.net.server.journal.JournalError` and
         :class:`vinesim.net.transport.access_control.CertificateError`.
         """

@@ -15,7 +15,7 @@ import pathlib
 import socket
 from collections.abc import Sequence
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.net.codec.messages import is_valid_name
 from vinesim.net.transport.access_control import (
     CA_NAME,
@@ -63,7 +63,7 @@ def create(
     ``hosts``: for ``server``, names and addresses under which clients reach it, besides those of this machine; its
     certificate is replaced. ``authority``: folder of ``ca.key``, by default ``folder`` with ``-authority`` appended.
     Raises :class:`CertificateError` if an actor has one already, and
-    :class:`vinesim.errors.UsageError` for an impossible name or role.
+    :class:`vinesim.core.errors.UsageError` for an impossible name or role.
     """
     if _missing is not None:
         raise CryptographyMissing from _missing

@@ -11,7 +11,7 @@ import socket
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 
 PORT = 7447
 """Default port of Zenoh."""
@@ -61,7 +61,7 @@ class Endpoint(NamedTuple):
 
 
 def parse(text: str, *, secured: bool = False) -> Endpoint:
-    """``PROTOCOL/HOST:PORT``; :class:`vinesim.errors.UsageError` for anything else, or a protocol without TLS."""
+    """``PROTOCOL/HOST:PORT``; :class:`vinesim.core.errors.UsageError` for anything else, or a protocol without TLS."""
     allowed = ("tls", "quic") if secured else ("tcp", "udp")
     protocol, _, address = text.partition("/")
     host, colon, port = address.rpartition(":")
@@ -84,7 +84,7 @@ def default_listen(*, secured: bool = False, insecure: bool = False) -> tuple[st
 
 
 def check_exposure(listen: Sequence[str], *, secured: bool = False, insecure: bool = False) -> None:
-    """Raise :class:`vinesim.errors.UsageError` for a place to listen that others on the network reach unchecked."""
+    """Raise :class:`vinesim.core.errors.UsageError` if anyone on the network could join without a check."""
     for text in listen:
         endpoint = parse(text, secured=secured)
         if not (endpoint.secured or endpoint.loopback or insecure):

@@ -23,19 +23,19 @@ from typing import Self
 import zenoh
 
 from vinesim.audio.permission import SpectatorsSpeakTo
-from vinesim.errors import UsageError
+from vinesim.core.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.transport.access_control import tls_config
 from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore
 from vinesim.net.transport.endpoints import Endpoint, client_links
 from vinesim.net.transport.name_holders import NameHolders, bound_name
 from vinesim.net.transport.zenoh_admission import ServerAdmission
-from vinesim.net.transport.zenoh_entities import BusPublisher, BusSubscription
 from vinesim.net.transport.zenoh_session import (
     CONNECT_TIMEOUT,
     ServerUnreachable,
     called_directly,
     close_session,
+    has_match,
     open_client,
     watch_certificates,
 )
@@ -86,7 +86,7 @@ class ZenohBus:
         actor's ``NAME.pem`` and ``NAME.key``; the endpoint is then ``tls/`` or ``quic/``.
 
         Raises :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the name is live,
-        and :class:`vinesim.errors.UsageError` if the name or the world cannot be part of a key or the endpoint is
+        and :class:`vinesim.core.errors.UsageError` if the name or the world cannot be part of a key or the endpoint is
         invalid.
         """
         for what, text in (("actor name", name), ("world", world)):
@@ -488,3 +488,104 @@ def _token(key: zenoh.KeyExpr) -> tuple[str, str]:
     """Name and session of a liveliness token."""
     name, session = str(key).split("/")[-2:]
     return name, session
+
+
+# Publishers and subscriptions of a bus, which move between its sessions.
+#
+# The real-time loop publishes, and the bus's thread moves entities to another session at any time: what fails in
+# between is counted and declared again.
+
+
+class BusPublisher:
+    """See :class:`vinesim.net.transport.bus.Publisher`. What the network refuses is counted, never raised."""
+
+    def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Publisher], reliable: bool) -> None:
+        self._bus, self._declare, self._reliable = bus, declare, reliable
+        self._publisher: zenoh.Publisher | None = None
+        self._is_closed = self._is_renewing = False
+        if not reliable:
+            bus.unreliable.add(self)
+        session = bus.session_for(reliable)
+        try:
+            self._publisher = declare(session)
+        except zenoh.ZError as error:
+            self._fail(error)
+        if bus.session_for(reliable) is not session:  # poses have moved meanwhile
+            self._renew_soon()
+
+    @property
+    def matching(self) -> bool:
+        publisher = self._publisher
+        try:
+            return publisher is not None and has_match(publisher)
+        except zenoh.ZError as error:
+            self._fail(error)
+            return False
+
+    def put(self, payload: bytes) -> bool:
+        publisher = self._publisher
+        if publisher is None or not self.matching:
+            return False
+        if self._reliable:
+            if not self._bus.submit_put(lambda: publisher.put(payload, source_info=self._bus.source), len(payload)):
+                return False
+        else:
+            try:
+                publisher.put(payload, source_info=self._bus.source)
+            except zenoh.ZError as error:
+                self._fail(error)
+                return False
+        self._bus.bytes_out += len(payload)
+        return True
+
+    def move_to(self, session: zenoh.Session) -> None:
+        """Publish over another session from now on."""
+        before, self._publisher = self._publisher, self._declare(session)
+        _undeclare(before)
+
+    def close(self) -> None:
+        self._is_closed = True
+        self._bus.unreliable.discard(self)
+        self._bus.submit(lambda: _undeclare(self._publisher))
+
+    def _fail(self, error: zenoh.ZError) -> None:
+        self._bus.count_failure(error)
+        self._renew_soon()
+
+    def _renew_soon(self) -> None:
+        """Let the bus's thread declare the publisher again, over the session of now."""
+        if not self._is_renewing:
+            self._is_renewing = True
+            self._bus.submit(self._renew)
+
+    def _renew(self) -> None:
+        self._is_renewing = False
+        if not self._is_closed:
+            self.move_to(self._bus.session_for(self._reliable))
+
+
+class BusSubscription:
+    """See :class:`vinesim.net.transport.bus.Subscription`."""
+
+    def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Subscriber], reliable: bool) -> None:
+        self._bus, self._declare = bus, declare
+        self._declared: zenoh.Subscriber | None = None
+        if not reliable:
+            bus.unreliable.add(self)
+        bus.submit(lambda: self.move_to(bus.session_for(reliable)))
+
+    def move_to(self, session: zenoh.Session) -> None:
+        """Subscribe over another session from now on."""
+        before, self._declared = self._declared, self._declare(session)
+        _undeclare(before)
+
+    def close(self) -> None:
+        self._bus.unreliable.discard(self)
+        self._bus.submit(lambda: _undeclare(self._declared))
+
+
+def _undeclare(entity: zenoh.Publisher | zenoh.Subscriber | None) -> None:
+    """Undeclare; that of a closed session is gone already."""
+    if entity is not None:
+        with contextlib.suppress(zenoh.ZError):
+            entity.undeclare()

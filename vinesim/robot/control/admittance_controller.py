@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.values import RobotSample

@@ -20,10 +20,10 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from vinesim import frames
-from vinesim.kernels import inverse_kinematics
+from vinesim.core import frames
+from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.launch import bind_launch
-from vinesim.physics.contact.warp_arrays import SharedArrays, share
+from vinesim.kernels.robot import inverse_kinematics
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import clip
@@ -209,7 +209,7 @@ class InverseKinematics:
     """Joint rates of one arm that fulfil tasks in order of priority, within bounds; one compiled call.
 
     A task uses only the null space of those before it (Siciliano and Slotine 1991). See
-    :mod:`vinesim.kernels.inverse_kinematics`.
+    :mod:`vinesim.kernels.robot.inverse_kinematics`.
     """
 
     def __init__(self, joint_weights: np.ndarray, task_rows: Sequence[int]) -> None:

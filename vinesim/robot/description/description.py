@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.robot.description.kinematics import MovingJoints
 from vinesim.robot.description.sidecar import BaseLimits, CameraMount, Cutter, JointGroup, SensorMount
 from vinesim.scene.values import ControllerSpec, Drive, RobotSpec, SensorPacing

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.kinematics import joint_limits
 from vinesim.robot.description.repairs import some_names

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.robot.description.urdf_model import Joint, Robot
 from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
 

@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
+from vinesim.core import data_files
 from vinesim.robot.description.controllers import command_interfaces, make_controllers
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
@@ -47,7 +48,6 @@ from vinesim.robot.description.urdf_reader import (
     read_xml,
     set_friction,
 )
-from vinesim.scene import data_files
 from vinesim.scene.values import SensorPacing
 
 log = logging.getLogger(__name__)

@@ -16,10 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.plants.detachment import Blade
-from vinesim.physics.rigid.rigid_world import RigidWorld
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.interaction.detachment import Blade
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.commands import CommandError, CommandInterface
 from vinesim.robot.drives.joint_servos import JointServos
@@ -27,6 +26,7 @@ from vinesim.robot.drives.proprioception import BodySensors, elastic_sample
 from vinesim.robot.drives.robot_instance import RobotInstance
 from vinesim.scene.values import Contact, LightPattern, Lights, RobotSample, RobotUpdate
 from vinesim.scene.values.signals import USUAL_COLOR
+from vinesim.world import Physics
 
 Values = Sequence[float] | np.ndarray
 Joints = Sequence[str] | np.ndarray | None

@@ -15,10 +15,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
-from vinesim.kernels import joint_servos
+from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.launch import bind_launch
-from vinesim.physics.contact.warp_arrays import SharedArrays, share
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.kernels.rigid import joint_servos
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.drives.commands import CommandInterface
 from vinesim.scene.values import Drive
 

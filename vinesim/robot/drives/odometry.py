@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 
 LEAST_VARIANCE = 1e-6
 """[m2, rad2, m2/s2, rad2/s2] Added to every variance, so that filters can invert covariances. GUESSED: of encoders that

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.sidecar import SensorMount
 from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, Wrench

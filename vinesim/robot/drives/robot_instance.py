@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.rigid.rigid_world import RigidWorld
+from vinesim.core import frames
+from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.odometry import TrackOdometry
 from vinesim.scene.values import Contact, JointSample, Lights, RobotSample

@@ -10,12 +10,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.step import Physics
+from vinesim.core import frames
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed
+from vinesim.world import Physics
 
 LIFT_HEIGHT = 0.15
 """[m] Height above the ground at which boxes are carried. GUESSED"""

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.physics.step import Physics
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.box_handling import LIFT_HEIGHT, BoxHandling
 from vinesim.robot.tasks.task import TaskFailed
+from vinesim.world import Physics
 
 REST_TIME = 1.0
 """[s] For which a bunch must lie in the box. GUESSED"""

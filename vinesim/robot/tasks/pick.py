@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.physics.rigid.static_world import CRATE_WALL
-from vinesim.physics.step import Physics
+from vinesim.core import frames
+from vinesim.rigid.static_world import CRATE_WALL
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose
 from vinesim.robot.control.waypoint_follower import WaypointFollower
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.task import Task, TaskFailed
+from vinesim.world import Physics
 
 STALK_LENGTH = 0.012
 """[m] Length of the stalk that stays on the bunch."""

@@ -17,7 +17,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.robot.control.cartesian_controller import CartesianController
 from vinesim.robot.drives.controlled_robot import Robot
 

@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from vinesim.physics.step import Physics
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.box_handling import CLAMP_TIME, LIFT_HEIGHT, BoxHandling
 from vinesim.robot.tasks.task import TaskFailed
+from vinesim.world import Physics
 
 RELEASE_HEIGHT = 0.004
 """[m] Height above the ground at which a box is released: it stands on the ground, however the clamp sags."""

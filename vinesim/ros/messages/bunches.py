@@ -21,7 +21,7 @@ from vision_msgs.msg import (
     VisionClass,
 )
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.ros.messages import convert
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import Box, BunchTruth, CameraFrame

@@ -11,7 +11,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.ros.topic import TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values.signals import UNLIT, Color
 

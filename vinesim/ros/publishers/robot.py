@@ -11,7 +11,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.ros.messages.serialized import joint_state_writer, odometry_writer
 from vinesim.ros.messages.transforms import SerializedTransforms
 from vinesim.ros.topic import EVERY_STEP, TRANSIENT_LOCAL, Advertise, PendingMessage

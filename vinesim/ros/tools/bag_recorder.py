@@ -21,7 +21,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-from vinesim.errors import writing
+from vinesim.core.errors import writing
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 from vinesim.ros.messages.definitions import UnknownTypeError, message_definition
@@ -43,7 +43,7 @@ class BagRecorder:
     def __init__(self, path: pathlib.Path, topics: Sequence[str] = ()) -> None:
         """``topics``: names or regular expressions that match a whole name; all topics unless given.
 
-        :class:`vinesim.errors.WriteError` if the file cannot be written.
+        :class:`vinesim.core.errors.WriteError` if the file cannot be written.
         """
         middleware.configure()
         message_packages.ensure_importable(message_packages.available_packages())

@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from vinesim import allocator
+from vinesim.core import allocator
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 

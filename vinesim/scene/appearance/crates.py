@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vinesim import frames
+from vinesim.core import frames
+from vinesim.core.data_files import find_data_file
+from vinesim.core.toml_loader import load_toml
 from vinesim.scene.appearance.shapes import AppearanceError, Paint, Table, surface_fields
-from vinesim.scene.data_files import find_data_file
-from vinesim.scene.toml_loader import load_toml
 from vinesim.scene.values import Shape
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.appearance.shapes import Paint, ShapeSpec, rod_shape, surface_fields
 from vinesim.scene.values import Mesh, Shape
 

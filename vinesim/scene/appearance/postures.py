@@ -7,10 +7,10 @@ import functools
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
+from vinesim.core.data_files import find_data_file
+from vinesim.core.toml_loader import load_toml
 from vinesim.scene.appearance.shapes import AppearanceError, Point, Table
-from vinesim.scene.data_files import find_data_file
-from vinesim.scene.toml_loader import load_toml
 from vinesim.scene.values import HumanPose
 
 

@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vinesim import frames
-from vinesim.scene.toml_loader import DataError
+from vinesim.core import frames
+from vinesim.core.toml_loader import DataError
 from vinesim.scene.values import Shape
 
 SURFACES = ("paint", "plastic", "cloth", "skin", "rubber", "metal", "straw", "reflex", "glass", "lamp")

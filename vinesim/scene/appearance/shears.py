@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
+from vinesim.core.data_files import find_data_file
+from vinesim.core.toml_loader import load_toml
 from vinesim.scene.appearance.lofts import build_shapes
 from vinesim.scene.appearance.shapes import AppearanceError, Paint, Point, ShapeSpec, Table, check_spec
-from vinesim.scene.data_files import find_data_file
-from vinesim.scene.toml_loader import load_toml
 from vinesim.scene.values import Shape
 
 SHEARS_PARTS = ("shears_blade", "shears_hook")

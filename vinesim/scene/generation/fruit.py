@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.scene import berries, portable_math
+from vinesim.core import frames, portable_math
+from vinesim.scene import berries
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.shoot_slots import AXIS_SEGMENTS, MAX_BUNCHES, PEDUNCLE_SEGMENTS
 from vinesim.scene.plant_parameters import Range, VineParameters

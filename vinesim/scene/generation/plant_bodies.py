@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.scene import builder, portable_math
+from vinesim.core import frames, portable_math
+from vinesim.scene import builder
 from vinesim.scene.generation.shoot_slots import (
     AXIS_SEGMENTS,
     CORE_SLOTS,

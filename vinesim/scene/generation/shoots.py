@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from vinesim import frames
-from vinesim.scene import builder, portable_math
+from vinesim.core import frames, portable_math
+from vinesim.scene import builder
 from vinesim.scene.generation.fixed_structure import FixedStructure
 from vinesim.scene.generation.fruit import choose_bunches, sample_fruit
 from vinesim.scene.generation.shoot_slots import (

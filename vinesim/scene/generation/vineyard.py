@@ -14,8 +14,8 @@ import pathlib
 import msgspec
 import numpy as np
 
-from vinesim import array_fields, disk_cache, frames
-from vinesim.scene import berries, builder, leaves, plant_parameters, portable_math
+from vinesim.core import array_fields, disk_cache, frames, portable_math
+from vinesim.scene import berries, builder, leaves, plant_parameters
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
 from vinesim.scene.generation.foliage import place_leaves
 from vinesim.scene.generation.plant_bodies import Bodies, build_bodies
@@ -33,10 +33,11 @@ from vinesim.scene.spec import Scene, Sun, Wind
 
 
 def generate(scene: Scene) -> Model:
-    """The model of a scene, from :mod:`vinesim.disk_cache` if it is there; the same scene gives the same bits on every
-    machine.
+    """The model of a scene, from :mod:`vinesim.core.disk_cache` if it is there.
 
-    Raises :class:`~vinesim.scene.toml_loader.DataError` if its plant parameters cannot be read.
+    The same scene gives the same bits on every machine.
+
+    Raises :class:`~vinesim.core.toml_loader.DataError` if its plant parameters cannot be read.
     """
     parameters = plant_parameters.load_plant(scene.plants)
 
@@ -62,7 +63,7 @@ def generate_uncached(scene: Scene) -> Model:
 def _code_digest() -> str:
     """Of the code that generates models, and of the varieties of grapes."""
     package = pathlib.Path(builder.__file__).parent
-    others = pathlib.Path(frames.__file__), pathlib.Path(array_fields.__file__)
+    others = [pathlib.Path(str(module.__file__)) for module in (frames, array_fields, portable_math)]
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))
 
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.builder import TreeBuilder
 from vinesim.scene.leaf_growth import LATERAL_AREA, LeafNodes, add_point_masses, grow_leaves
 from vinesim.scene.leaves import SHAPE_COUNT, blade_area

@@ -14,14 +14,14 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from vinesim.errors import UsageError, writing
+from vinesim.core.errors import UsageError, writing
+from vinesim.core.toml_loader import load_toml
 from vinesim.scene import plant_parameters
 from vinesim.scene.plant_import.helios import read_cylinders, read_helios_xml
 from vinesim.scene.plant_import.mtg import read_mtg
 from vinesim.scene.plant_import.ply import read_ply
 from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, check_skeleton
 from vinesim.scene.plant_parameters import Number
-from vinesim.scene.toml_loader import load_toml
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Units of length that a plant file may have [m]."""
@@ -71,7 +71,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return Skeleton(table[:, 1:4], table[:, 0].astype(int), table[:, 4], bunch, self.source, self.notes)
 
     def write(self, path: str | pathlib.Path) -> None:
-        """Write the plant as a TOML file; :class:`~vinesim.errors.WriteError` if that fails."""
+        """Write the plant as a TOML file; :class:`~vinesim.core.errors.WriteError` if that fails."""
         lines = [
             f"source = {json.dumps(self.source, ensure_ascii=False)}", f'shape = "{self.shape}"',
             f"piece = {self.piece!r} # m, length of a rigid body",

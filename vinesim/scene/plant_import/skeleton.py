@@ -7,7 +7,7 @@ import pathlib
 
 import numpy as np
 
-from vinesim.scene.toml_loader import DataError
+from vinesim.core.toml_loader import DataError
 
 MAX_NODES = 20_000
 """Largest number of points of one plant."""

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.plant_parameters import Trellis

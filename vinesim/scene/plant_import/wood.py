@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene import berries, builder
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.ids import Organ

@@ -1,6 +1,6 @@
 """Values that packages exchange: small frozen dataclasses, so that sibling packages never import each other.
 
-Times are simulation seconds. Arrays are numpy, poses and velocities as in :mod:`vinesim.frames`.
+Times are simulation seconds. Arrays are numpy, poses and velocities as in :mod:`vinesim.core.frames`.
 A value that leaves the physics thread owns its arrays: they are never written afterwards.
 """
 

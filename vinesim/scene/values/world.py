@@ -27,7 +27,7 @@ class WindState:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SegmentPoses:
-    """Where segments of wires are that are away from where they were drawn, see :mod:`vinesim.scene.wire_segments`."""
+    """Where segments of wires are that are away from where they were drawn, see :mod:`vinesim.wires.wire_segments`."""
 
     segment: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
     """[k] Their numbers, ascending."""
@@ -54,7 +54,7 @@ class Snapshot:
     """Indices of the trees that are awake [k]: only these have moved since they fell asleep."""
     wind: WindState | None = None
     """None: the air is calm. Else ``body_q`` lacks the sway of trees on which wind is not simulated; see
-    :mod:`vinesim.physics.plants.sway`."""
+    :mod:`vinesim.wind.sway`."""
     wires: SegmentPoses = dataclasses.field(default_factory=SegmentPoses)
     """All other segments of wires are where they were drawn."""
 

@@ -15,13 +15,13 @@ import msgspec
 import numpy as np
 import warp as wp
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster.pinhole import Pinhole
-from vinesim.kernels.sensing import stereo_rows
 from vinesim.kernels.shading import deferred, light_plants, light_points, shadow_maps, tone_rows
 from vinesim.kernels.shading.shadow_maps import ShadowMap
+from vinesim.kernels.stereo import stereo_rows
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput
 from vinesim.sensors import spec_file
@@ -30,9 +30,9 @@ from vinesim.sensors.camera.live_light import LiveLight
 from vinesim.sensors.camera.live_light import shadow_maps as shadow_maps_of
 from vinesim.sensors.camera.stereo import Stereo, StereoSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN, Sunlight, SunPath
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole, supersampled
 from vinesim.sensors.raster.lens_map import LensError, LensMap, lens_map
-from vinesim.sensors.scene.primitives import Primitives
 
 
 class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -10,8 +10,8 @@ import warp as wp
 
 from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.shading import deferred, tone_rows
-from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives import textures
+from vinesim.sensors.primitives.scene_primitives import Primitives
 
 NOON_EXPOSURE = 0.75
 """Exposure that suits a sunny noon."""

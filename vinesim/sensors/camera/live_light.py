@@ -13,8 +13,8 @@ from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.shading import light_plants, light_points
 from vinesim.kernels.shading.deferred import Light
 from vinesim.kernels.shading.shadow_maps import ShadowMap
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.raster.camera_rasterizer import BANDS_PER_THREAD, CameraRasterizer
-from vinesim.sensors.scene.primitives import Primitives
 
 _ROWS = 4
 """Rows of blocks of 2 x 2 pixels whose points make one list: long enough to fill batches, short enough for caches."""

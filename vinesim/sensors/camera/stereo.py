@@ -19,7 +19,7 @@ import warp as wp
 
 from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.raster.pinhole import NEAR_DEPTH, Pinhole
-from vinesim.kernels.sensing import stereo_depth, stereo_input, stereo_rows
+from vinesim.kernels.stereo import stereo_depth, stereo_input, stereo_rows
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import CameraInfo
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer

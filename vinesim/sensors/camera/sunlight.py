@@ -15,8 +15,8 @@ import warp as wp
 
 from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.shading import deferred, shadow_maps
-from vinesim.sensors.scene import textures
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives import textures
+from vinesim.sensors.primitives.scene_primitives import Primitives
 
 DEFAULT_SUN = (-0.41, -0.52, 0.75)
 """Towards the sun: south-west, half-way up."""

@@ -13,7 +13,7 @@ from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import distortion_model, intrinsic_matrix
 from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
 from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
-from vinesim.sensors.truth.ground_truth import PixelBuffers
+from vinesim.sensors.ground_truth import PixelBuffers
 
 _EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
 """Fields of a bunch in annotations beside those of COCO."""

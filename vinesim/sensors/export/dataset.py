@@ -17,9 +17,9 @@ from typing import Any, Protocol
 import msgspec
 import numpy as np
 
-import vinesim
-from vinesim import frames
-from vinesim.errors import WriteError
+from vinesim.core import frames
+from vinesim.core.errors import WriteError
+from vinesim.core.version import __version__
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.generation.vineyard import generate_uncached
@@ -27,15 +27,15 @@ from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Season, sun_direction
 from vinesim.scene.values import CameraInfo, Snapshot
+from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
 from vinesim.sensors.export import images as picture
 from vinesim.sensors.export.files import remove_partial_files, write_files
-from vinesim.sensors.scene.bunch_primitives import Ripeness
-from vinesim.sensors.scene.primitives import Primitives, rest_snapshot
-from vinesim.sensors.scene.ray_caster import RayCaster, enclosing_primitive
+from vinesim.sensors.primitives.bunch_primitives import Ripeness
+from vinesim.sensors.primitives.ray_caster import RayCaster, enclosing_primitive
+from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.spec_file import SensorError
-from vinesim.sensors.truth import ground_truth
 
 IMAGES_PER_VINEYARD = 5
 """Images of one vineyard before the next one is generated."""
@@ -117,7 +117,7 @@ class DatasetPlan:
         """All that decides what the images show, as JSON."""
         info = resized_intrinsics(CameraSpec.load(self.camera), self.size)
         return {
-            "vinesim": vinesim.__version__,
+            "vinesim": __version__,
             "scene": msgspec.to_builtins(self.scene),
             "seed": self.seed,
             "camera": self.camera,

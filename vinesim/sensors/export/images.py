@@ -7,7 +7,7 @@ import pathlib
 import cv2
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.camera_geometry import depth_millimetres
 from vinesim.scene.ids import LABEL_STRIDE, Organ
 from vinesim.scene.model import Model
@@ -15,7 +15,7 @@ from vinesim.scene.values import CameraFrame, CameraInfo, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN
 from vinesim.sensors.export.files import write_files
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 def look_at(eye: np.ndarray, at: np.ndarray) -> np.ndarray:

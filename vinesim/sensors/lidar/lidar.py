@@ -18,15 +18,15 @@ import msgspec
 import numpy as np
 import warp as wp
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
-from vinesim.kernels.sensing import lidar_echoes
+from vinesim.kernels.lidar import lidar_echoes
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.plant_parameters import Number
 from vinesim.scene.values import LevelLaser, LidarScan
 from vinesim.sensors import spec_file
 from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.spec_file import Numbers
 
 MAX_RAYS = 8

@@ -2,7 +2,7 @@
 
 Rows are rays of one elevation, columns follow each other in even steps of azimuth; each row has an azimuth of its own
 to start from, as lasers that fire in turn have, or the sub-rays of one beam. The oracle is
-:class:`~vinesim.sensors.scene.ray_caster.RayCaster`.
+:class:`~vinesim.sensors.primitives.ray_caster.RayCaster`.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from vinesim import frames
-from vinesim.kernels.raster import lidar_raster
+from vinesim.core import frames
+from vinesim.kernels.lidar import lidar_raster
+from vinesim.kernels.lidar.lidar_bounds import ELEVATION_SLOTS, LidarHead
 from vinesim.kernels.raster import primitives as shapes
-from vinesim.kernels.raster.lidar_bounds import ELEVATION_SLOTS, LidarHead
 from vinesim.kernels.raster.pinhole import EMPTY_KEY
+from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
-from vinesim.sensors.scene.primitives import Primitives
 
 
 def _as_floats(vectors: wp.array) -> wp.array:

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.scene.values import LidarScan
 from vinesim.sensors.lidar.lidar import Lidar
-from vinesim.sensors.scene.primitives import Primitives
+from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 class PoseHistory:

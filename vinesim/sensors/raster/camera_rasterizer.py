@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
-from vinesim import frames
+from vinesim.core import frames
 from vinesim.kernels.launch import ThreadPool
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster import primitives as shapes

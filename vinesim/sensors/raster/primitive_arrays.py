@@ -35,7 +35,7 @@ KINDS = {
 
 
 class PosedPrimitives(Protocol):
-    """Primitives posed in the world (:class:`vinesim.sensors.scene.primitives.Primitives`)."""
+    """Primitives posed in the world (:class:`vinesim.sensors.primitives.scene_primitives.Primitives`)."""
 
     device: str
     shapes: primitives.Shapes

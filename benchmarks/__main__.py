@@ -1,0 +1,139 @@
+"""``python -m benchmarks NAME``: one measurement a line, as ``vinesim bench`` prints them."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import pathlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from vinesim.cli.bench import print_measurement
+from vinesim.core.errors import UsageError
+from vinesim.scene.values import Measurement
+
+
+def _announce(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _call(path: str) -> Callable[..., Iterator[Measurement]]:
+    """The function at ``module:name``, loaded when its benchmark runs."""
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(f"benchmarks.{module}"), name)
+
+
+def _asleep() -> Iterator[Measurement]:
+    from vinesim.robot.description.loader import load_description
+
+    return _call("vineyard:sleeping_measurements")(load_description("vinebot").to_spec("robot"))
+
+
+def _kill(times: int, seed: int) -> Iterator[Measurement]:
+    if times < 1:
+        raise UsageError(f"--times is {times}: give 1 or more")
+    if seed < 0:
+        raise UsageError(f"--seed is {seed}: give 0 or more")
+    return _call("kill:kill")(times, seed, _announce)
+
+
+def _fuzz(messages: int, lies: int) -> Iterator[Measurement]:
+    for option, value in (("messages", messages), ("lies", lies)):
+        if value < 0:
+            raise UsageError(f"--{option} is {value}: give 0 or more")
+    return _call("message_fuzz:fuzz")(messages, lies)
+
+
+def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measurement]:
+    if minutes <= 0.0:
+        raise UsageError(f"--minutes is {minutes:g}: give more than 0")
+    if real_time_factor is not None and not 0.01 <= real_time_factor <= 1.0:
+        raise UsageError(f"--real-time-factor is {real_time_factor:g}: give 0.01 to 1")
+    return _call("soak:soak")(minutes, real_time_factor, _announce)
+
+
+def _later(path: str) -> Callable[..., Iterator[Measurement]]:
+    return lambda **options: _call(path)(**options)
+
+
+BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str, dict[str, Any]]]] = {
+    "asleep": (_asleep, "a step of a vineyard of ten thousand bunches, of which twenty trees are awake", {}),
+    "picking": (_later("picking:picking"), "pick every bunch within reach, in simulated time", {}),
+    "sensors": (
+        _later("sensor_accuracy:sensors"),
+        "what modelled sensors measure, compared with the truth",
+        {"plot": {"type": pathlib.Path, "help": "folder for the plots"}},
+    ),
+    "sync": (
+        _later("replication_delay:sync"),
+        "what network delay does, in simulated time",
+        {"plot": {"type": pathlib.Path, "help": "PNG file to draw"}},
+    ),
+    "traffic": (_later("traffic:traffic"), "bytes that a client of a full vineyard receives and sends", {}),
+    "load": (_later("router_load:load"), "many clients on one router, and on two linked routers", {}),
+    "actors": (_later("many_actors:actors"), "64 robots and people with bodies, equal on all clients", {}),
+    "link": (_later("touch_latency:link"), "real clients over emulated links; needs root", {}),
+    "sound": (_later("sound_delay:sound"), "delay of alarms and voices, in simulated time", {}),
+    "page": (_later("page_latency:page"), "delay from an input of a person to the state that shows it", {}),
+    "voice": (_later("voice_delay:voice"), "delay from the microphone of one browser to the sound of another", {}),
+    "fuzz": (
+        _fuzz,
+        "broken messages, and well-formed false ones",
+        {
+            "messages": {"type": int, "default": 100_000, "help": "number of corrupted messages"},
+            "lies": {"type": int, "default": 0, "help": "number of series of false messages (needs hypothesis)"},
+        },
+    ),
+    "kill": (
+        _kill,
+        "kill programs at random moments, while all others must go on",
+        {
+            "times": {"type": int, "default": 50, "help": "number of programs that are killed"},
+            "seed": {"type": int, "default": 1, "help": "seed of the order and the moments"},
+        },
+    ),
+    "soak": (
+        _soak,
+        "memory, threads and open files in a long run (Linux)",
+        {
+            "minutes": {"type": float, "default": 60.0, "help": "measured time"},
+            "real-time-factor": {"type": float, "help": "of the world; as fast as all can follow unless given"},
+        },
+    ),
+}
+"""Function, description and options of each benchmark."""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
+    commands = parser.add_subparsers(dest="name", required=True, metavar="NAME")
+    for name, (_, text, options) in BENCHMARKS.items():
+        command = commands.add_parser(name, help=text, description=text)
+        command.add_argument("--json", action="store_true", help="print one JSON object a line")
+        for option, settings in options.items():
+            command.add_argument(f"--{option}", **settings)
+    return parser
+
+
+def main(words: list[str] | None = None) -> int:
+    """Run one benchmark and print its measurements as they come; the exit code."""
+    options = vars(_parser().parse_args(words))
+    measure, _, _ = BENCHMARKS[options.pop("name")]
+    as_json = options.pop("json")
+    try:
+        for one in measure(**options):
+            print_measurement(one, as_json)
+    except UsageError as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets them
+    os.environ.setdefault("MUJOCO_GL", "disable")
+    sys.exit(main())

@@ -1,0 +1,272 @@
+"""``python -m benchmarks actors``: 64 robots and people with bodies in one world, compared on all clients at the end.
+
+Each actor is a client of its own with the whole physics, and a copy of every other actor in it. All stand in one
+window of cells, in rows 1.2 m apart, each with a bunch above it and a box before it. Each picks its bunch, which falls
+to the ground, and pushes its box: robots with their base, people with their shins. When all is at rest, the retained
+objects and their owners are compared between all clients. The bus is in memory, the clock simulated: the figures do not
+depend on the machine.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from vinesim.client.client import Client, label_index
+from vinesim.core import frames
+from vinesim.net.codec import messages
+from vinesim.net.replication.retained import RetainedState
+from vinesim.net.transport.bus import KEEP_ALL
+from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.rigid.human_posture import standing_pose
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.loader import load_description
+from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
+from vinesim.scene.ids import ObjectKind, object_id
+from vinesim.scene.model import Model
+from vinesim.scene.spec import load_scene
+from vinesim.scene.values import HumanPose, HumanSpec, Measurement
+
+ACTORS = 64
+APART = 1.2
+"""Distance between neighbours [m]."""
+DELAY, JITTER, LOSS = 0.02, 0.004, 0.01
+"""Of the network: one way [s], [s], and the share of messages that is lost."""
+PUSH = 0.15
+"""Distance by which each pushes its box [m]."""
+PUSH_TIME = 1.0
+"""Duration of a push [s]."""
+DT = 0.01
+HEIGHT = 1.75
+"""Of people [m]."""
+CLIENTS = 2
+"""Of the command: each simulates half of the actors, and has copies of the others."""
+MEETING_LIMIT, REST_LIMIT = 10.0, 20.0
+"""Limits of simulated time [s]: until each has bodies of all others, and until all is at rest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Agreement:
+    """How far the clients agree when all is at rest."""
+
+    bodies: int
+    """Actors that have a body on a client, the fewest of all clients."""
+    objects: int
+    """Bunches and boxes that were moved and rest by a record, which is the same on all clients to the bit."""
+    owned: int
+    """Objects that a client still holds for owned by an actor."""
+    position: float
+    """[m] Largest difference of the position of an object's body between two clients: each settles on its
+    own, beside copies of the actors that lean on it."""
+    angle: float
+    """[rad] Largest difference of its rotation."""
+    tick: float
+    """[s] Processor time of one tick of one client, mean."""
+    faults: dict[str, int]
+    """Faults of all clients together, by name."""
+
+
+def _place(number: int, count: int) -> np.ndarray:
+    """Position [2] m of an actor."""
+    row = math.ceil(math.sqrt(count))
+    return APART * np.array([number % row, number // row], float)
+
+
+def yard(count: int) -> Model:
+    """A short cane with a bunch 0.35 m beside each of ``count`` places, and a box before each."""
+    trees, boxes = [], []
+    for number in range(count):
+        x, y = _place(number, count)
+        tree = TreeBuilder(frames.pose(np.array([x - 0.2, y + 0.6, 1.6])))
+        tip = tree.add_rod(-1, 0.3, (0.006, 0.004), RodMaterial(2e9, 900.0), 3)[-1]
+        tree.add_bunch(tip, 0.4, clusters=False)
+        trees.append(tree)
+        boxes.append(frames.pose([x + 0.55, y, 0.001]))
+    return assemble(
+        trees, box_pose=np.array(boxes), box_size=np.tile([0.2, 0.3, 0.2], (count, 1)), box_mass=np.full(count, 1.0)
+    )
+
+
+class Crowd:
+    """Clients on one bus in memory, with a server of retained records; every second actor is a person."""
+
+    def __init__(self, count: int, robot: RobotDescription, clients: int | None = None) -> None:
+        """``count`` actors that so many ``clients`` share; None: each has a client of its own."""
+        self.count, self.now, self.model = count, 100.0, yard(count)
+        self.hub = MemoryHub(delay=DELAY, jitter=JITTER, loss=LOSS, seed=1)
+        self._records = RetainedState()
+        self._server = self.hub.bus("server")
+        self._server.subscribe("fact/**", KEEP_ALL)
+        for x in range(-3, 6):
+            for y in range(-3, 6):
+                self._server.declare_queryable(f"snap/{x}/{y}", functools.partial(self._reply, (x, y)))
+        scene = load_scene("demo")
+        self._pushing_since = math.inf
+        self.clients: list[Client] = []
+        for number in range(count):
+            x, y = _place(number, count)
+            person = number % 2 == 1
+            name, pose = f"{'person' if person else 'robot'}{number}", frames.pose([x, y, 0.0])
+            source, bus = self._walk(x, y), self.hub.bus(name)
+            if clients is None or number < clients:
+                client = Client(
+                    scene, self.model, None if person else robot, bus, name=name, pose=pose,
+                    source=source if person else None, clock=lambda: self.now,
+                )  # fmt: skip
+                client.physics.wind = None
+                self.clients.append(client)
+                continue
+            client = self.clients[number % clients]
+            if person:
+                client.add_human(HumanSpec(name, label_index(name), standing_pose(pose, HEIGHT), HEIGHT), source, bus)
+            else:
+                client.add_robot(robot, name, pose, bus)
+        self.ticks, self.busy = 0, 0.0
+
+    def _reply(self, cell: tuple[int, int], _: bytes) -> bytes:
+        return messages.encode_records(self._records.in_cell(cell))
+
+    def _walk(self, x: float, y: float) -> Callable[[float], HumanPose]:
+        """The pose of a person who walks against its box and stops."""
+
+        def source(_: float) -> HumanPose:
+            share = min(max((self.now - self._pushing_since) / PUSH_TIME, 0.0), 1.0)
+            return standing_pose(frames.pose([x + (0.25 + PUSH) * share, y, 0.0]), HEIGHT)
+
+        return source
+
+    def tick(self) -> None:
+        """One step of all clients and of the server."""
+        start = time.thread_time()
+        for client in self.clients:
+            client.tick()
+        self.busy, self.ticks = self.busy + time.thread_time() - start, self.ticks + 1
+        for key, payload in self._server.poll():
+            _, x, y, _ = key.split("/")
+            for record in messages.decode_records(payload):
+                self._records.merge((int(x), int(y)), record)
+        self.hub.advance(DT)
+        self.now += DT
+
+    def until(self, condition: Callable[[], bool], limit: float) -> None:
+        """Tick until ``condition()``; RuntimeError after ``limit`` [s] of simulated time."""
+        end = self.now + limit
+        while not condition():
+            if self.now > end:
+                raise RuntimeError(f"{self.count} actors: not done after {limit} s of simulated time")
+            self.tick()
+
+    def meet(self) -> None:
+        """Until each client has a body of every other actor."""
+        self.until(lambda: min(map(bodies, self.clients)) == self.count, MEETING_LIMIT)
+
+    def work(self) -> None:
+        """Each picks its bunch and pushes its box; until all rests, on all clients, by records."""
+        self._pushing_since = self.now
+        for number in range(self.count):
+            self.clients[number % len(self.clients)].physics.pick(number)
+        while self.now < self._pushing_since + PUSH_TIME:
+            for client in self.clients:
+                for robot in client.robots.values():
+                    robot.command_base((0.15 + PUSH) / PUSH_TIME, 0.0, client.physics.time)
+            self.tick()
+        self.until(self._all_at_rest, REST_LIMIT)
+
+    def moved(self) -> list[int]:
+        """Objects that were moved: all bunches, and the boxes of which there is a record."""
+        kinds = (ObjectKind.BUNCH, ObjectKind.BOX)
+        every = [object_id(kind, number) for kind in kinds for number in range(self.count)]
+        return [number for number in every if any(client.replicator.record(number) for client in self.clients)]
+
+    def _all_at_rest(self) -> bool:
+        bunches = [object_id(ObjectKind.BUNCH, number) for number in range(self.count)]
+        for client in self.clients:
+            records = [client.replicator.record(number) for number in bunches]
+            if any(replicator.owned for replicator in client.replicators.values()) or any(
+                record is None or record.moving for record in records
+            ):
+                return False
+        return all(self._is_known_alike(number) for number in self.moved())
+
+    def _is_known_alike(self, number: int) -> bool:
+        records = [client.replicator.record(number) for client in self.clients]
+        return all(record is not None and not record.moving and record == records[0] for record in records)
+
+    def agreement(self) -> Agreement:
+        """Compare all clients."""
+        moved = self.moved()
+        poses = np.array([[_pose_of(client, number) for number in moved] for client in self.clients])
+        chord = np.minimum(
+            np.linalg.norm(poses[..., 3:] - poses[0, :, 3:], axis=-1),
+            np.linalg.norm(poses[..., 3:] + poses[0, :, 3:], axis=-1),
+        )
+        spread = poses[..., :3].max(0) - poses[..., :3].min(0)
+        faults: dict[str, int] = {}
+        for client in self.clients:
+            for name, fault_count in client.physics.faults.items():
+                faults[name] = faults.get(name, 0) + fault_count
+        return Agreement(
+            bodies=min(map(bodies, self.clients)),
+            objects=len(moved),
+            owned=sum(client.replicator.owner(number) is not None for client in self.clients for number in moved),
+            position=float(np.linalg.norm(spread, axis=-1).max()),
+            angle=float((4.0 * np.arcsin(0.5 * chord)).max()),
+            tick=self.busy / (self.ticks * len(self.clients)),
+            faults={name: fault_count for name, fault_count in faults.items() if fault_count},
+        )
+
+    def close(self) -> None:
+        """Close all buses."""
+        for client in self.clients:
+            for replicator in client.replicators.values():
+                replicator.bus.close()
+        self._server.close()
+
+
+def bodies(client: Client) -> int:
+    """Number of actors that have a body on a client."""
+    return len(client.replicators) + len(client.remote_actors)
+
+
+def _pose_of(client: Client, number: int) -> np.ndarray:
+    """Pose [7] of a box or free bunch on one client, with a body or dormant."""
+    tracker = client.physics.support_tracker
+    if number in tracker:
+        return tracker.object_state(number)[0]
+    dormant = client.physics.dormant_bunches
+    rows = {object_id(ObjectKind.BUNCH, visual.index): row for row, visual in enumerate(dormant.visuals())}
+    return dormant.visual_q()[rows[number]]
+
+
+def run_crowd(count: int, robot: RobotDescription, clients: int | None = None) -> Agreement:
+    """Let so many actors meet, work and come to rest; how far their clients agree. Arguments as of :class:`Crowd`."""
+    with contextlib.closing(Crowd(count, robot, clients)) as crowd:
+        crowd.meet()
+        crowd.work()
+        return crowd.agreement()
+
+
+def actors(count: int = ACTORS) -> Iterator[Measurement]:
+    """Rows for one crowd: carriers and people, on two clients."""
+    found = run_crowd(count, load_description("logistic"), CLIENTS)
+    case = f"{count} actors with bodies, half carriers, half people, one world, {CLIENTS} clients"
+    rows = (
+        ("actors that have a body on every client", found.bodies, "actors", count),
+        ("objects moved, at rest by the same record on all clients", found.objects, "objects", None),
+        ("of these with an owner on any client", found.owned, "objects", 0),
+        ("largest difference of the bodies' positions between two clients", 1e3 * found.position, "mm", None),
+        ("largest difference of a rotation", 1e3 * found.angle, "mrad", None),
+        ("faults of all clients", sum(found.faults.values()), "faults", None),
+        ("processor time of a tick of one client, mean", 1e3 * found.tick, "ms", None),
+    )
+    for what, value, unit, wanted in rows:
+        if wanted is None:
+            yield Measurement("actors", f"{case}: {what}", float(value), unit)
+        else:
+            yield Measurement("actors", f"{case}: {what}", float(value), unit, "wanted", float(wanted))

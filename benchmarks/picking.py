@@ -1,0 +1,63 @@
+"""``python -m benchmarks picking``: every bunch in reach of a start place is picked, in simulated time, by clearance.
+
+Each try has a vineyard of its own and the base where the hand has most room about the bunch. It succeeds when the bunch
+has been cut and is in the hand, drawn back to the robot. It is planned and controlled with poses read from the
+simulation: what is measured is arm, hand, blade and canopy, not perception. Jobs and the demo take the freest bunch.
+"""
+
+from __future__ import annotations
+
+import collections
+from collections.abc import Iterator
+
+import numpy as np
+
+from vinesim.api.picking import Grasp, PickAttempt, attempt_pick
+from vinesim.client.tasks import pick_planning
+from vinesim.client.tasks.start_poses import bunch_centres, spawn_pose
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load_scene
+from vinesim.scene.values import Measurement
+
+SCENE = "demo"
+REACH = 3.0
+"""[m] Bunches this near to the start place are tried; the base may move."""
+CLASSES = (-np.inf, 0.0, 0.005, 0.015, pick_planning.FULL_CLEARANCE, np.inf)
+"""[m] Bounds of the classes of clearance: planned picks have 5 mm at least."""
+
+
+def class_name(clearance: float) -> str:
+    """The class of a clearance [m]."""
+    number = int(np.searchsorted(CLASSES, clearance, side="right")) - 1
+    low, high = 1e3 * CLASSES[number], 1e3 * CLASSES[number + 1]
+    if low < 0.0:
+        return "hand overlaps its neighbours"
+    return f"{low:g} mm or more" if np.isinf(high) else f"{low:g} to {high:g} mm"
+
+
+def picking() -> Iterator[Measurement]:
+    """Success over all bunches in reach, by clearance, for the freest, and how many cannot be tried."""
+    scene = load_scene(SCENE)
+    model, near = generate(scene), spawn_pose(scene, 0)[:2]
+    around = int((np.linalg.norm(bunch_centres(model)[:, :2] - near, axis=1) < REACH).sum())
+    tries = [attempt_pick(model, Grasp(*one)) for one in pick_planning.freest_bases(model, near, REACH)]
+    case = f"{SCENE}, bunches within {REACH:g} m of start place 0"
+    yield Measurement("picking", case, float(around), "bunches")
+    yield Measurement("picking", f"{case}, that a base can stand before and a hand fits", float(len(tries)), "bunches")
+    yield from success_measurements(tries)
+
+
+def success_measurements(tries: list[PickAttempt]) -> Iterator[Measurement]:
+    """Success of all, of each class, and of the freest; why the others failed; what else came off."""
+    by_class = collections.defaultdict(list)
+    for one in sorted(tries, key=lambda one: one.clearance):
+        by_class[class_name(one.clearance)].append(one)
+    groups = {"all in reach": tries} | {f"clearance: {name}": group for name, group in by_class.items()}
+    for name, group in groups.items():
+        share = 100.0 * sum(one.picked for one in group) / max(len(group), 1)
+        yield Measurement("picking", f"{name} ({len(group)} tried)", share, "%")
+    freest = [one for one in tries if one.clearance >= pick_planning.MIN_HAND_CLEARANCE][:1]
+    yield Measurement("picking", "the one a job would take", 100.0 * sum(one.picked for one in freest), "%")
+    for phase, count in collections.Counter(one.reason.split(":")[0] for one in tries if one.reason).most_common():
+        yield Measurement("picking", f"failed in phase {phase}", float(count), "bunches")
+    yield Measurement("picking", "other bunches that came off", float(sum(one.others for one in tries)), "bunches")

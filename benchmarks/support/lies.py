@@ -1,0 +1,361 @@
+"""Well-formed lies: messages of every kind that the encoders make, whose content the model forbids or that contradict.
+
+Strategies of Hypothesis. A lie that carries a time is encoded for time zero plus an error, and moved to the present
+when it is told.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import hypothesis
+import numpy as np
+from hypothesis import strategies as st
+
+from benchmarks.support.fuzz_world import ATTACKER, WORLD, FuzzWorld, human_at, small_vineyard
+from vinesim.core import frames
+from vinesim.net.codec import messages
+from vinesim.net.codec.couplings import CouplingMessage, encode_couplings
+from vinesim.net.codec.human import encode_human
+from vinesim.net.codec.messages import Hello, MeshPart, MessageError, ObjectStates, RetainedRecord, TreeStates
+from vinesim.net.codec.robot import encode_robot
+from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
+from vinesim.net.replication.authority import Claim
+from vinesim.net.replication.streams import object_counts
+from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.sidecar import encode_sidecar
+from vinesim.scene import triangles
+from vinesim.scene.ids import ObjectKind, object_id
+from vinesim.scene.model import Model
+from vinesim.scene.values import Coupling, HumanUpdate, RobotUpdate
+
+Draw = Callable[[st.SearchStrategy], Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Lie:
+    """A message under a key, or a greeting with which the attacker comes back, or an offered mesh."""
+
+    kind: str
+    """``put``, ``greet``, ``mesh`` or ``join``."""
+    payload: bytes
+    key: str = ""
+
+    def tell(self, world: FuzzWorld) -> None:
+        """Send it."""
+        if self.kind == "put":
+            world.put(self.key, messages.shift_time(self.payload, world.now))
+        elif self.kind == "greet":
+            world.greet(self.payload)
+        elif self.kind == "join":
+            world.admission.decide(WORLD, ATTACKER, "another", self.payload, world.now)
+        else:
+            world.offer(self.payload)
+
+
+class Liar:
+    """Tells lies in a world that goes on from one example to the next; anew after a broken law, so that Hypothesis can
+    find the shortest lies that break it."""
+
+    def __init__(self, *, kind: str = "robot") -> None:
+        self.kind, self.told = kind, 0
+        self.world: FuzzWorld | None = None
+
+    def tell(self, lies_at_once: list[Lie]) -> None:
+        """Tell these lies, one a step, then let the world go on and hold it to its laws."""
+        world = self.world or FuzzWorld(kind=self.kind)
+        self.world = None
+        try:
+            world.admit(self.kind)
+            for lie in lies_at_once:
+                lie.tell(world)
+                world.step()
+                world.check()
+            world.step()
+            world.check()
+        except BaseException:
+            world.close()
+            raise
+        self.told += len(lies_at_once)
+        self.world = world
+
+    def close(self) -> None:
+        """Close the world, whose store must be what its journals say."""
+        if self.world is not None:
+            self.world.check_store()
+            self.world.close()
+            self.world = None
+
+
+_HEALTH_CHECKS = (
+    hypothesis.HealthCheck.too_slow,
+    hypothesis.HealthCheck.data_too_large,
+    hypothesis.HealthCheck.filter_too_much,
+    hypothesis.HealthCheck.large_base_example,
+)
+
+
+def tell_lies(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
+    """Tell that many series of up to eight lies, found by Hypothesis; the number of lies.
+
+    Raises what the product raises, or :class:`benchmarks.support.fuzz_world.LawBroken`.
+    """
+    liar = Liar(kind=kind)
+
+    @hypothesis.seed(seed)
+    @hypothesis.settings(
+        max_examples=examples, deadline=None, database=None, print_blob=False,
+        suppress_health_check=_HEALTH_CHECKS,
+    )  # fmt: skip
+    @hypothesis.given(st.lists(lies(small_vineyard()), min_size=1, max_size=8))
+    def tell(series: list[Lie]) -> None:
+        liar.tell(series)
+
+    try:
+        tell()
+    finally:
+        liar.close()
+    return liar.told
+
+
+def lies(model: Model) -> st.SearchStrategy[Lie]:
+    """Lies about a model, of all kinds alike."""
+    return st.one_of(
+        _composite(_about_trees, model), _composite(_about_objects, model), _composite(_about_owners, model),
+        _composite(_records, model), _composite(_robot_pose, model), _composite(_human_pose, model),
+        _composite(_wrenches, model), _composite(_couplings, model), _composite(_greeting, model),
+        _composite(_mesh, model), _composite(_control, model),
+    )  # fmt: skip
+
+
+def _composite(make: Callable[[Draw, Model], Lie | None], model: Model) -> st.SearchStrategy[Lie]:
+    @st.composite
+    def strategy(draw: Draw) -> Lie | None:
+        try:
+            return make(draw, model)
+        except MessageError:  # not well-formed
+            return None
+
+    return strategy().filter(lambda lie: lie is not None)  # type: ignore[return-value]
+
+
+CELL = st.integers(-2, 1)
+SEQUENCE = st.one_of(st.integers(0, 4), st.sampled_from((32767, 32768, 65535)), st.integers(0, 65535))
+TIME_ERROR = st.one_of(st.just(0.0), st.floats(-1.0, 1.0), st.sampled_from((-1e300, -1e6, -60.0, 60.0, 1e6, 1e300)))
+OWNERS = st.sampled_from((ATTACKER, "ada", "bob", "", "unknown"))
+NEAR = st.floats(-2.5, 2.5, width=32)
+FAR = st.one_of(NEAR, st.floats(-9.9e4, 9.9e4, width=32), st.sampled_from((99_999.0, -99_999.0)))
+FARTHER = st.one_of(NEAR, st.floats(-9.9e8, 9.9e8, width=32))
+UNIT = st.floats(-1.0, 1.0, width=32)
+
+
+def _vectors(draw: Draw, number: st.SearchStrategy[float], *shape: int, scale: float = 1.0) -> np.ndarray:
+    """An array [shape] of numbers; large ones come from a seed."""
+    count = int(np.prod(shape))
+    if count <= 12:
+        return scale * np.array([draw(number) for _ in range(count)], float).reshape(shape)
+    generator = np.random.default_rng(draw(st.integers(0, 1 << 16)))
+    return scale * draw(UNIT) * generator.uniform(-1.0, 1.0, shape)
+
+
+def _quaternions(draw: Draw, count: int) -> np.ndarray:
+    return frames.exp(_vectors(draw, UNIT, count, 3, scale=np.pi))
+
+
+def _object(draw: Draw, model: Model, kinds: tuple[ObjectKind, ...]) -> int:
+    kind = draw(st.sampled_from(kinds))
+    return object_id(kind, draw(st.integers(0, object_counts(model)[kind])))
+
+
+def _about_trees(draw: Draw, model: Model) -> Lie:
+    """Absurd states of trees, and bodies cut off that cannot be, far away."""
+    trees = sorted(draw(st.sets(st.integers(0, len(model.tree_first) - 1), min_size=1, max_size=2)))
+    sizes = np.array([int(model.tree_size[tree]) + draw(st.sampled_from((0, 0, 0, 0, 1))) for tree in trees])
+    roots = [sorted(draw(st.sets(st.integers(0, int(size) - 1), max_size=3))) for size in sizes]
+    total, cut = int(sizes.sum()), sum(map(len, roots))
+    ownership, authority = (np.array([draw(SEQUENCE) for _ in trees]) for _ in range(2))
+    flags = np.array([draw(st.integers(0, 3)) for _ in trees])
+    states = TreeStates(
+        draw(TIME_ERROR), np.array(trees), ownership, authority, flags, sizes,
+        _quaternions(draw, total), _vectors(draw, UNIT, total, 3, scale=83.0),
+        np.array([len(one) for one in roots]), np.array([body for one in roots for body in one], np.int64),
+        _vectors(draw, FAR, cut, 3), _vectors(draw, UNIT, cut, 3, scale=32.7),
+    )  # fmt: skip
+    family = draw(st.sampled_from(("tree", "near", "own")))
+    return Lie("put", messages.encode_trees(states)[0][0], f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+
+
+def _about_objects(draw: Draw, model: Model) -> Lie:
+    """Boxes and bunches that hang, of others or that there are not, at absurd places and speeds."""
+    numbers = sorted({_object(draw, model, (ObjectKind.BUNCH, ObjectKind.BOX)) for _ in range(draw(st.integers(1, 3)))})
+    count, cell = len(numbers), (draw(CELL), draw(CELL))
+    pose = np.concatenate([_vectors(draw, NEAR, count, 3), _quaternions(draw, count)], 1)
+    ownership, authority = (np.array([draw(SEQUENCE) for _ in numbers]) for _ in range(2))
+    velocity = _vectors(draw, st.one_of(UNIT, st.floats(-4000.0, 4000.0, width=32)), count, 6)
+    states = ObjectStates(
+        draw(TIME_ERROR), np.array(numbers), ownership, authority,
+        np.array([draw(st.integers(0, 3)) for _ in numbers]), pose, velocity,
+    )  # fmt: skip
+    return Lie("put", messages.encode_objects(states, cell)[0][0], f"c/{cell[0]}/{cell[1]}/{ATTACKER}")
+
+
+def _about_owners(draw: Draw, model: Model) -> Lie:
+    """Claims for others, for objects that there are not, and of all sequences."""
+    claims = []
+    for _ in range(draw(st.integers(1, 4))):
+        claim = Claim(draw(SEQUENCE), draw(SEQUENCE), draw(OWNERS))
+        claims.append((_object(draw, model, tuple(ObjectKind)), claim, draw(st.booleans())))
+    return Lie("put", messages.encode_claims(claims), f"own/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+
+
+PARENTS = st.sampled_from((
+    "", "box/0", "box/1", "box/2", "box/3", "box/4", "box/-1", "box/" + "9" * 40, "bunch/0", "tree/0", "ada/base_link",
+    "ada/no link", "bob/chest", "bob/left_hand", f"{ATTACKER}/base_link", "unknown/link", "/", "box/", "x" * 200,
+))  # fmt: skip
+
+
+def _records(draw: Draw, model: Model) -> Lie:
+    """Records: cuts of bodies that cannot be cut, states of other trees, supports that lie in each other."""
+    records = []
+    for _ in range(draw(st.integers(1, 3))):
+        number = _object(draw, model, tuple(ObjectKind))
+        tree = min(number, len(model.tree_first) - 1)
+        first, size = int(model.tree_first[tree]), int(model.tree_size[tree])
+        cut = sorted(draw(st.sets(st.one_of(st.integers(first, first + size), st.integers(0, 1 << 20)), max_size=3)))
+        state = draw(st.one_of(st.just(b""), st.binary(max_size=30), _composite(_about_trees, model)))
+        pose = (*_vectors(draw, FAR, 3).tolist(), *_quaternions(draw, 1)[0].tolist())
+        records.append(
+            RetainedRecord(
+                number, draw(SEQUENCE), draw(SEQUENCE), draw(st.sampled_from((ATTACKER, ATTACKER, "ada", "bob"))), pose,
+                draw(PARENTS), tuple(cut) if draw(st.booleans()) else (),
+                state.payload if isinstance(state, Lie) else state, draw(st.booleans()),
+            )
+        )  # fmt: skip
+    payload = messages.encode_records(records)
+    messages.decode_records(payload)
+    return Lie("put", payload, f"fact/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+
+
+def _pose_key(draw: Draw) -> str:
+    return f"a/{ATTACKER}" + draw(st.sampled_from(("", "/far", "/mid", "/near")))
+
+
+def _robot_pose(draw: Draw, _: Model) -> Lie:
+    """Robots with any number of joints, at any distance and speed, turned over."""
+    count = draw(st.sampled_from((27, 27, 27, 0, 1, 256)))
+    near = draw(st.booleans())
+    base = np.concatenate([_vectors(draw, NEAR if near else FARTHER, 3), _quaternions(draw, 1)[0]])
+    update = RobotUpdate(
+        ATTACKER, draw(TIME_ERROR), base, _vectors(draw, st.floats(-1e3, 1e3, width=32), 6),
+        _vectors(draw, UNIT, count, scale=draw(st.sampled_from((1.0, 10.0, 9e8)))) if count > 12 else np.zeros(count),
+        _vectors(draw, UNIT, count, scale=83.0),
+    )  # fmt: skip
+    return Lie("put", encode_robot(update), _pose_key(draw))
+
+
+def _human_pose(draw: Draw, _: Model) -> Lie:
+    """People turned and stretched, far away, and near others at absurd speeds."""
+    place = frames.pose(_vectors(draw, NEAR if draw(st.booleans()) else FAR, 3))
+    points = human_at(place).points + np.pad(_vectors(draw, UNIT, 7, 3, scale=2.0), ((0, 0), (0, 4)))
+    points[:, 3:] = _quaternions(draw, 7)
+    update = HumanUpdate(
+        ATTACKER, draw(TIME_ERROR), human_at(place).with_points(points), _vectors(draw, UNIT, 7, 6, scale=40.0)
+    )
+    return Lie("put", encode_human(update), _pose_key(draw))
+
+
+def _wrenches(draw: Draw, _: Model) -> Lie:
+    """Forces beyond all limits, on links out of reach, of other robots, or that there are not."""
+    links = draw(
+        st.sets(st.sampled_from(("base_link", "arm_left_7_link", "torso_lift_link", "no link", "")), max_size=3)
+    )
+    wrenches = {link: _vectors(draw, st.floats(-2000.0, 2000.0, width=32), 6) for link in sorted(links)}
+    return Lie("put", encode_wrenches(WrenchMessage(draw(TIME_ERROR), wrenches)), f"force/ada/{ATTACKER}")
+
+
+def _couplings(draw: Draw, model: Model) -> Lie:
+    """Springs to bodies without an owner, that cannot be held, or that there are not, from far away."""
+    bodies = sorted(draw(st.sets(st.integers(0, len(model.body_tree)), max_size=8)))
+    couplings = tuple(
+        Coupling(body, _vectors(draw, st.floats(-10.0, 10.0, width=32), 3), _vectors(draw, FAR, 3)) for body in bodies
+    )
+    return Lie("put", encode_couplings(CouplingMessage(draw(TIME_ERROR), couplings)), f"force/ada/{ATTACKER}")
+
+
+def _urdf(links: str) -> str:
+    return f"<robot name='x'>{links}</robot>"
+
+
+_TWO_LINKS = "<link name='a'/><link name='b'/>"
+
+URDFS = (
+    None,
+    "",
+    "<robot/>",
+    _urdf("<link name='base_link'/>"),
+    "<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>",
+    _urdf(
+        f"{_TWO_LINKS}<joint name='j' type='revolute'><parent link='a'/><child link='b'/><axis xyz='0 0 0'/>"
+        "<limit effort='1e300' velocity='1e300' lower='-1e300' upper='1e300'/></joint>"
+    ),
+    _urdf(
+        "<link name='a'><inertial><mass value='1e30'/>"
+        "<inertia ixx='1e30' iyy='1e30' izz='1e30' ixy='0' ixz='0' iyz='0'/></inertial>"
+        "<collision><geometry><box size='1e6 1e6 1e6'/></geometry></collision></link>"
+    ),
+    _urdf("<link name='a'><visual><geometry><mesh filename='/etc/passwd'/></geometry></visual></link>"),
+    _urdf(
+        "<link name='a'><visual><geometry><mesh filename='m.stl' size='1e9 1 1' triangles='4' "
+        f"digest='{'0' * 40}'/></geometry></visual></link>"
+    ),
+    _urdf(
+        f"{_TWO_LINKS}<joint name='j' type='fixed'><parent link='b'/><child link='a'/></joint>"
+        "<joint name='k' type='fixed'><parent link='a'/><child link='b'/></joint>"
+    ),
+)
+"""Robots that cannot be; None: one that can."""
+
+SIDECARS = (None, "", "{}", "[]", "null", '{"groups": 3}', '{"base_limits": [1e999, -1]}', "\x00", '{"a": ' * 50)
+
+
+def _greeting(draw: Draw, model: Model) -> Lie:
+    """Greetings whose parts contradict each other, of robots that cannot be."""
+    robot = load_description("vinebot")
+    urdf, sidecar = draw(st.sampled_from(URDFS)), draw(st.sampled_from(SIDECARS))
+    hello = Hello(
+        draw(st.sampled_from((ATTACKER, ATTACKER, "ada", "bob"))),
+        draw(st.sampled_from(("robot", "human", "spectator"))),
+        draw(st.sampled_from(("vinebot", "logistic", "../../etc/passwd", "", "x" * 1000))),
+        robot.urdf if urdf is None else urdf,
+        encode_sidecar(robot.base_limits, robot.groups) if sidecar is None else sidecar, "demo",
+        draw(st.sampled_from((model.digest(), model.digest(), model.digest(), "", "0" * 64))),
+        index=draw(st.sampled_from((0, 1, 4095))), joints=draw(st.sampled_from((-1, 0, 1, 27, 256))),
+        seed=draw(st.sampled_from((-1, 0, (1 << 63) - 1))), height=draw(st.sampled_from((1.0, 1.75, 2.5))),
+        outfit=draw(st.sampled_from(("", "green", "no-such-outfit"))),
+    )  # fmt: skip
+    return Lie(draw(st.sampled_from(("greet", "greet", "join"))), messages.encode_hello(hello))
+
+
+def _mesh(draw: Draw, _: Model) -> Lie:
+    """Parts of meshes with lying digests and sizes."""
+    corners = _vectors(draw, UNIT, 4, 3, 3, scale=draw(st.sampled_from((1.0, 1e6, 1e38)))).astype("<f4").tobytes()
+    data = draw(st.sampled_from((corners, corners[:-1], b"", b"\xff" * 36)))
+    digest = draw(st.sampled_from((triangles.digest_of(data), "0" * 40)))
+    offset = draw(st.sampled_from((0, 0, 0, 1, 36)))
+    size = draw(st.sampled_from((len(data), len(data) + offset, 36, triangles.MAX_BYTES)))
+    payload = messages.encode_part(MeshPart(digest, size, offset, data))
+    messages.decode_part(payload)
+    return Lie("mesh", draw(st.sampled_from((payload, messages.encode_request(offset)))))
+
+
+def _control(draw: Draw, model: Model) -> Lie:
+    """Answers that were not asked for, under keys of other kinds; clocks."""
+    number = draw(st.floats(allow_nan=False, allow_infinity=False))
+    payload = draw(st.sampled_from((
+        messages.encode_time(number, -number), messages.encode_welcome(messages.Welcome("go away")),
+        messages.encode_wanted(messages.MeshWanted(0, "no")),
+    )))  # fmt: skip
+    family = draw(st.sampled_from(("own", "fact", "c", "tree", "near")))
+    return Lie("put", payload, f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")

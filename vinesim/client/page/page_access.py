@@ -1,0 +1,62 @@
+"""How other machines of the network open a page: by https, since browsers allow headsets and microphones nowhere else,
+and with a token, since who opens the page may move the person."""
+
+from __future__ import annotations
+
+import dataclasses
+import secrets
+import socket
+import ssl
+import sys
+
+from vinesim.core import disk_cache
+from vinesim.net.transport import certificates
+from vinesim.net.transport.access_control import SERVER, Role
+
+_ELSEWHERE = ("192.0.2.1", 9)
+"""An address that no machine has (RFC 5737): which of our own addresses leads out; nothing is sent."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class NetworkAccess:
+    """What a page's server needs for other machines."""
+
+    host: str
+    """Address of this machine in its network."""
+    tls: ssl.SSLContext
+    token: str
+    """In the address that one opens; a new one for every run."""
+
+
+def network_access() -> NetworkAccess:
+    """Access by the address under which the network reaches this machine.
+
+    The certificate is signed by an authority of this machine's own, kept in the folder for caches: browsers warn of it
+    once, or never where its ``ca.pem`` is installed. Raises :class:`certificates.CryptographyMissing`.
+    """
+    host, folder = own_address(), disk_cache.folder() / "page-certificate"
+    certificates.create(folder, SERVER, Role.SERVER, (host,))
+    tls = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    tls.load_cert_chain(folder / f"{SERVER}.pem", folder / f"{SERVER}.key")
+    return NetworkAccess(host, tls, secrets.token_urlsafe(16))
+
+
+def own_address() -> str:
+    """Address of this machine in its network; 127.0.0.1 without one."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(_ELSEWHERE)
+        except OSError:
+            return "127.0.0.1"
+        return str(probe.getsockname()[0])
+
+
+def print_code(address: str) -> None:
+    """Show an address as a QR code on standard error, if that is a terminal and segno is installed."""
+    if not sys.stderr.isatty():
+        return
+    try:
+        import segno
+    except ImportError:
+        return
+    segno.make(address).terminal(out=sys.stderr, compact=True)

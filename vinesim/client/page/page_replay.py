@@ -1,0 +1,98 @@
+"""A recording for pages: it plays, pauses, and goes to any of its times, as the timeline of a page asks."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim.client.page.page_world import PageWorld
+from vinesim.client.recording.replay import ReplayBus
+from vinesim.client.spectator import Spectator
+from vinesim.web.page_input import ReplayCommand
+from vinesim.web.page_server import PageServer
+
+LEAD = 1.0
+"""A time that was asked for is reached by playing from so much earlier [s]: actors and clocks are known then."""
+REPEAT = 50
+"""While nothing plays, a state is sent every so many steps, for pages that come meanwhile."""
+
+
+class PageReplay:
+    """A spectator in a recording, and its pages. One loop calls :meth:`step`; pages ask in the server's thread."""
+
+    def __init__(
+        self, make: Callable[[float, np.ndarray | None], tuple[Spectator, ReplayBus]], length: float,
+        start: float = 0.0, speed: float = 1.0,
+    ) -> None:  # fmt: skip
+        """``make(start, eyes)`` gives a spectator at a time [s] of a recording of a ``length`` [s], which looks from
+        ``eyes`` [7], or, None, from where it begins."""
+        self._make, self._length = make, length
+        self._lock = threading.Lock()
+        self._command: ReplayCommand | None = None
+        self._speed, self.is_paused = speed, False
+        self._jumps = self._idle_steps = 0
+        self._has_begun = False
+        self._spectator, self._bus = make(start, None)
+        self.world = PageWorld(self._spectator, replay=self)
+
+    @property
+    def dt(self) -> float:
+        """Length of a step [s]."""
+        return self._spectator.physics.dt
+
+    @property
+    def position(self) -> float:
+        """Time since the beginning of the recording [s]."""
+        return self._bus.time - self._bus.start
+
+    def status(self) -> dict[str, float | bool]:
+        """What pages are told with every state."""
+        return {
+            "position": round(self.position, 3), "length": round(self._length, 3), "speed": self._speed,
+            "paused": self.is_paused, "jumps": self._jumps,
+        }  # fmt: skip
+
+    def take(self, command: ReplayCommand) -> None:
+        """What a page asks for; it replaces what was asked for since the last step. From any thread."""
+        with self._lock:
+            before = None if self._command is None else self._command.seek
+            seek = before if command.seek is None else command.seek
+            self._command = ReplayCommand(command.paused, command.speed, seek)
+
+    def step(self, server: PageServer) -> bool:
+        """Do what was asked for, and play one step once the first page is there; whether it plays."""
+        self._has_begun |= server.has_viewers
+        with self._lock:
+            command, self._command = self._command, None
+        was_paused = self.is_paused
+        if command is not None:
+            self._obey(command)
+        self.is_paused |= self._bus.ended
+        if self._has_begun and not self.is_paused:
+            self._play(self._speed)
+            self.world.collect(server)
+            return True
+        self._idle_steps += 1
+        if command is not None or not was_paused or self._idle_steps % REPEAT == 0:
+            self.world.collect(server, again=True)
+        return False
+
+    def _obey(self, command: ReplayCommand) -> None:
+        goal = command.seek
+        if goal is None and self._bus.ended and not command.paused:
+            goal = 0.0  # again from the beginning
+        self._speed, self.is_paused = command.speed, command.paused
+        if goal is None:
+            return
+        self._spectator, self._bus = self._make(max(min(goal, self._length) - LEAD, 0.0), self._spectator.pose)
+        self._jumps += 1
+        self._play(1.0)
+        while self.position < goal and not self._bus.ended:
+            self._play(1.0)
+        self.world.show(self._spectator)
+
+    def _play(self, speed: float) -> None:
+        self._bus.play(self.dt * speed)
+        self._spectator.tick()

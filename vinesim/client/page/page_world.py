@@ -1,0 +1,445 @@
+"""What pages are shown: the primitives of the cameras once, then the poses of what has moved."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any, Protocol
+
+import numpy as np
+
+from vinesim.avatar.gestures import OPEN_HAND
+from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
+from vinesim.client.client import Client
+from vinesim.client.page import page_overlays
+from vinesim.client.page.first_view import first_view
+from vinesim.client.spectator import Spectator
+from vinesim.kernels.shading import materials
+from vinesim.rigid.human_shapes import SIDES
+from vinesim.scene.appearance import load_shears
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
+from vinesim.sensors.camera.exposure import usual_exposure
+from vinesim.sensors.camera.sunlight import OutdoorLight
+from vinesim.sensors.primitives import textures
+from vinesim.sensors.primitives.scene_primitives import Primitives
+from vinesim.sensors.primitives.static_primitives import row_layout
+from vinesim.sensors.scheduler import load_kernels
+from vinesim.web import array_message
+from vinesim.web.page_input import PageInput, ReplayCommand, TrackedPerson
+from vinesim.web.page_server import PageServer
+from vinesim.wind.sway import Sway
+from vinesim.wires.wire_segments import wire_segments
+
+GRASS = 25.0
+"""Tufts a square metre: a browser draws fewer than the cameras."""
+MAX_PRIMITIVES = 400_000
+"""Of plants and ground that a page has at a time: 32 MB."""
+LOADED = {int(materials.STEM): 0.4, int(materials.GRASS): 0.5, int(materials.BERRY): 1.0}
+"""How far things are loaded by their material, berries being 1: about as far as a page draws them. GUESSED."""
+ELSE_LOADED = 2.0
+"""The same for leaves and wood."""
+AMONG_VINES = 1.08
+"""Exposure of a page beside the usual one of the daylight: what cameras come to by themselves among vines, 1.06 to 1.12
+times it in the pictures of docs/web.md."""
+MAX_SENTENCES = 4
+"""Closures of shears that a state tells of: pages learn of both hands, and of those between two states."""
+BLADE_STEPS = 5
+"""Pages are told every so many steps what is between the blades of shears."""
+_TURN_STEPS = 32767
+"""Steps of a component of a quaternion from 0 to 1."""
+
+
+class Replay(Protocol):
+    """A recording that is played for pages."""
+
+    def status(self) -> dict[str, float | bool]:
+        """What pages are told with every state."""
+        ...
+
+    def take(self, command: ReplayCommand) -> None:
+        """What a page asks for; called in the server's thread."""
+        ...
+
+
+class PageWorld:
+    """The world of one client as its pages see it. The client's loop writes it, the server's thread reads it.
+
+    Nothing is laid out before the first page asks. A page knows the poses of all trees at rest. It is kept in which
+    tick each tree has last moved; a page is sent the trees that have moved since the last state that was sent to it.
+    """
+
+    def __init__(
+        self, client: Client, person: TrackedHuman | None = None, most: int = MAX_PRIMITIVES,
+        replay: Replay | None = None,
+    ) -> None:  # fmt: skip
+        """``person``: the source of the client's own human, whom the first page moves; ``most``: primitives of plants
+        and ground that a page has at a time, those nearest to where it looks from; ``replay``: the recording that the
+        client is in, if it is in one."""
+        self._client, self._person, self._most, self._replay = client, person, most, replay
+        self._ticks_before = 0
+        """Of earlier clients, so that ticks of states rise: see :meth:`show`."""
+        self._at_rest = client.physics.snapshot().body_q.copy()
+        self._moved_at = np.full(len(client.model.tree_first), -1)
+        """[tree] tick"""
+        self._wires = wire_segments(client.model)
+        """For pages their segments are bodies, numbered behind those of plants."""
+        self._wire_q, self._wire_moved_at = self._wires.rest_q.astype(np.float32), np.full(len(self._wires), -1)
+        """[segment, 7] m, 1 as last seen, and [segment] the tick."""
+        self._wires_away = self._wires.piece[:0].astype(int)
+        """[k] Segments that were away from where they were drawn."""
+        self._sway: Sway | None = None
+        self._primitives: Primitives | None = None
+        """None until a page asks."""
+        self._lock = threading.Lock()
+        self._snapshot: tuple[int, Snapshot] | None = None
+        self._rigid_version, self._rigid = 0, b""
+        self._lamps: dict[str, np.ndarray] = {}
+        """Rows of primitives that have shone, counted from those of the rigid bodies; their surfaces and materials."""
+        self._laid_out: dict[str, np.ndarray] = {}
+        """Values of the rigid primitives as pages load them."""
+        self._has_shone = np.zeros(0, bool)
+        """[row] Whether it was ever other than that."""
+        self._visuals: tuple[Any, ...] | None = None
+        client.after_reset.append(self._follow_reset)
+        self._driver: int | None = None
+        """The page that moves the spectator's eyes or the person: the first that sends anything."""
+        self._eyes: np.ndarray | None = None
+        self._intention = ""
+        self._overlay_pages: set[int] = set()
+        """Pages that show contacts and owners."""
+        self._contacts: tuple[Contact, ...] = ()
+        self._hands: dict[str, np.ndarray] = {}
+        """Of the person's left and right hand [2, 7]: as simulated, and the controllers that they followed."""
+        self._haptics: dict[str, Haptic] = {}
+        """Strongest vibration of each hand since the last state."""
+        self._shears: dict[str, Any] = {"closures": 0, "said": [], "between": ["", ""]}
+        """How often the person's shears have closed, what they cut the last times, and what is between the open blades
+        of both hands; replaced, never changed."""
+
+    # ------------------------------------------------------------------ in the client's loop
+
+    def show(self, client: Client) -> None:
+        """From now on show another client of the same vineyard, at another time of it: all trees are told anew."""
+        with self._lock:
+            self._ticks_before += self._client.physics.tick + 1
+            self._client, self._snapshot = client, None
+            self._moved_at[self._moved_at >= 0] = self._tick
+            self._wire_moved_at[self._wire_moved_at >= 0] = self._tick
+        client.after_reset.append(self._follow_reset)
+        self._visuals = None
+        if self._sway is not None:
+            self._sway = Sway(client.model)
+
+    @property
+    def _tick(self) -> int:
+        """Tick of the newest state for pages."""
+        return self._client.physics.tick + self._ticks_before
+
+    def collect(self, server: PageServer, *, again: bool = False) -> None:
+        """After a step: note what has moved, take a snapshot if a page looks, and lead a spectator's eyes there.
+        ``again``: there was no step, but something else that pages are told of."""
+        physics = self._client.physics
+        self._ticks_before += again
+        self._moved_at[physics.plants.awake] = self._tick
+        if self._eyes is not None and isinstance(self._client, Spectator):
+            self._client.pose = self._eyes
+        if self._person is not None:
+            human = self._client.humans[self._client.name]
+            if human.intention != self._intention:
+                human.indicate(self._intention)
+            for haptic in human.haptics:
+                if (before := self._haptics.get(haptic.hand)) is None or before.amplitude < haptic.amplitude:
+                    self._haptics[haptic.hand] = haptic
+            if human.closures:
+                said = [*self._shears["said"], *(closure.sentence for closure in human.closures)]
+                closures = self._shears["closures"] + len(human.closures)
+                self._shears = {**self._shears, "closures": closures, "said": said[-MAX_SENTENCES:]}
+        if self._sway is None or not server.has_viewers:
+            return
+        self._contacts = physics.contacts if self._overlay_pages else ()
+        snapshot = physics.snapshot()
+        swayed = self._sway.apply(snapshot, np.flatnonzero(self._moved_at == self._tick))
+        self._moved_at[swayed.moved_trees] = self._tick
+        self._follow_wires(snapshot.wires)
+        if self._person is not None:
+            hands = [physics.hand(self._client.name, side) for side in SIDES]
+            self._hands = {
+                "hand_proxy": np.array([hand.pose for hand in hands], np.float32),
+                "hand_controller": np.array([hand.controller for hand in hands], np.float32),
+            }
+            if physics.tick % BLADE_STEPS == 0:
+                between = self._client.humans[self._client.name].between_blades()
+                self._shears = {**self._shears, "between": list(between)}
+        with self._lock:
+            self._snapshot = self._tick, swayed
+        server.notify()
+
+    def _follow_wires(self, wires: SegmentPoses) -> None:
+        """Note which segments have moved."""
+        which = np.union1d(self._wires_away, wires.segment).astype(int)
+        now = self._wires.poses(which, wires)
+        moved = which[(now != self._wire_q[which]).any(1)]
+        self._wire_q[which], self._wire_moved_at[moved], self._wires_away = now, self._tick, wires.segment
+
+    def _follow_reset(self) -> None:
+        """All trees are at rest again: pages are told of those that had moved."""
+        self._moved_at[self._moved_at >= 0] = self._tick + 1
+        self._wire_moved_at[self._wire_moved_at >= 0] = self._tick + 1
+        if self._sway is not None:
+            self._sway = Sway(self._client.model)
+
+    # ------------------------------------------------------------------ in the server's thread
+
+    def scene(self) -> bytes:
+        """Everything that stands or grows, at rest; tables of leaves' outlines; light of the ground."""
+        primitives, scene = self._lay_out(), self._client.scene
+        outline, hull = textures.leaf_outlines()
+        leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes have both signs
+        ground = primitives.materials
+        model = self._client.model
+        sun = scene.sun.direction(0.0)
+        start = self._start_view()
+        reach, plants = _nearest(primitives, start[:3], self._most)
+        return array_message.encode(
+            {
+                "scene": scene.name, "seed": scene.seed, "sun": list(sun), "light": _light(sun[2]),
+                "rows": list(row_layout(model)), "room": min(primitives.plant_count, self._most), "reach": reach,
+                "bodies": len(model.body_mass) + len(self._wires), "dt": self._client.physics.dt,
+                "interest": self._client.replicator.interest_radius,
+                "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
+                "ground_columns": int(ground.ground_sky.shape[1]),
+                "person": None if self._person is None else self._client.name,
+                "mouth": None if self._person is None else load_shears().mouth[:3].tolist(),
+                "replay": None if self._replay is None else self._replay.status(),
+                "intentions": [] if self._person is None else list(INTENTIONS[1:]),
+                "gestures": {} if self._person is None else dict(self._person.gestures.poses),
+                "buttons": {} if self._person is None else dict(self._person.gestures.buttons),
+            },
+            plants
+            | {
+                "tree_first": model.tree_first.astype(np.uint32),
+                "poses": np.concatenate([self._at_rest, self._wires.rest_q]).astype(np.float32),
+                "outline": outline, "hull": hull, "noise": _bytes(textures.noise_texture()), "leaf": _bytes(leaf),
+                "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(start, np.float32),
+            } | ({} if self._person is None else _within_reach(model)),
+        )  # fmt: skip
+
+    def plants(self, place: np.ndarray) -> bytes:
+        """Of a vineyard that is too large for a page the part around a ``place`` [3] m, as in :meth:`scene`."""
+        reach, plants = _nearest(self._lay_out(), place, self._most)
+        return array_message.encode({"reach": reach, "place": place.tolist()}, plants)
+
+    def _lay_out(self) -> Primitives:
+        """The primitives of plants and ground."""
+        if self._primitives is None:
+            load_kernels()
+            self._sway = Sway(self._client.model)
+            self._primitives = Primitives(self._client.model, grass=GRASS)
+        return self._primitives
+
+    def rigid(self) -> bytes:
+        """Robots, people, boxes and picked bunches that there are now."""
+        return self._rigid
+
+    def state(self, since: int) -> tuple[int, bytes] | None:
+        """Bodies of the trees that have moved after the tick ``since``, all rigid bodies, and what was picked."""
+        with self._lock:
+            newest = self._snapshot
+        if newest is None or self._primitives is None or newest[0] <= since:
+            return None
+        tick, snapshot = newest
+        if snapshot.visuals is not self._visuals:
+            self._follow_visuals(self._primitives, snapshot)
+        body = self._bodies(np.flatnonzero(self._moved_at > since))
+        wire = np.flatnonzero(self._wire_moved_at > since)
+        pose = np.concatenate([snapshot.body_q[body], self._wires.poses(wire, snapshot.wires)])
+        body = np.concatenate([body, len(self._client.model.body_mass) + wire])
+        rigid = np.asarray(snapshot.visual_q).reshape(-1, 7)
+        haptics, self._haptics = self._haptics, {}
+        shown: dict[str, Any] = {"owners": page_overlays.owners(self._client)} if self._overlay_pages else {}
+        if self._replay is not None:
+            shown["replay"] = self._replay.status()
+        if self._person is not None:
+            shown["shears"] = self._shears
+        state = array_message.encode(
+            {
+                **shown, "pace": self._client.pace_text(),
+                "tick": tick, "time": snapshot.time, "rigid": self._rigid_version,
+                "haptics": {hand: [one.amplitude, one.duration] for hand, one in haptics.items()},
+            },
+            {
+                "body": body.astype(np.uint32), "place": pose[:, :3].astype(np.float32), "turn": _turns(pose),
+                "rigid_place": rigid[:, :3].astype(np.float32), "rigid_turn": _turns(rigid),
+                "picked": np.flatnonzero(~snapshot.bunch_attached).astype(np.uint32), **self._lamps,
+                **self._hands, **page_overlays.contact_arrays(self._contacts),
+            },
+        )  # fmt: skip
+        return tick, state
+
+    def _follow_visuals(self, primitives: Primitives, snapshot: Snapshot) -> None:
+        """Lay the rigid bodies out for pages, unless only lights have changed: those are part of every state."""
+        primitives.update(snapshot)
+        before, self._visuals = self._visuals, snapshot.visuals
+        rows = slice(primitives.plant_count, primitives.count)
+        columns = _columns(primitives, rows)
+        if before is None or not _differ_in_lights_only(before, snapshot.visuals):
+            self._lay_out_rigid(primitives, snapshot, rows)
+            self._laid_out, self._has_shone = columns, np.zeros(len(columns["material"]), bool)
+        self._has_shone |= (columns["surface"] != self._laid_out["surface"]).any(1)
+        self._has_shone |= columns["material"] != self._laid_out["material"]
+        lamps = np.flatnonzero(self._has_shone)
+        self._lamps = {
+            "lamp": lamps.astype(np.uint32), "lamp_surface": columns["surface"][lamps],
+            "lamp_material": columns["material"][lamps],
+        }  # fmt: skip
+
+    def _lay_out_rigid(self, primitives: Primitives, snapshot: Snapshot, rows: slice) -> None:
+        self._rigid_version += 1
+        clusters = slice(len(primitives.cluster_first) - len(primitives.rigid_clusters), None)
+        self._rigid = array_message.encode(
+            {"version": self._rigid_version, "names": [visual.name for visual in snapshot.visuals]},
+            _columns(primitives, rows) | _clusters(primitives, clusters, primitives.plant_count),
+        )
+
+    def take(self, page: int, said: PageInput) -> None:
+        """Take over where a page looks from and what its person does; only the first page's."""
+        (self._overlay_pages.add if said.overlays else self._overlay_pages.discard)(page)
+        if said.replay is not None and self._replay is not None:
+            self._replay.take(said.replay)
+        if self._driver is None:
+            self._driver = page
+        if page != self._driver:
+            return
+        self._eyes = np.array(said.view)
+        if self._person is not None and said.person is not None:
+            self._person.take(_tracked(said.person))
+            if said.person.intention in INTENTIONS:
+                self._intention = said.person.intention
+
+    def leave(self, page: int) -> None:
+        """A page is gone: another one may move the person."""
+        self._overlay_pages.discard(page)
+        if page == self._driver:
+            self._driver = None
+
+    def _bodies(self, trees: np.ndarray) -> np.ndarray:
+        """Bodies of some trees, one tree after the other."""
+        model = self._client.model
+        first, size = model.tree_first[trees], model.tree_size[trees]
+        return np.repeat(first - (np.cumsum(size) - size), size) + np.arange(size.sum())
+
+    def _start_view(self) -> np.ndarray:
+        """Where the page looks from at first: a spectator's eyes, else over the shoulder of the client's own actor."""
+        client = self._client
+        if isinstance(client, Spectator):
+            return client.pose
+        if self._person is not None:
+            return client.humans[client.name].pose.head
+        name = next(iter(client.robots), client.name)
+        root = client.physics.rigid.base_state(name)[0] if client.robots else client.humans[name].pose.root
+        return first_view(np.asarray(root, float), client.model, self._at_rest[:, :3])
+
+
+def _light(height: float) -> dict[str, Any]:
+    """Light as cameras see it, by the sine of the sun's elevation; linear RGB."""
+    light = OutdoorLight.of(height)
+    colours = {name: getattr(light, name).tolist() for name in ("sun", "sky", "haze", "ground", "canopy", "balance")}
+    return colours | {"dim": light.dim, "exposure": AMONG_VINES * usual_exposure(light.brightness)}
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    """Values from 0 to 1 in bytes."""
+    return np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
+
+
+def _differ_in_lights_only(before: tuple[RigidVisual, ...], now: tuple[RigidVisual, ...]) -> bool:
+    """Whether two lists of rigid bodies have the same shapes but for the colours of indicator lights."""
+    return len(before) == len(now) and all(
+        one is other
+        or (
+            (one.name, one.organ, one.index, len(one.shapes))
+            == (other.name, other.organ, other.index, len(other.shapes))
+            and all(
+                a is b or (a.is_indicator and b.is_indicator) for a, b in zip(one.shapes, other.shapes, strict=True)
+            )
+        )
+        for one, other in zip(before, now, strict=True)
+    )
+
+
+def _tracked(person: TrackedPerson) -> TrackedPoints:
+    """A page's person as its avatar takes it."""
+    hands = person.left, person.right
+    left, right = (None if hand is None else np.array(hand.pose) for hand in hands)
+    return TrackedPoints(
+        np.array(person.head), left, right, (bool(hands[0] and hands[0].closed), bool(hands[1] and hands[1].closed)),
+        (OPEN_HAND if hands[0] is None else hands[0].fingers, OPEN_HAND if hands[1] is None else hands[1].fingers),
+        person.shears,
+    )  # fmt: skip
+
+
+def _within_reach(model: Model) -> dict[str, np.ndarray]:
+    """What a person may reach for: bodies of wood and their lengths [m]; of each bunch its body, length and radius [m],
+    and the last piece of its stalk."""
+    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
+    stalk = model.body_parent[model.bunch_body]
+    return {
+        "wood": wood.astype(np.uint32), "wood_length": model.body_length[wood].astype(np.float32),
+        "bunch_body": model.bunch_body.astype(np.uint32), "bunch_length": model.bunch_length.astype(np.float32),
+        "bunch_radius": model.bunch_radius.astype(np.float32), "bunch_stalk": stalk.astype(np.uint32),
+        "stalk_length": model.body_length[stalk].astype(np.float32),
+    }  # fmt: skip
+
+
+def _turns(pose: np.ndarray) -> np.ndarray:
+    """Quaternions of poses [k, 7] in steps, [k, 4] int16."""
+    return np.round(pose[:, 3:] * _TURN_STEPS).astype(np.int16)
+
+
+def _columns(primitives: Primitives, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
+    """Values of primitives as a page needs them."""
+    columns = primitives.local_columns(rows)
+    shape = np.concatenate([columns[name] for name in "abcd"], 1).astype(np.float32)
+    colour = np.round(255.0 * np.clip(columns["tint"], 0.0, 1.0) ** (1.0 / 2.2))
+    light = np.round(255.0 * np.clip(columns["sky"], 0.0, 1.0))
+    surface = np.column_stack([colour, light]).astype(np.uint8)
+    return {
+        "shape": shape, "surface": surface, "material": columns["material"].astype(np.uint8),
+        "carrier": columns["carrier"].astype(np.uint32),
+    }  # fmt: skip
+
+
+def _nearest(
+    primitives: Primitives, place: np.ndarray, most: int
+) -> tuple[float | None, dict[str, np.ndarray]]:  # fmt: skip
+    """Primitives of the clusters of plants and ground nearest to a ``place`` [3] m, at most ``most``, and the clusters;
+    before them how far from there no berry is missing [m], None: nothing is missing anywhere. :data:`LOADED` says how
+    far other things are loaded."""
+    count = len(primitives.cluster_first) - len(primitives.rigid_clusters)
+    clusters = _clusters(primitives, slice(0, count))
+    if primitives.plant_count <= most:
+        return None, _columns(primitives, slice(0, primitives.plant_count)) | clusters
+    first, size = clusters["first"].astype(int), clusters["size"].astype(int)
+    material = primitives.local_columns(first)["material"]
+    share = np.select([material == one for one in LOADED], list(LOADED.values()), ELSE_LOADED)
+    away = np.linalg.norm(clusters["ball"][:, :3] - place, axis=1) / share
+    order = np.argsort(away, kind="stable")
+    fitting = int(np.searchsorted(np.cumsum(size[order]), most, side="right"))
+    kept = np.sort(order[:fitting])
+    clusters = {name: values[kept] for name, values in clusters.items()}
+    start = np.cumsum(size[kept]) - size[kept]
+    rows = np.repeat(first[kept] - start, size[kept]) + np.arange(size[kept].sum())
+    clusters["first"] = start.astype(np.uint32)
+    return float(away[order[fitting]]), _columns(primitives, rows) | clusters
+
+
+def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, np.ndarray]:
+    """Clusters as a page needs them: runs of primitives, counted from ``row``, and balls around them in the world."""
+    return {
+        "first": (primitives.cluster_first[which] - row).astype(np.uint32),
+        "size": primitives.cluster_size[which].astype(np.uint32),
+        "kind": primitives.cluster_kind[which].astype(np.uint8),
+        "bunch": primitives.cluster_bunch[which].astype(np.int32),
+        "ball": primitives.ball.numpy()[which].astype(np.float32),
+    }

@@ -1,0 +1,175 @@
+"""The processes of one robot of the client: its sensors, and its ROS node if ROS 2 can be used."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import logging
+import pathlib
+from collections.abc import Sequence
+from typing import Any, Self
+
+from vinesim.client.client import Client
+from vinesim.client.faults import RecentCounts
+from vinesim.client.processes.ros_process import RosProcess
+from vinesim.client.processes.sensor_process import SensorProcess
+from vinesim.net.pace import describe
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.ros import middleware
+from vinesim.scene.model import Model
+from vinesim.scene.spec import Scene
+from vinesim.scene.values import ComponentStatus, SensorPacing
+
+log = logging.getLogger(__name__)
+
+BEHIND = 0.95
+"""A loop that has done a smaller share than this of the steps that were due since the last status is behind."""
+_LOOP_VALUES = (
+    "tick_hz", "tick_p99_ms", "overruns", "steps_skipped", "real_time_factor", "target_real_time_factor", "pace_cause",
+    "awake", "unfinished_solves", "sound_dropped",
+)  # fmt: skip
+"""Values of a client's status that /diagnostics shows with the loop."""
+_NETWORK_VALUES = ("others", "round_trip_ms", "bytes_in", "bytes_out")
+"""The same with the network."""
+
+
+class RobotProcesses:
+    """Starts the processes of one robot; a context: they end with it."""
+
+    def __init__(
+        self, name: str, scene: Scene, model: Model, description: RobotDescription, *, namespace: str = "",
+        params_file: pathlib.Path | None = None, interest_radius: float | None = None,
+        ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
+        renderer: str = "warp", device: str = "cpu", pacing: SensorPacing | None = None,
+        standby: bool = False,
+    ) -> None:  # fmt: skip
+        """``clock``: may publish /clock, as one node of a ROS domain does; ``params_file``: ROS parameters of the
+        nodes; ``interest_radius``: see :class:`RosProcess`. For the others see :class:`SensorProcess`."""
+        if ros and (reason := middleware.unavailable_reason()) is not None:
+            log.warning("running without ROS 2: %s", reason)
+            ros = False
+        with contextlib.ExitStack() as stack:
+            self.sensors = stack.enter_context(
+                SensorProcess(
+                    name, scene, model, description, namespace=namespace, params_file=params_file, ros=ros,
+                    keep_pictures=keep_pictures, sensor_hz=sensor_hz, renderer=renderer, device=device, pacing=pacing,
+                    standby=standby,
+                )
+            )  # fmt: skip
+            self.ros = None
+            if ros:
+                process = RosProcess(
+                    name, model, description, namespace=namespace, params_file=params_file, clock=clock,
+                    interest_radius=interest_radius,
+                )  # fmt: skip
+                self.ros = stack.enter_context(process)
+            self._stack = stack.pop_all()
+        self._restarts = RecentCounts()
+
+    def attach(self, client: Client, robot: Robot | None = None, *, wait_for_sensors: bool = True) -> None:
+        """Connect the processes with a robot of the client, its first unless given.
+
+        Waits until the ROS node is ready, and unless otherwise asked the sensors; see :meth:`SensorProcess.attach`.
+        """
+        self.sensors.attach(client, robot, wait=wait_for_sensors)
+        if self.ros is not None:
+            self.ros.attach(client, robot)
+
+    def sent_messages(self) -> dict[str, int]:
+        """ROS messages sent so far, by topic."""
+        return self.sensors.sent_messages() | ({} if self.ros is None else self.ros.sent_messages())
+
+    def dropped_messages(self) -> dict[str, int]:
+        """ROS messages that had subscribers and were not sent, by topic; topics that lost none are left out."""
+        dropped = collections.Counter(self.sensors.dropped_messages())
+        if self.ros is not None:
+            dropped.update(self.ros.dropped_messages())
+        return {topic: count for topic, count in sorted(dropped.items()) if count}
+
+    def awaited(self) -> list[str]:
+        """What has to be done before pictures and messages are sent."""
+        ros = [] if self.ros is None or self.ros.worker.is_ready else [f"{self.sensors.name}: ROS node"]
+        return self.sensors.awaited() + ros
+
+    def status(self) -> dict[str, Any]:
+        """Whether the sensors are ready, what was lost so far, and process ids; for the status of a client."""
+        report, awaited = self.sensors.report(), self.awaited()
+        pids = {f"sensors of {self.sensors.name}": self.sensors.worker.pid}
+        if (standby := self.sensors.worker.standby_pid) is not None:
+            pids[f"standby of {self.sensors.name}"] = standby
+        if self.ros is not None:
+            pids[f"ROS node of {self.sensors.name}"] = self.ros.worker.pid
+        return {
+            "sensors_ready": not awaited,
+            "sensors_awaited": awaited,
+            "frames_dropped": sum(report["frames_dropped"].values()),
+            "messages_dropped": sum(self.dropped_messages().values()),
+            "sound_lost": 0 if self.ros is None else self.ros.sound_lost,
+            "sensor_restarts": report["sensor_restarts"],
+            "ros_restarts": 0 if self.ros is None else self.ros.worker.restarts,
+            "sensor_restart_s": self.sensors.worker.restart_time,
+            "processes": pids,
+        }
+
+    def report(self) -> dict[str, Any]:
+        """Everything that was counted, by sensor and topic."""
+        restarts = 0 if self.ros is None else self.ros.worker.restarts
+        return self.sensors.report() | {"ros_dropped": self.dropped_messages(), "ros_restarts": restarts}
+
+    def publish_diagnostics(self, status: dict[str, Any]) -> None:
+        """Publish a client's status on /diagnostics, with that of the sensors."""
+        if self.ros is None:
+            return
+        report, awaited = self.report() | {"sound_lost": self.ros.sound_lost}, self.sensors.awaited()
+        restarts = {"sensor process": report["sensor_restarts"], "ROS node": report["ros_restarts"]}
+        restarted = self._restarts.update(restarts, status["time"])
+        self.ros.publish_diagnostics(
+            status["world_time"],
+            [loop_status(status), network_status(status), sensors_status(awaited, restarted, report)],
+        )
+
+    def close_ros(self) -> None:
+        """End the ROS node; the counts of its messages are complete then."""
+        if self.ros is not None:
+            self.ros.close()
+
+    def save_picture(self, folder: pathlib.Path) -> None:
+        """Write the kept picture; see :meth:`SensorProcess.save_picture`."""
+        self.sensors.save_picture(folder)
+
+    def close(self) -> None:
+        """End the processes."""
+        self._stack.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        self._stack.__exit__(*exception)
+
+
+def loop_status(status: dict[str, Any]) -> ComponentStatus:
+    """A client's loop for /diagnostics: a warning while it is behind and after recent faults, the counts of all."""
+    trouble = ["behind"] * (status["recent_real_time_factor"] < BEHIND * status["target_real_time_factor"])
+    trouble += [name.replace("_", " ") for name in status["recent_faults"]]
+    values = {key: status[key] for key in _LOOP_VALUES} | status["faults"]
+    pace = describe(status["target_real_time_factor"], status["pace_cause"])
+    text = ", ".join(trouble + [pace] * bool(pace)) or "well"
+    return ComponentStatus("simulation", "warning" if trouble else "ok", text, values)
+
+
+def network_status(status: dict[str, Any]) -> ComponentStatus:
+    """A client's network for /diagnostics: a warning while its server is gone or rejects it."""
+    trouble = status["network"]
+    values = {key: status[key] for key in _NETWORK_VALUES}
+    return ComponentStatus("network", "warning" if trouble else "ok", trouble or "well", values)
+
+
+def sensors_status(awaited: Sequence[str], restarted: Sequence[str], report: dict[str, Any]) -> ComponentStatus:
+    """A robot's sensors for /diagnostics, with all that was counted: an error while any is ``awaited``; a warning after
+    a process was started again, for that can take less than the time between two messages."""
+    if awaited:
+        return ComponentStatus("sensors", "error", f"not ready: {awaited[0]}", report)
+    trouble = [f"{process} restarted" for process in restarted]
+    return ComponentStatus("sensors", "warning" if trouble else "ok", ", ".join(trouble) or "well", report)

@@ -1,0 +1,362 @@
+"""The client's side of a robot's ROS process: it passes the robot's state of every step, and takes commands."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import logging
+import pathlib
+import time
+import types
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from vinesim.audio import opus
+from vinesim.avatar.local_human import LocalHuman
+from vinesim.client.client import Client
+from vinesim.client.pace import Limit
+from vinesim.client.processes.rigid_visual_list import VisualListSender
+from vinesim.client.processes.ros_worker import RosChannel, RosConfig, run_ros_worker
+from vinesim.client.processes.spawned_process import ROS_MODULES
+from vinesim.client.processes.step_record import StepRecords
+from vinesim.client.processes.worker_process import Hold, Run, WorkerProcess
+from vinesim.client.remote.remote_human import RemoteHuman
+from vinesim.client.signals import GestureLog, IntentionLog
+from vinesim.client.sound.exchange import SoundStep
+from vinesim.client.sound.microphone_step import at_place
+from vinesim.client.tasks.ros_command_handler import RosCommandHandler
+from vinesim.client.tasks.simulation_control import SimulationControl
+from vinesim.core import frames
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import series_stiffness
+from vinesim.ros.commands.types import Command, GoalResult
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.values import ComponentStatus, JointReference, RigidVisual
+from vinesim.scene.values.signals import Color
+
+log = logging.getLogger(__name__)
+
+START_TIMEOUT = 120.0
+"""How long the process may take to start; a first run builds message packages [s]."""
+FREE_BACKLOG = 0.2
+"""Share of the room for steps that may be taken before the world slows down."""
+RATE_PERIOD = 0.5
+"""Time over which the rate is measured at which the process takes steps [s]."""
+TRUTH_ORGANS = (Organ.BOX, Organ.BUNCH, Organ.HUMAN)
+"""Rigid bodies whose true poses are published; robots have their own transforms."""
+
+
+class RosProcess:
+    """The ROS node of one robot of the client, in a process of its own. A context: the process ends with it."""
+
+    def __init__(
+        self, name: str, model: Model, description: RobotDescription, *, namespace: str = "",
+        params_file: pathlib.Path | None = None, clock: bool = True, interest_radius: float | None = None,
+    ) -> None:  # fmt: skip
+        """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock, and
+        serves simulation_interfaces. ``params_file``: ROS parameters of its node. ``interest_radius`` [m]: of the
+        client, to be shown; None without a server."""
+        self._model = model
+        self._commands: collections.deque[Command] = collections.deque()
+        self._sent: dict[str, int] = {}
+        self._dropped: dict[str, int] = {}
+        self._sent_before: collections.Counter[str] = collections.Counter()
+        self._dropped_before: collections.Counter[str] = collections.Counter()
+        """Counts of the runs of the process before this one."""
+        self._losses: collections.Counter[str] = collections.Counter()
+        self._losses_before: collections.Counter[str] = collections.Counter()
+        """Frames of sound and commands that were lost or refused in this run of the process, and in those before."""
+        self._contacts_left_out = 0
+        self._is_restarted = False
+        self._leads = clock
+        self._simulation: SimulationControl | None = None
+        self._missed_truth = 0
+        self._intentions = IntentionLog()
+        self._gestures = GestureLog()
+        self._had_people = False
+        """Whether there were people after the last step."""
+        self._told_run: Run[RosChannel] | None = None
+        """The run of the process that knows :attr:`_intentions` and :attr:`_gestures`."""
+        self._told_lights: tuple[Run[RosChannel], Color | None] | None = None
+        """The run of the process that knows what the indicator lights show, and that."""
+        poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
+        fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
+        self._records = StepRecords(name, description, series_stiffness(description.drives))
+        config = RosConfig(
+            name, description.urdf, description.base, namespace, clock, tuple((p, c, q) for (p, c), q in fixed),
+            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
+            model.bunch_of_body(),
+            description.controllers, tuple(mount.name for mount in description.imus),
+            tuple(mount.name for mount in description.wrenches), interest_radius, params_file,
+        )  # fmt: skip
+        self._visuals: tuple[RigidVisual, ...] | None = None
+        """All rigid bodies when the list of those in the truth was made."""
+        self._truth_rows = np.zeros(0, np.intp)
+        self._truth_visuals: tuple[RigidVisual, ...] = ()
+        self._truth_list = VisualListSender()
+        self._run: Run[RosChannel] | None = None
+        """The run of the process that :attr:`_truth_list` belongs to."""
+        self._step_topics = config.step_topics
+        self._lost = np.zeros(len(self._step_topics), np.int64)
+        """[topic] messages of steps that found no room on the way to the process."""
+        body_sensors = {*config.imus, *config.wrenches}
+        self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
+        self._parameters = config.parameters
+        self._hold: Hold | None = None
+        self._taken = 0.0, 0, np.inf
+        """When the process's rate was last measured [s], how many steps it had taken then, and its rate as a factor of
+        real time."""
+        self.worker = WorkerProcess(
+            f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
+            lambda context: RosChannel(config, context), self._receive,
+        )  # fmt: skip
+
+    def attach(self, client: Client, robot: Robot | None = None) -> None:
+        """Publish a robot of the client from now on, the first unless ``robot`` is given, and obey its commands.
+
+        Waits until the process is ready; :class:`WorkerError` if it fails.
+        """
+        self.client, self.robot = client, robot or client.robot
+        self.worker.wait_until_ready(START_TIMEOUT)
+        client.post_step.append(self._after_step)
+        client.wake_readers.append(self._wake)
+        client.holds.append(self.held)
+        client.pace_limits.append(self.limit)
+        self.handler = RosCommandHandler(
+            self.robot, self._take_commands, self._finish, client.world_time,
+            lambda pcm: client.sound.play(self.robot.name, pcm),
+        )  # fmt: skip
+        client.faults_elsewhere.append(lambda: {"commands_refused": self.commands_refused})
+        client.sound.listen(self.robot.name, _Microphone(self))
+        client.pre_step.insert(0, self._control)
+        client.after_reset.append(self._begin_anew)
+        if self._leads:
+            self._simulation = SimulationControl(client, lambda reply: self.worker.send("simulated", reply))
+            client.between_steps.append(self._simulation)
+
+    # ------------------------------------------------------------------ in the loop
+
+    def held(self) -> str:
+        """Why the next step must wait, in two words: no more "ROS messages" fit on the way to the process, or it waits
+        for "ROS subscribers", which are behind. Empty when it may run.
+
+        A loop that calls it before each step, until it is empty, loses no message of a step on the way. A process that
+        is not ready, or has done nothing for :data:`HOLD_TIMEOUT`, does not hold the loop; what finds no room is lost
+        then, and counted.
+        """
+        run = self.worker.current()
+        cause = _cause_to_wait(run.shared) if self.worker.is_ready else ""
+        if not cause:
+            self._hold = None
+            return ""
+        if self._hold is None or self._hold.run is not run:
+            self._hold = Hold(
+                run, self.worker.title, "its messages are lost, and counted",
+                lambda: int(run.shared.wanted["turns"][0]),
+            )  # fmt: skip
+        return "" if self._hold.is_over() else cause
+
+    @property
+    def backlog(self) -> float:
+        """Share of the room for steps on the way to the process that is taken, 0 to 1."""
+        steps = self.worker.current().shared.steps
+        return steps.waiting_count / steps.capacity
+
+    def limit(self) -> Limit:
+        """The largest real-time factor at which the process takes every step; infinite unless steps pile up."""
+        now, steps = time.monotonic(), self.worker.current().shared.steps
+        since, before, factor = self._taken
+        if now - since >= RATE_PERIOD:
+            taken = steps.put_count - steps.waiting_count
+            factor = max(taken - before, 0) * self.client.physics.dt / (now - since)
+            self._taken = now, taken, factor
+        return Limit(factor if self.backlog > FREE_BACKLOG else np.inf, "ROS messages")
+
+    def _control(self, time: float) -> None:
+        """Apply commands; goals of a process that is gone end."""
+        if self._is_restarted:
+            self._is_restarted = False
+            self.handler.cancel_all(time)
+            if self._simulation is not None:
+                self._simulation.end_steps("the process that asked for them failed")
+        self.handler(time)
+
+    def _finish(self, result: GoalResult) -> None:
+        """Tell the process how a goal ended; its client hears of it after the steps that led there."""
+        run = self.worker.current()
+        run.send("finish", (run.shared.steps.put_count, result))
+
+    def _begin_anew(self) -> None:
+        """After a reset: obey no earlier command, and publish the new robot."""
+        self._take_commands()
+        self.robot = self.client.robots[self.robot.name]
+        self.handler.begin_anew(self.robot)
+
+    def _after_step(self, client: Client) -> None:
+        """Pass the state to the process, as far as its topics have subscribers."""
+        physics, channel = client.physics, self.worker.current().shared
+        wanted = channel.wanted["steps"]
+        has_goals = channel.wanted["goals"][0]
+        if has_goals or wanted.any():
+            sample = None
+            if has_goals or wanted[1:].any():
+                body_sensors = bool((wanted & self._reads_body_sensors).any())
+                controllers = self.handler.controllers
+                reference = JointReference(controllers.desired, controllers.desired_velocity)
+                sample = self.robot.measure(
+                    physics.time, physics.contacts, body_sensors=body_sensors, reference=reference
+                )  # fmt: skip
+            with channel.steps.put() as record:
+                if record is None:
+                    self._lost += wanted
+                else:
+                    now = physics.time + client.world_time.offset
+                    self._contacts_left_out += self._records.write(record, now, sample)
+        self._tell_of_people(client)
+        self._tell_lights()
+        truth_period = float(channel.wanted["truth_period"][0])
+        if truth_period and physics.tick % max(round(truth_period / physics.dt), 1) == 0:
+            self._write_truth(client)
+
+    def _tell_of_people(self, client: Client) -> None:
+        """Send people's intentions and hand gestures to the ROS process when they change, and to a restarted one."""
+        people: dict[str, LocalHuman | RemoteHuman] = dict(client.humans)
+        people |= {name: one for name, one in client.remote_actors.items() if isinstance(one, RemoteHuman)}
+        run = self.worker.current()
+        is_new, self._told_run = run is not self._told_run, run
+        had_people, self._had_people = self._had_people, bool(people)
+        if not (is_new or people or had_people):
+            return
+        now = client.physics.time + client.world_time.offset
+        if self._intentions.update({name: one.intention for name, one in people.items()}, now) or is_new:
+            run.send("intentions", self._intentions.intentions)
+        if self._gestures.update({name: one.pose for name, one in people.items() if one.pose is not None}) or is_new:
+            run.send("gestures", (now, self._gestures.gestures))
+
+    def _tell_lights(self) -> None:
+        """Pass what the indicator lights show to the process when it changes, and to a new run."""
+        told = self.worker.current(), self.robot.shown_lights
+        if told != self._told_lights:
+            self._told_lights = told
+            told[0].send("lights", told[1])
+
+    def _write_truth(self, client: Client) -> None:
+        """Pass true poses to the process: of bunches, boxes and people."""
+        physics, run = client.physics, self.worker.current()
+        if run is not self._run:  # a new run knows nothing yet
+            self._run, self._visuals = run, None
+            self._truth_list.close()
+            self._truth_list = VisualListSender()
+        physics.update_kinematics()
+        visuals = physics.visuals()
+        if visuals is not self._visuals:
+            self._visuals = visuals
+            self._truth_rows = np.array([i for i, one in enumerate(visuals) if one.organ in TRUTH_ORGANS], np.intp)
+            self._truth_visuals = tuple(dataclasses.replace(visuals[i], shapes=()) for i in self._truth_rows)
+        if (message := self._truth_list.update(self._truth_visuals)) is not None:
+            run.send("truth", message)
+        with run.shared.truth.writing() as truth:
+            if truth is None:
+                self._missed_truth += 1
+                return
+            truth["time"][0] = physics.time + client.world_time.offset
+            truth["attached"][:] = physics.state.bunch_attached
+            truth["bunch_q"][:] = physics.state.body_q[self._model.bunch_body]
+            truth["version"][0] = self._truth_list.version
+            self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
+
+    def hear(self, step: SoundStep) -> None:
+        """Pass what is heard at the robot to the process."""
+        self.worker.send("sound", at_place(step, self.client.sound.place_of(self.robot.name)))
+
+    def _wake(self) -> None:
+        channel = self.worker.current().shared
+        channel.steps.wake()
+        channel.truth.wake()
+
+    def _take_commands(self) -> list[Command]:
+        return [self._commands.popleft() for _ in range(len(self._commands))]
+
+    # ------------------------------------------------------------------ outside the loop
+
+    def _receive(self, kind: str, value: Any) -> None:
+        """Take a message of the process; in a thread."""
+        if kind == "commands":
+            self._commands.extend(value)
+        elif kind == "simulation" and self._simulation is not None:
+            self._simulation.put(value)
+        elif kind == "statistics":
+            self._sent, self._dropped = value["sent"], value["dropped"]
+            self._losses = collections.Counter({kind: value[kind] for kind in ("sound_lost", "commands_refused")})
+        elif kind == "parameters":
+            self._parameters.update(value)
+        elif kind == "restarted":
+            self._is_restarted = True
+            self._sent_before.update(self._sent)
+            self._dropped_before.update(self._dropped)
+            self._losses_before, self._losses = self._losses_before + self._losses, collections.Counter()
+            self._sent, self._dropped = dict.fromkeys(self._sent, 0), {}
+
+    def sent_messages(self) -> dict[str, int]:
+        """Messages sent so far, by topic."""
+        return {topic: count + self._sent_before[topic] for topic, count in self._sent.items()}
+
+    def dropped_messages(self) -> dict[str, int]:
+        """Messages that had subscribers and were not sent, by topic."""
+        dropped = collections.Counter(self._dropped) + self._dropped_before
+        dropped.update(dict(zip(self._step_topics, self._lost.tolist(), strict=True)))
+        dropped["vine/contacts"] += self._contacts_left_out
+        dropped["tf_environment"] += self._missed_truth
+        return dict(dropped)
+
+    @property
+    def sound_lost(self) -> int:
+        """Frames of voices that the microphone missed: lost on the network, too late, or not decoded."""
+        return self._losses_before["sound_lost"] + self._losses["sound_lost"]
+
+    @property
+    def commands_refused(self) -> int:
+        """Commands that contradicted themselves, or what the robot has."""
+        kind = "commands_refused"
+        return self._losses_before[kind] + self._losses[kind] + self.handler.rejected_count
+
+    def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
+        """Publish states of parts of the client on /diagnostics at simulation time ``time`` [s]."""
+        self.worker.send("diagnose", (time, list(components)))
+
+    def close(self) -> None:
+        """End the process; its counts are complete then. A second call does nothing."""
+        self.worker.close()
+        self._truth_list.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: types.TracebackType | type[BaseException] | BaseException | None) -> None:
+        self.close()
+
+
+def _cause_to_wait(channel: RosChannel) -> str:
+    if channel.steps.waiting_count < channel.steps.capacity:
+        return ""
+    return "ROS subscribers" if channel.wanted["waits"][0] else "ROS messages"
+
+
+class _Microphone:
+    """Listens for a robot while its topics of sound have subscribers."""
+
+    decodes_opus = opus.is_available()
+
+    def __init__(self, process: RosProcess) -> None:
+        self._process = process
+
+    @property
+    def is_open(self) -> bool:
+        return bool(self._process.worker.current().shared.wanted["sound"][0])
+
+    def hear(self, step: SoundStep) -> None:
+        self._process.hear(step)

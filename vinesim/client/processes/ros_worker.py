@@ -1,0 +1,313 @@
+"""The ROS process of one robot: publishes its state, the ground truth and diagnostics, and takes commands.
+
+It renders nothing and imports neither Warp nor the renderer, so that it starts at once, needs little memory, and keeps
+the rate of the topics of every step whatever the sensors do.
+"""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import dataclasses
+import pathlib
+import queue
+import sys
+import time
+from multiprocessing.connection import Connection
+from multiprocessing.context import BaseContext
+from typing import Any
+
+import numpy as np
+
+from vinesim.audio.frame import to_pcm
+from vinesim.audio.microphone import Microphone
+from vinesim.client.processes.rigid_visual_list import VisualListReceiver
+from vinesim.client.processes.shared_arrays import SharedArrays, SharedSnapshot
+from vinesim.client.processes.shared_queue import SharedQueue
+from vinesim.client.processes.step_record import StepRecords
+from vinesim.client.processes.worker_process import report_ready, serve
+from vinesim.client.sound.microphone_step import MicrophoneStep
+from vinesim.ros.commands.types import GoalResult, SimulationRequest
+from vinesim.ros.names import ros_name
+from vinesim.scene.ids import Organ
+from vinesim.scene.values import ControllerKind, ControllerSpec, RigidVisual
+
+STATE_TOPICS = ("joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "vine/markers")
+"""Topics that need a robot's state after a step, whatever robot it is."""
+TRUTH_TOPIC = "tf_environment"
+SOUND_TOPICS = ("audio", "audio_stamped")
+NICENESS = 5
+"""Behind the client's loop, before the renderer."""
+QUEUE_CAPACITY = 100
+"""Steps that may wait for the process, a second of them; the loop waits then (:meth:`RosProcess.held`)."""
+WAIT_PERIOD = 0.004
+"""Time between two looks whether subscribers are behind [s]."""
+STATISTICS_PERIOD = 0.2
+"""Wall time between two reports to the client [s]."""
+COUNT_PERIOD = 0.05
+"""Wall time between two looks at what has subscribers [s]; the node counts them half as often."""
+SWITCH_INTERVAL = 5e-4
+"""[s] The thread that receives gives way to the one that publishes after so long; Python's default is half a step."""
+POLL_PERIOD = 0.02
+"""Longest time without a look at commands and requests [s]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RosConfig:
+    """What the process needs to start: plain values only, so that it imports nothing large."""
+
+    name: str
+    """The robot's."""
+    urdf: str
+    base: str
+    namespace: str
+    """Prefix of its topics."""
+    clock: bool
+    """Whether the node may publish /clock; one of a ROS domain does."""
+    static_transforms: tuple[tuple[str, str, np.ndarray], ...]
+    poles: np.ndarray
+    """Poses [pole, 7] m, 1."""
+    records: StepRecords
+    bunch_count: int
+    bunch_of_body: np.ndarray
+    """[body] -1 for wood."""
+    controllers: tuple[ControllerSpec, ...]
+    imus: tuple[str, ...]
+    wrenches: tuple[str, ...]
+    interest_radius: float | None = None
+    """[m] Of the area around the robot within which the network sends it what others move; None without a server."""
+    params_file: pathlib.Path | None = None
+    """ROS parameters of the node."""
+    parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Values of the node's parameters that were set; the client changes it, and each run starts with it."""
+
+    @property
+    def step_topics(self) -> tuple[str, ...]:
+        """Topics that need the record of a step, or names above several such topics; /clock comes first."""
+        states = [one.name for one in self.controllers if one.kind is ControllerKind.JOINT_TRAJECTORY]
+        elastic = [one.name for one in self.controllers if one.kind is ControllerKind.SERIES_ELASTIC]
+        return ("/clock", *STATE_TOPICS, *self.imus, *self.wrenches, *states, *elastic)
+
+
+class RosChannel:
+    """What the client and the process share."""
+
+    def __init__(self, config: RosConfig, context: BaseContext) -> None:
+        self.steps = SharedQueue(config.records.dtype, QUEUE_CAPACITY, context)
+        self.truth = SharedSnapshot(
+            {
+                "time": ((1,), "f8"), "attached": ((config.bunch_count,), "?"),
+                "bunch_q": ((config.bunch_count, 7), "f4"), "version": ((1,), "i8"),  # of the list of rigid bodies
+            },
+            context,
+        )  # fmt: skip
+        self.wanted = SharedArrays(
+            {
+                "steps": ((len(config.step_topics),), "?"),
+                "truth_period": ((1,), "f8"),
+                "goals": ((1,), "?"),
+                "sound": ((1,), "?"),
+                "waits": ((1,), "?"),
+                "turns": ((1,), "i8"),
+            }
+        )
+        """Whether topics have subscribers, and actions goals, and how often true poses are wanted [s], 0 for never;
+        whether the process waits for subscribers; how often the process has looked at all this, so that the client
+        sees that it lives. Written by the process."""
+
+    def close(self) -> None:
+        """Release the memory."""
+        for part in (self.steps, self.truth, self.wanted):
+            part.close()
+
+
+def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
+    """Entry of the process: publish until told to stop."""
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run())
+
+
+class RosWorker:
+    """The robot's ROS node, fed with the records of steps."""
+
+    def __init__(self, config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
+        from vinesim.ros import middleware
+        from vinesim.ros.robot_node import RobotNode
+        from vinesim.ros.simulation_node import SimulationNode
+
+        middleware.configure(large_messages=False)
+        self.config, self.channel, self.pipe = config, channel, pipe
+        self.node = RobotNode(
+            ros_name(config.name), config.urdf, namespace=config.namespace, static_transforms=config.static_transforms,
+            controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
+            bunch_of_body=config.bunch_of_body, interest_radius=config.interest_radius, base=config.base,
+            clock=config.clock, params_file=config.params_file, parameters=config.parameters,
+        )  # fmt: skip
+        self._requests: queue.SimpleQueue[SimulationRequest] = queue.SimpleQueue()
+        self.simulation = None
+        if config.clock:
+            name = f"{ros_name(config.name)}_simulation"
+            self.simulation = SimulationNode(name, config.namespace, self._requests.put, beside=self.node)
+        poles = tuple(f"pole_{i:04d}" for i in range(len(config.poles)))
+        self.node.publish_environment_static(poles, config.poles)
+        self._bunch_names = tuple(f"bunch_{i:05d}" for i in range(config.bunch_count))
+        self._rigid = VisualListReceiver()
+        self._truth_names: tuple[str, ...] = ()
+        self._named: tuple[int, bytes] = 0, b""
+        """Version of the list of rigid bodies, and attached bunches, that :attr:`_truth_names` belong to."""
+        self._ends: collections.deque[tuple[int, GoalResult]] = collections.deque()
+        """Goals that have ended, each after how many records of steps."""
+        self._microphone = Microphone()
+        self._next_count = self._next_statistics = 0.0
+        self._pace = Pace()
+        self._reported_parameters = self.node.set_parameters
+
+    def run(self) -> None:
+        """Publish until a "stop"."""
+        report_ready(self.pipe, NICENESS)
+        with self.node, self.simulation or contextlib.nullcontext():
+            while self._take_requests():
+                record = self._next_record()
+                if record is not None:
+                    self.node.publish_clock(float(record["time"]))
+                    if record["has_state"]:
+                        self.node.publish_robot_state(self.config.records.read(record))
+                while self._ends and self._ends[0][0] <= self.channel.steps.taken_count:
+                    self.node.finish_goal(self._ends.popleft()[1])
+                if self.channel.truth.wait(0.0):
+                    self._publish_truth()
+                while not self._requests.empty():
+                    self.pipe.send(("simulation", self._requests.get()))
+                if commands := self.node.commands():
+                    self.pipe.send(("commands", commands))
+                self._report()
+        self._send_statistics()  # what was sent last is counted, too
+
+    def _next_record(self) -> Any | None:
+        """The next step to publish; None if none comes for a while, or subscribers are behind."""
+        steps, wanted = self.channel.steps, self.channel.wanted
+        begin = time.monotonic()
+        while steps.waiting_count and self.node.must_wait(now := time.monotonic()):
+            wanted["waits"][0] = True
+            if now - begin > POLL_PERIOD:
+                return None
+            time.sleep(WAIT_PERIOD)
+        wanted["waits"][0] = False
+        time.sleep(self._pace.delay(steps.put_count))
+        if (record := steps.take(POLL_PERIOD)) is not None:
+            self._pace.add()
+        return record
+
+    def _take_requests(self) -> bool:
+        """Answer the client's requests; False after a "stop"."""
+        while self.pipe.poll():
+            kind, value = self.pipe.recv()
+            if kind == "stop":
+                return False
+            if kind == "diagnose":
+                self.node.publish_diagnostics(*value)
+            elif kind == "sound":
+                self._record(value)
+            elif kind == "intentions":
+                self.node.publish_intentions(value)
+            elif kind == "gestures":
+                self.node.publish_gestures(*value)
+            elif kind == "lights":
+                self.node.publish_lights(value)
+            elif kind == "truth":
+                self._rigid.take(value)
+            elif kind == "finish":
+                self._ends.append(value)
+            elif kind == "simulated" and self.simulation is not None:
+                self.simulation.answer(value)
+        return True
+
+    def _record(self, step: MicrophoneStep) -> None:
+        """Mix what the robot hears, and publish what is complete."""
+        for frame in step.frames:
+            self._microphone.hear(frame)
+        for source, frequency, level in step.tones:
+            self._microphone.sound(source, frequency, level, step.now)
+        for block in self._microphone.blocks(step.now):
+            self.node.publish_sound(block.time + step.to_world, to_pcm(block.samples))
+
+    def _publish_truth(self) -> None:
+        """True poses of rigid bodies, and of the bunches that hang on their plants."""
+        with self.channel.truth.reading() as truth:
+            version, memory = int(truth["version"][0]), self._rigid.memory
+            if memory is None or version != self._rigid.version:  # the list has not arrived: the next poses will do
+                return
+            now, attached = float(truth["time"][0]), np.flatnonzero(truth["attached"])
+            rigid_q = memory["visual_q"][: len(self._rigid.visuals)]
+            poses = np.concatenate([rigid_q, truth["bunch_q"][attached]])
+        if (named := (version, attached.tobytes())) != self._named:
+            rigid = map(truth_frame, self._rigid.visuals)
+            self._named, self._truth_names = named, (*rigid, *(self._bunch_names[i] for i in attached))
+        self.node.publish_environment(now, self._truth_names, poses)
+
+    def _report(self) -> None:
+        """Tell the client what is subscribed to, and now and then what was sent."""
+        wanted, now = self.channel.wanted, time.monotonic()
+        wanted["turns"][0] += 1
+        wanted["goals"][0] = self.node.has_goals
+        if now >= self._next_count:
+            self._next_count = now + COUNT_PERIOD
+            wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
+            wanted["sound"][0] = any(map(self.node.has_subscribers, SOUND_TOPICS))
+            wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
+        if (parameters := self.node.set_parameters) is not self._reported_parameters:
+            self._reported_parameters = parameters
+            self.pipe.send(("parameters", parameters))
+        if now >= self._next_statistics:
+            self._next_statistics = now + STATISTICS_PERIOD
+            self._send_statistics()
+
+    def _send_statistics(self) -> None:
+        statistics: dict[str, Any] = {
+            "sent": self.node.sent, "dropped": self.node.dropped, "sound_lost": self._microphone.missed,
+            "commands_refused": self.node.refused_commands,
+        }  # fmt: skip
+        self.pipe.send(("statistics", statistics))
+
+
+class Pace:
+    """How fast steps are published that have waited: little faster than the world makes them, few at once.
+
+    Stock subscribers keep ten messages of a topic, and overwrite them when more come before they are taken. What takes
+    them may wait for a processor, and does not say so.
+    """
+
+    BURST = 5
+    """Steps that are published at once."""
+    SPEED = 1.5
+    """Rate beyond, as a multiple of the world's."""
+    LEAST = 50.0
+    """The same at least [Hz]: the world may have paused."""
+    PERIOD = 0.5
+    """Of measurements of the world's rate [s]."""
+
+    def __init__(self) -> None:
+        self._interval = 0.01
+        self._due = self._since = time.monotonic()
+        self._count = 0
+
+    def delay(self, put_count: int) -> float:
+        """Time until the next step may be published [s], after the world has put so many."""
+        now = time.monotonic()
+        if (passed := now - self._since) > self.PERIOD:
+            rate = self.SPEED * (put_count - self._count) / passed
+            self._since, self._count = now, put_count
+            self._interval = 1.0 / max(rate, self.LEAST)
+        return max(self._due - now, 0.0)
+
+    def add(self) -> None:
+        """A step is published now."""
+        earliest = time.monotonic() - (self.BURST - 1) * self._interval
+        self._due = max(self._due, earliest) + self._interval
+
+
+def truth_frame(visual: RigidVisual) -> str:
+    """Frame of a box, a picked bunch or a part of a person: ``box_3``, ``picked_bunch_00017``, ``anna/head``."""
+    if visual.organ == Organ.BUNCH:
+        return f"picked_bunch_{visual.index:05d}"
+    return f"box_{visual.index}" if visual.organ == Organ.BOX else visual.name

@@ -1,0 +1,322 @@
+"""The client's side of a sensor process, which renders and publishes the cameras and lidars of one robot.
+
+The loop writes snapshots of the world to shared memory while a sensor has subscribers, and never waits for an answer.
+"""
+
+from __future__ import annotations
+
+import collections
+import logging
+import math
+import pathlib
+import threading
+import types
+from typing import Any, Self
+
+import numpy as np
+
+from vinesim.client.client import Client
+from vinesim.client.pace import Limit
+from vinesim.client.processes.rigid_visual_list import VisualListSender
+from vinesim.client.processes.sensor_worker import POSE_HISTORY, SensorChannel, SensorConfig, run_sensor_worker
+from vinesim.client.processes.spawned_process import SENSOR_REHEARSAL, sensor_modules
+from vinesim.client.processes.worker_process import Hold, Run, WorkerProcess, cpu_use
+from vinesim.core.errors import WriteError
+from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.ros import middleware
+from vinesim.scene.model import Model
+from vinesim.scene.spec import Scene
+from vinesim.scene.values import SensorMode, SensorPacing
+from vinesim.scene.wind import wind_of
+
+log = logging.getLogger(__name__)
+
+SNAPSHOT_PERIOD = 2
+"""Ticks between two snapshots: 50 Hz, faster than any camera here."""
+START_TIMEOUT = 300.0
+"""How long the process may take to start; a first run compiles kernels [s]."""
+COUNT_TIMEOUT = 20.0
+"""How long the process may take to say what it has rendered [s]: it ends its present picture before."""
+SAVE_TIMEOUT = 60.0
+"""How long the process may take to write its pictures [s]; on a busy machine it renders first."""
+
+Counts = dict[str, dict[str, int]]
+"""Counts by sensor or topic, by what is counted."""
+
+
+def time_of_snapshot(time: float, dt: float) -> float:
+    """Simulated time of the first snapshot at ``time`` or later [s], for steps of ``dt`` [s]."""
+    period = SNAPSHOT_PERIOD * dt
+    return math.ceil(time / period - 1e-6) * period if math.isfinite(time) else time
+
+
+class SensorProcess:
+    """Cameras and lidars of one robot of the client. A context: the process ends with it."""
+
+    def __init__(
+        self,
+        name: str,
+        scene: Scene,
+        model: Model,
+        description: RobotDescription,
+        *,
+        namespace: str = "",
+        params_file: pathlib.Path | None = None,
+        ros: bool = True,
+        keep_pictures: bool = False,
+        sensor_hz: float | None = None,
+        renderer: str = "warp",
+        device: str = "cpu",
+        pacing: SensorPacing | None = None,
+        standby: bool = False,
+    ) -> None:
+        """Starts the process; :meth:`attach` connects it with a client.
+
+        ``keep_pictures`` keeps the picture of the first camera with the highest ``Client.frame_score`` for
+        :meth:`save_picture`, and renders it even without subscribers. ``sensor_hz`` replaces the sensors' own rates.
+        ``pacing``: whether simulated time waits for sensors; as the ``description`` says unless given.
+        ``standby``: another process stands by and takes its place if it fails, see :class:`WorkerProcess`.
+        """
+        self.name = name
+        self.missed_snapshots = 0
+        """Snapshots that were written one step later, as the process was just reading."""
+        self._awaited: tuple[str, ...] = ("process",)
+        self._device = device
+        self._counts: Counts = {}
+        self._counts_before: dict[str, collections.Counter[str]] = {}
+        """Counts of the runs of the process before this one."""
+        self._saved = threading.Event()
+        self._save_failure = ""
+        """Why the last picture could not be written."""
+        self._moved_trees = np.zeros(len(model.tree_first), bool)
+        """[tree] whether it moved since the last snapshot that was written."""
+        self._is_overdue = False
+        ros = ros and middleware.unavailable_reason() is None
+        config = SensorConfig(
+            name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer,
+            device, pacing=pacing or description.sensor_pacing, wind=wind_of(scene), params_file=params_file,
+        )  # fmt: skip
+        self._pacing = config.pacing
+        self._digests: dict[str, str] = {}
+        self._counted = threading.Event()
+        self._hold: Hold | None = None
+        self._frames = tuple(config.sensor_frames.values())
+        self._parameters = config.parameters
+        self.worker = WorkerProcess(
+            f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
+            lambda context: SensorChannel(config, context), self._receive,
+            rehearsal=SENSOR_REHEARSAL if standby else "",
+        )  # fmt: skip
+        self._run: Run[SensorChannel] | None = None
+        """The run of the process that snapshots were last written for."""
+        self._visuals = VisualListSender()
+        self._snapshot_count = self._pose_count = 0
+
+    def attach(self, client: Client, robot: Robot | None = None, *, wait: bool = True) -> None:
+        """Show the process the client's world from now on, as seen by its first robot unless ``robot`` is given.
+
+        Waits until the process has rendered a first picture of every sensor; :class:`WorkerError` if it fails. Without
+        ``wait`` the client may step meanwhile, and the error comes from the step after the failure.
+        """
+        self.client, self.robot = client, robot or client.robot
+        self._write(client)
+        self._wake()
+        if wait:
+            self.worker.wait_until_ready(START_TIMEOUT)
+        client.holds.append(self.held)
+        client.pace_limits.append(self.limit)
+        client.post_step.append(self._after_step)
+        client.wake_readers.append(self._wake)
+        client.after_reset.append(self._begin_anew)
+
+    # ------------------------------------------------------------------ in the loop
+
+    def held(self) -> str:
+        """Why the next step must wait: "sensors", which have not taken or, in lockstep, not sent what their mode
+        promises; empty when it may run.
+
+        A process that is not ready, or has done nothing for three seconds, holds only the steps of lockstep.
+        """
+        run, physics = self.worker.current(), self.client.physics
+        wanted = run.shared.wanted
+        if self.is_lockstep:
+            is_behind = not self.worker.is_ready or run is not self._run or wanted["shown"][0] != self._snapshot_count
+        else:
+            latest = time_of_snapshot(float(wanted["horizon"][0]), physics.dt)
+            is_behind = self.worker.is_ready and physics.time + 0.5 * physics.dt > latest
+        if self._is_overdue and (is_behind or self.is_lockstep):
+            self._write(self.client)
+            self._wake()
+            is_behind = True
+        if not is_behind:
+            self._hold = None
+            return ""
+        if self._hold is None or self._hold.run is not run:
+            self._hold = Hold(
+                run, self.worker.title, "simulated time goes on without its pictures",
+                lambda: cpu_use(run.process.pid or 0)[0],
+            )  # fmt: skip
+        return "" if self._hold.is_over() and not self.is_lockstep else "sensors"
+
+    @property
+    def is_lockstep(self) -> bool:
+        """Whether simulated time waits for every frame."""
+        return self._pacing.mode is SensorMode.LOCKSTEP
+
+    def limit(self) -> Limit:
+        """The largest real-time factor at which the sensors keep what their mode promises."""
+        run = self.worker.current()
+        return Limit(float(run.shared.wanted["factor"][0]) if self.worker.is_ready else np.inf, "sensors")
+
+    def _begin_anew(self) -> None:
+        """After a reset: all plants are elsewhere, and the sensors are on the new robot."""
+        self._moved_trees[:] = True
+        self.robot = self.client.robots[self.robot.name]
+
+    def _after_step(self, client: Client) -> None:
+        """Write the next snapshot if it is due."""
+        self.worker.raise_failure()
+        physics = client.physics
+        self._moved_trees[physics.plants.awake] = self._moved_trees[physics.remotely_posed] = True
+        if physics.tick % SNAPSHOT_PERIOD == 0 or self._is_overdue:
+            run = self.worker.current()
+            if not self.worker.is_ready or run.shared.wanted["world"][0]:
+                self._write(client)
+
+    def _write(self, client: Client) -> None:
+        """Write a snapshot of the world."""
+        physics, run = client.physics, self.worker.current()
+        if run is not self._run:  # a new run knows nothing yet
+            self._run = run
+            self._visuals.close()
+            self._visuals = VisualListSender()
+            self._snapshot_count = self._pose_count = 0
+            self._moved_trees[:] = True
+        physics.update_kinematics()
+        if (message := self._visuals.update(physics.visuals())) is not None:
+            run.send("visuals", message)
+        with run.shared.snapshot.writing() as shared:
+            self._is_overdue = shared is None
+            if shared is None:
+                self.missed_snapshots += 1
+                return
+            self._snapshot_count += 1
+            trees = np.flatnonzero(self._moved_trees)
+            self._moved_trees[:] = False
+            bodies = physics.plants.bodies_of(trees)
+            shared["body_q"][bodies] = physics.state.body_q[bodies]
+            shared["tree_number"][trees] = shared["number"][0] = self._snapshot_count
+            shared["bunch_attached"][:] = physics.state.bunch_attached
+            wires = physics.wire_shapes.poses()
+            shared["wire_count"][0] = moved = len(wires.segment)
+            shared["wire_segment"][:moved], shared["wire_q"][:moved] = wires.segment, wires.q
+            shared["wind_strength"][0] = 0.0 if (wind := physics.wind_on_plants.state) is None else wind.strength
+            if wind is not None:
+                shared["wind_time"][0] = wind.time
+                shared["tree_air"][:], shared["tree_drawn"][:] = wind.tree_air, wind.tree_drawn
+            shared["time"][0], shared["tick"][0] = physics.time, physics.tick
+            shared["frame_score"][0] = client.frame_score()
+            visual_q = physics.visual_q()
+            self._visuals.memory["visual_q"][: len(visual_q)] = visual_q
+            shared["visual_count"][0], shared["visuals_version"][0] = len(visual_q), self._visuals.version
+            row = self._pose_count % POSE_HISTORY
+            shared["pose_time"][row], shared["pose_world_offset"][row] = physics.time, client.world_time.offset
+            for pose, frame in zip(shared["pose"][row], self._frames, strict=True):
+                pose[:] = self.robot.frame_pose(frame)
+            self._pose_count += 1
+            shared["pose_count"][0] = self._pose_count
+
+    def _wake(self) -> None:
+        self.worker.current().shared.snapshot.wake()
+
+    # ------------------------------------------------------------------ outside the loop
+
+    def _receive(self, kind: str, value: Any) -> None:
+        """Take a message of the process; in a thread."""
+        if kind == "awaited":
+            self._awaited = value
+            if value:
+                log.info("the sensors of %s are not ready, awaited: %s", self.name, ", ".join(value))
+        elif kind == "statistics":
+            self._digests = value.pop("digests")
+            self._counts = value
+        elif kind == "counted":
+            self._counted.set()
+        elif kind == "parameters":
+            self._parameters.update(value)
+        elif kind == "restarted":
+            for what, counts in self._counts.items():
+                self._counts_before.setdefault(what, collections.Counter()).update(counts)
+            self._counts = {what: dict.fromkeys(counts, 0) for what, counts in self._counts.items()}
+        elif kind == "device":
+            self._device = value
+        elif kind == "saved":
+            self._save_failure = value
+            self._saved.set()
+
+    def _total(self, what: str) -> dict[str, int]:
+        before = self._counts_before.get(what, collections.Counter())
+        return {name: count + before[name] for name, count in self._counts.get(what, {}).items()}
+
+    def awaited(self) -> list[str]:
+        """What has to be done before all sensors are ready; empty when they are."""
+        if self.worker.is_ready:
+            return []
+        return [f"{self.name}: {part}" for part in self._awaited or ("process",)]
+
+    def sent_messages(self) -> dict[str, int]:
+        """ROS messages sent so far, by topic."""
+        return self._total("sent")
+
+    def dropped_messages(self) -> dict[str, int]:
+        """ROS messages that newer ones replaced before they were sent, by topic."""
+        return self._total("ros_dropped")
+
+    def report(self) -> dict[str, Any]:
+        """Frames delivered and dropped by sensor, snapshots that could not be shown or were late, restarts, device;
+        in lockstep a digest of all frames of each sensor."""
+        digests = {"frame_digests": self._digests} if self.is_lockstep else {}
+        return digests | {
+            "frames": self._total("frames"),
+            "frames_dropped": self._total("frames_dropped"),
+            "frames_skipped": self._total("frames_skipped").get("snapshots", 0),
+            "snapshots_missed": self.missed_snapshots,
+            "sensor_restarts": self.worker.restarts,
+            "sensor_device": self._device,
+        }
+
+    def complete_counts(self) -> None:
+        """Wait until the counts and digests are those of all frames so far; at most :data:`COUNT_TIMEOUT`."""
+        self._counted.clear()
+        if self.worker.is_ready:
+            self.worker.send("count")
+            self._counted.wait(COUNT_TIMEOUT)
+
+    def save_picture(self, folder: pathlib.Path) -> None:
+        """Write the kept picture: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and ``labels`` PNGs.
+
+        A process that is not ready, or fails now, costs the picture and is logged. :class:`WriteError` if the folder
+        cannot be written.
+        """
+        self._saved.clear()
+        if self.worker.is_ready:
+            self.worker.send("save", folder)
+            if self._saved.wait(SAVE_TIMEOUT):
+                if self._save_failure:
+                    raise WriteError(
+                        f"{folder} cannot be written: {self._save_failure}; make room there or give another"
+                    )
+                return
+        log.error("no picture in %s: the sensor process of %s did not save it", folder, self.name)
+
+    def close(self) -> None:
+        """End the process."""
+        self.worker.close()
+        self._visuals.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: types.TracebackType | type[BaseException] | BaseException | None) -> None:
+        self.close()

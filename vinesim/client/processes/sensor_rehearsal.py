@@ -1,0 +1,34 @@
+"""A first picture and a first revolution of a sensor process that stands by: what they load and make is there then."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.core import allocator, frames
+from vinesim.scene.generation.vineyard import generate
+from vinesim.scene.spec import load_scene
+from vinesim.scene.state import State
+from vinesim.scene.values import Snapshot
+from vinesim.sensors.camera.camera import Camera, CameraSpec
+from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
+
+SCENE, CAMERA, LIDAR = "demo", "d435", "vlp16"
+SIZE = (64, 48)
+"""Of the picture: it is the first call of each kernel that takes its time."""
+
+
+def rehearse() -> None:
+    """Render with sensors of a small vineyard on the CPU, and release their memory."""
+    load_kernels()
+    scene, spec = load_scene(SCENE), CameraSpec.load(CAMERA)
+    model = generate(scene)
+    camera = Camera(spec, spec.info("camera", size=SIZE), "camera", scene.sun.direction)
+    sensors = [ScheduledSensor(sensor, lambda _: None) for sensor in (camera, Lidar(LidarSpec.load(LIDAR), "lidar"))]
+    state, trees = State.at_rest(model), np.arange(len(model.tree_first))
+    pose = frames.pose(np.array([0.0, 0.0, 1.0]))
+    snapshot = Snapshot(0.0, 0, state.body_q, state.bunch_attached, (), np.zeros((0, 7)), trees)
+    for _ in SensorScheduler(model, sensors).warm_up(snapshot, {sensor.name: pose for sensor in sensors}):
+        pass
+    del sensors, camera, model, state, snapshot
+    allocator.release_free_memory()

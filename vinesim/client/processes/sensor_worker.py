@@ -1,0 +1,443 @@
+"""The sensor process of one robot: renders what is subscribed to, and publishes it as the drivers of sensors do."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import logging
+import pathlib
+import sys
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from multiprocessing.connection import Connection
+from multiprocessing.context import BaseContext
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vinesim.client.processes.picture_keeper import PictureKeeper
+from vinesim.client.processes.rigid_visual_list import VisualListMessage, VisualListReceiver
+from vinesim.client.processes.shared_arrays import SharedArrays, SharedSnapshot
+from vinesim.client.processes.worker_process import report_ready, serve
+from vinesim.client.world_time import OffsetHistory
+from vinesim.core import allocator, progress
+from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
+from vinesim.plants.device_buffers import device_fault
+from vinesim.robot.description.description import RobotDescription
+from vinesim.ros.names import ros_name
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+from vinesim.scene.values import (
+    CameraFrame,
+    CameraOutput,
+    LidarScan,
+    SegmentPoses,
+    SensorMode,
+    SensorPacing,
+    Snapshot,
+    WindState,
+)
+from vinesim.scene.wind import Wind
+from vinesim.wires.wire_segments import wire_segments
+
+if TYPE_CHECKING:
+    from vinesim.ros.sensor_node import SensorNode
+    from vinesim.sensors.camera.sunlight import SunPath
+    from vinesim.sensors.scheduler import SensorScheduler
+
+log = logging.getLogger(__name__)
+
+STATISTICS_PERIOD = 0.2
+"""Wall time between two reports to the client [s]."""
+SEND_POLL = 5e-4
+"""Time between two looks whether all messages were sent [s]."""
+POLL_PERIOD = 0.02
+"""Longest time without a look at requests and subscribers [s]."""
+SWITCH_INTERVAL = 5e-4
+"""How long one thread here may hold the interpreter lock when another wants it [s]."""
+NICENESS = 10
+"""The client's loop and its ROS process come first, but a renderer that is much nicer starves beside other programs
+(docs/decisions/sensor-process.md)."""
+POSE_HISTORY = 128
+"""Poses of the sensors that are kept for lidars: of 2.5 s."""
+OFFSET_HISTORY = 512
+"""Offsets of the world's time that are kept for the stamps of scans: of 10 s."""
+
+
+LIVE = SensorPacing()
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorConfig:
+    """What the process needs to start."""
+
+    name: str
+    """The robot's."""
+    model: Model
+    description: RobotDescription
+    sun: SunPath
+    namespace: str
+    """Prefix of its topics."""
+    ros: bool
+    """Whether it runs a ROS node."""
+    keep_pictures: bool
+    """Whether the best picture of the first camera is kept, which renders it even without subscribers."""
+    sensor_hz: float | None
+    """Rate of all sensors [Hz]; None: each sensor's own."""
+    renderer: str = "warp"
+    device: str = "cpu"
+    """Where they compute; the CPU from the next start on if a GPU fails."""
+    pacing: SensorPacing = LIVE
+    wind: Wind | None = None
+    """That of the scene."""
+    params_file: pathlib.Path | None = None
+    """ROS parameters of its node."""
+    parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
+    """Values of the node's parameters that were set; the client changes it, and each run starts with it."""
+
+    @property
+    def sensor_frames(self) -> dict[str, str]:
+        """Link that carries each camera and lidar, by name; the order of poses in snapshots."""
+        return {mount.name: mount.frame for mount in (*self.description.cameras, *self.description.lidars)}
+
+
+class SensorChannel:
+    """What the client and the process share: the newest snapshot of the world, and what is wanted."""
+
+    def __init__(self, config: SensorConfig, context: BaseContext) -> None:
+        model, sensors = config.model, len(config.sensor_frames)
+        bodies, trees, bunches = len(model.body_mass), len(model.tree_first), len(model.bunch_body)
+        wires = len(wire_segments(model))
+        self.snapshot = SharedSnapshot(
+            {
+                "time": ((1,), "f8"), "frame_score": ((1,), "f8"),
+                "tick": ((1,), "i8"), "number": ((1,), "i8"),  # counts snapshots from 1
+                "visuals_version": ((1,), "i8"), "visual_count": ((1,), "i8"),
+                "body_q": ((bodies, 7), "f4"), "bunch_attached": ((bunches,), "?"),
+                "wire_count": ((1,), "i8"), "wire_segment": ((wires,), "i8"), "wire_q": ((wires, 7), "f4"),
+                "tree_number": ((trees,), "i8"),  # the snapshot in which each tree moved last
+                "wind_time": ((1,), "f8"), "wind_strength": ((1,), "f8"),  # 0: calm
+                "tree_air": ((trees, 3), "f4"), "tree_drawn": ((trees,), "f4"),
+                "pose_count": ((1,), "i8"), "pose_time": ((POSE_HISTORY,), "f8"),  # a ring of sensor poses
+                "pose": ((POSE_HISTORY, sensors, 7), "f8"), "pose_world_offset": ((POSE_HISTORY,), "f8"),
+            },
+            context,
+        )  # fmt: skip
+        self.wanted = SharedArrays(
+            {"world": ((1,), "?"), "horizon": ((1,), "f8"), "factor": ((1,), "f8"), "shown": ((1,), "i8")}
+        )
+        """Whether snapshots of the world are wanted; which simulated time the world must not pass before another is
+        taken [s]; the largest real-time factor that the sensors can follow; number of the newest snapshot of which all
+        is rendered and sent. Written by the process."""
+        self.wanted["horizon"][0] = self.wanted["factor"][0] = np.inf
+
+    def close(self) -> None:
+        """Release the memory."""
+        self.snapshot.close()
+        self.wanted.close()
+
+
+def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connection) -> None:
+    """Entry of the process: render and publish until told to stop."""
+    sys.setswitchinterval(SWITCH_INTERVAL)
+
+    def work() -> None:
+        with contextlib.ExitStack() as stack:
+            SensorWorker(config, channel, pipe, stack).run()
+
+    serve("sensor process", pipe, work)
+
+
+class SensorWorker:
+    """The robot's sensors and their ROS node, fed with snapshots."""
+
+    def __init__(
+        self, config: SensorConfig, channel: SensorChannel, pipe: Connection, stack: contextlib.ExitStack
+    ) -> None:
+        """Starts the node and the sensors in ``stack``."""
+        self.config, self.channel, self.pipe = config, channel, pipe
+        self.frames_skipped = 0
+        """Snapshots that could not be shown as their list of bodies had not arrived."""
+        self._state = State.at_rest(config.model)
+        self._visuals = VisualListReceiver()
+        self._missing_version: int | None = None
+        """Version of the list of bodies that the newest snapshot belongs to, if that has not arrived."""
+        self._offsets = OffsetHistory(OFFSET_HISTORY)
+        self._last_number = 0
+        self._pose_count = 0
+        self._keeper = PictureKeeper() if config.keep_pictures else None
+        self._is_lockstep = config.pacing.mode is SensorMode.LOCKSTEP
+        self._digests = {name: hashlib.blake2b(digest_size=16) for name in config.sensor_frames}
+        """Of all that each sensor has delivered, in lockstep."""
+        self._time = self._frame_score = 0.0  # of the newest snapshot
+        self._next_statistics = 0.0
+        self._awaits("kernels and scene")
+        self.node = self._open_node(stack) if config.ros else None
+        self._reported_parameters = None if self.node is None else self.node.set_parameters
+        self.scheduler = self._open_sensors()
+
+    def _awaits(self, *parts: str) -> None:
+        self.pipe.send(("awaited", parts))
+
+    @contextlib.contextmanager
+    def _awaiting_progress(self) -> Iterator[None]:
+        """Tell the client how far this process is with what takes long, which also shows that it does not hang."""
+        handler = logging.Handler()
+        handler.emit = lambda record: self._awaits(record.getMessage()) if record.getMessage() else None
+        progress.log.setLevel(logging.INFO)
+        progress.log.addHandler(handler)
+        try:
+            yield
+        finally:
+            progress.log.removeHandler(handler)
+
+    # ------------------------------------------------------------------ construction
+
+    def _open_node(self, stack: contextlib.ExitStack) -> SensorNode:
+        from vinesim.ros.sensor_node import SensorNode
+
+        config, description = self.config, self.config.description
+        return stack.enter_context(
+            SensorNode(
+                f"{ros_name(config.name)}_sensors", namespace=config.namespace,
+                cameras=[m.name for m in description.cameras], lidars=[m.name for m in description.lidars],
+                rates=self._rates(), params_file=config.params_file, parameters=config.parameters,
+            )
+        )  # fmt: skip
+
+    def _rates(self) -> dict[str, float]:
+        """Rates of all sensors at the start [Hz]."""
+        from vinesim.sensors.camera.camera import CameraSpec
+        from vinesim.sensors.lidar.lidar import LidarSpec
+
+        given, description = self.config.sensor_hz, self.config.description
+        cameras = {m.name: given or m.rate or CameraSpec.load(m.type).rate.value for m in description.cameras}
+        return cameras | {m.name: given or LidarSpec.load(m.type).rate.value for m in description.lidars}
+
+    def _present_rate(self, name: str) -> Callable[[], float] | None:
+        """The rate of a sensor that its parameter says."""
+        return None if self.node is None else partial(self.node.rate, name)
+
+    def _open_sensors(self) -> SensorScheduler:
+        from vinesim.sensors.camera.camera import Camera, CameraSpec
+        from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+        from vinesim.sensors.primitives.scene_primitives import Primitives
+        from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
+
+        device = self._working_device()
+        with self._awaiting_progress():
+            compile_kernels(SENSOR_PACKAGES, device)
+        self._awaits("kernels and scene")
+        if device == "cpu":
+            load_kernels()
+        config, sensors = self.config, []
+        seed = zlib.crc32(config.name.encode())  # no two robots have the same noise
+        for i, mount in enumerate(config.description.cameras):
+            spec = CameraSpec.load(mount.type)
+            info = spec.info(mount.frame, size=mount.size)
+            camera = Camera(spec, info, mount.name, config.sun, quality=mount.quality, seed=seed, device=device)
+            wanted = self._camera_demand(mount.name, self._keeper if i == 0 else None)
+            rate, present = config.sensor_hz or mount.rate, self._present_rate(mount.name)
+            sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, rate, present))
+        for mount in config.description.lidars:
+            lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed, device=device)
+            wanted = self._lidar_demand(mount.name)
+            present = self._present_rate(mount.name)
+            sensors.append(ScheduledSensor(lidar, self._deliver_lidar, wanted, config.sensor_hz, present))
+        primitives = Primitives(config.model, renderer=config.renderer, device=device)
+        return SensorScheduler(
+            config.model, sensors, primitives=primitives, pacing=config.pacing, on_taken=self._publish_pace
+        )
+
+    def _working_device(self) -> str:
+        """The device of the configuration, or the CPU if it cannot be used any more, which is logged and reported."""
+        device = self.config.device
+        if device != "cpu" and (fault := device_fault(device)) is not None:
+            log.error("cameras and lidars of %s compute on the CPU: %s", self.config.name, fault)
+            device = "cpu"
+        self.pipe.send(("device", device))
+        return device
+
+    def _camera_demand(self, name: str, keeper: PictureKeeper | None) -> Callable[[], CameraOutput]:
+        """The outputs of a camera that its subscribers need now, and its ``keeper``."""
+        whole = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
+        node = self.node
+
+        def demand() -> CameraOutput:
+            if self._is_lockstep:
+                return whole if node is None else whole | node.camera_outputs_wanted(name)
+            is_kept = keeper is not None and keeper.wants(self._time, self._frame_score)
+            wanted = CameraOutput.NONE if node is None else node.camera_outputs_wanted(name)
+            return wanted | whole if is_kept else wanted
+
+        return demand
+
+    def _lidar_demand(self, name: str) -> Callable[[], CameraOutput]:
+        """What the subscribers of a lidar need now."""
+        node = self.node
+        if self._is_lockstep:
+            return lambda: CameraOutput.DEPTH
+        return lambda: CameraOutput.NONE if node is None else node.lidar_outputs_wanted(name)
+
+    # ------------------------------------------------------------------ loop
+
+    def run(self) -> None:
+        """Warm the sensors up with the first snapshot, report "ready", then render until a "stop"."""
+        is_ready = False
+        self._awaits("snapshot of the world")
+        while self._take_requests():
+            if self._wait_for_snapshot() and (world := self._read()) is not None:
+                snapshot, earlier = world
+                poses = earlier.pop()[1]
+                if is_ready:
+                    self.scheduler.advance(snapshot, poses, earlier)
+                    if self._is_lockstep:
+                        self._wait_until_sent()
+                else:
+                    for name in self.scheduler.warm_up(snapshot, poses):
+                        self._awaits(name)
+                    is_ready = True
+                    self._awaits()
+                    report_ready(self.pipe, NICENESS)
+                    allocator.release_free_memory()  # takes 0.1 s, which nothing has to wait for
+                self.channel.wanted["shown"][0] = self._last_number
+            is_rendering = any(sensor.wanted() for sensor in self.scheduler.sensors)
+            self.channel.wanted["world"][0] = is_rendering or self._keeper is not None
+            self._publish_pace()
+            self._report_parameters()
+            if time.monotonic() >= self._next_statistics:
+                self._next_statistics = time.monotonic() + STATISTICS_PERIOD
+                self.pipe.send(("statistics", self._statistics()))
+
+    def _publish_pace(self) -> None:
+        """Tell the client how far the world may go on, and how fast."""
+        wanted = self.channel.wanted
+        wanted["horizon"][0] = self.scheduler.horizon()
+        wanted["factor"][0] = self.scheduler.sustainable_factor()
+
+    def _wait_until_sent(self) -> None:
+        """Return when all messages of the frames that were delivered have been sent."""
+        while self.node is not None and self.node.has_pending:
+            time.sleep(SEND_POLL)
+
+    def _report_parameters(self) -> None:
+        """Tell the client which parameters were set, so that a further run starts with them."""
+        if self.node is not None and (parameters := self.node.set_parameters) is not self._reported_parameters:
+            self._reported_parameters = parameters
+            self.pipe.send(("parameters", parameters))
+
+    def _wait_for_snapshot(self) -> bool:
+        """Whether there is a snapshot to read: a new one, or one that was skipped and whose list arrived since."""
+        return self.channel.snapshot.wait(POLL_PERIOD) or self._visuals.version == self._missing_version
+
+    def _take_requests(self) -> bool:
+        """Do what the client asks for; False after a "stop"."""
+        while self.pipe.poll():
+            kind, value = self.pipe.recv()
+            if kind == "stop":
+                return False
+            if kind == "visuals":
+                assert isinstance(value, VisualListMessage)
+                self._visuals.take(value)
+            elif kind == "save":
+                self._save_kept_frame(value)
+            elif kind == "count":
+                self.pipe.send(("statistics", self._statistics()))
+                self.pipe.send(("counted", None))
+        return True
+
+    def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
+        """The newest snapshot, and sensor poses with their times [s] since the last one; the last are of its time.
+
+        None if it was read before: it was written between the signal for the last one and its reading. None, and
+        counted, if the list of bodies that it belongs to has not arrived.
+        """
+        with self.channel.snapshot.reading() as shared:
+            if shared["number"][0] == self._last_number:
+                return None
+            memory, version = self._visuals.memory, int(shared["visuals_version"][0])
+            if memory is None or version != self._visuals.version:
+                self.frames_skipped += 1
+                self._missing_version = version
+                return None
+            self._missing_version = None
+            visual_q = memory["visual_q"][: int(shared["visual_count"][0])].copy()
+            has_moved = shared["tree_number"] > self._last_number
+            bodies = np.flatnonzero(has_moved[self.config.model.body_tree])
+            self._state.body_q[bodies] = shared["body_q"][bodies]
+            self._last_number = int(shared["number"][0])
+            wires = int(shared["wire_count"][0])
+            wire_poses = SegmentPoses(shared["wire_segment"][:wires].copy(), shared["wire_q"][:wires].copy())
+            wind = None
+            if self.config.wind is not None and shared["wind_strength"][0] > 0.0:
+                wind = WindState(
+                    self.config.wind, float(shared["wind_time"][0]), float(shared["wind_strength"][0]),
+                    shared["tree_air"].copy(), shared["tree_drawn"].copy(),
+                )  # fmt: skip
+            self._state.bunch_attached[:] = shared["bunch_attached"]
+            self._frame_score = float(shared["frame_score"][0])
+            self._time = time = float(shared["time"][0])
+            tick = int(shared["tick"][0])
+            count = int(shared["pose_count"][0])
+            rows = np.arange(max(self._pose_count, count - POSE_HISTORY), count) % POSE_HISTORY
+            times, poses = shared["pose_time"][rows], shared["pose"][rows]
+            offsets = shared["pose_world_offset"][rows]
+            self._pose_count = count
+        for t, offset in zip(times, offsets, strict=True):
+            self._offsets.add(float(t), float(offset))
+        state, names = self._state, tuple(self.config.sensor_frames)
+        snapshot = Snapshot(
+            time, tick, state.body_q, state.bunch_attached, self._visuals.visuals, visual_q,
+            np.flatnonzero(has_moved), wind, wire_poses,
+        )  # fmt: skip
+        return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
+
+    def _statistics(self) -> dict[str, Any]:
+        """What was rendered, sent and dropped."""
+        statistics: dict[str, Any] = {
+            "frames": dict(self.scheduler.frames),
+            "frames_dropped": dict(self.scheduler.dropped),
+            "frames_skipped": {"snapshots": self.frames_skipped},
+            "digests": {name: digest.hexdigest() for name, digest in self._digests.items()},
+        }
+        if self.node is not None:
+            statistics |= {"sent": self.node.sent, "ros_dropped": self.node.dropped}
+        return statistics
+
+    def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
+        assert isinstance(frame, CameraFrame)
+        if self._is_lockstep:
+            self._digest(frame.name, frame.time, frame.rgb, frame.depth, frame.labels)
+        if self.node is not None:
+            self.node.publish_camera(dataclasses.replace(frame, time=self._offsets.world_time(frame.time)))
+        keeper = self._keeper if frame.name == self.scheduler.sensors[0].name else None
+        if keeper is not None and keeper.wants(frame.time, self._frame_score):
+            keeper.keep(frame, self._frame_score)
+
+    def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
+        assert isinstance(scan, LidarScan)
+        if self._is_lockstep:
+            self._digest(scan.name, scan.time, scan.xyz, scan.intensity, scan.labels)
+        if self.node is not None:
+            self.node.publish_lidar(dataclasses.replace(scan, time=self._offsets.world_time(scan.time)))
+
+    def _digest(self, name: str, moment: float, *arrays: np.ndarray | None) -> None:
+        digest = self._digests[name]
+        digest.update(np.float64(moment).tobytes())
+        for array in arrays:
+            digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+
+    def _save_kept_frame(self, folder: pathlib.Path) -> None:
+        failure = ""
+        if self._keeper is not None and self._keeper.frame is not None:
+            from vinesim.sensors.export import images
+
+            try:
+                images.save_frame(self._keeper.frame, folder, "")
+            except OSError as bad:
+                failure = bad.strerror or str(bad)
+        self.pipe.send(("statistics", self._statistics()))
+        self.pipe.send(("saved", failure))

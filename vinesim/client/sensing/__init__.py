@@ -1,1 +1,0 @@
-"""The process that renders a robot's sensors and runs its ROS node."""

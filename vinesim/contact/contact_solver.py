@@ -1,0 +1,254 @@
+"""Contacts of plants with rigid bodies and with each other: one solve a step, shared by plants and rigid bodies.
+
+Both sides predict how fast they would move without contacts, and how an impulse changes that. The impulses that keep
+them apart are then found for both at once, so they feel equal and opposite forces in the same step. Solving them in
+turn with penalty springs instead (a *staggered* scheme) is unstable from 1e4 N/m on.
+
+Stages: :meth:`ContactSolver.wake_near_trees` (``detection``: broadphase), the prediction of the plants,
+:meth:`ContactSolver.solve` (``detection``: narrowphase; ``impulse_solver``: islands and impulses).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters
+from vinesim.contact.detection import ContactDetection
+from vinesim.contact.impulse_solver import ImpulseSolver
+from vinesim.contact.plant_capsules import nearest_body, plant_capsules
+from vinesim.kernels.contact import structs
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.model import Model
+from vinesim.scene.values import Contact
+from vinesim.wires.deflected_wires import DeflectedWires
+
+
+class ContactSolver:
+    """Contacts between the plants and the rigid world of one step.
+
+    ``wake_near_trees()`` (before ``plants.predict()``) wakes the trees that an actor is near to; ``solve()`` (after it)
+    leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.integrate()``.
+
+    Robots, people, boxes and free bunches wake the trees that they are near to, awake trees those that they touch.
+    Static geoms (ground, trellis, wood) only hold back what moves already. What overlaps in the scene as generated is
+    in contact only beyond that. All numbers come from ``rigid.parameters``; of more contacts than
+    ``contact_capacity``, the deepest are kept, and ``dropped_contacts`` and ``overflow_message`` report it.
+    """
+
+    def __init__(
+        self, model: Model, plants: ArticulationSolver, rigid: RigidWorld, wires: DeflectedWires | None = None
+    ) -> None:
+        """``wires``: those that give to what presses on them; without, none does."""
+        self.model, self.plants, self.rigid, self.parameters = model, plants, rigid, rigid.parameters
+        self.capsules = plant_capsules(model)
+        self.plant_plant_contacts = True
+        """Whether bunches and branches of awake trees touch each other too."""
+        self.count = 0
+        """Contacts of the last step, those without force included."""
+        self.dropped_contacts = 0
+        """Contacts left out since the start, for want of room."""
+        self.overflow_message = ""
+        """When contacts were last left out and how many: empty if never."""
+        self.skipped_geoms = 0
+        """Static geoms left out since the start, as more of them were near one tree than there is room for."""
+        self.near_trees = np.zeros(0, np.int32)
+        """Trees [k] whose box a robot or a moving box reaches into: these must not fall asleep."""
+        self.remote_actors: set[str] = set()
+        """Robots and people that another client controls. Their contacts are computed by that client: here they touch
+        only remote trees, so that each contact counts once and a distant copy disturbs nothing.
+        """
+        self.remote_trees = np.zeros(len(model.tree_first), np.bool_)
+        """[tree] whether another client owns its state; to be written by the client."""
+        self._awake = np.zeros(0, np.int32)
+        self._reported: tuple[Contact, ...] | None = ()
+        self._touched: tuple[tuple[int, str], ...] | None = ()
+        self._generation = 0
+        self._kernel_parameters = numbers = kernel_parameters(self.parameters)
+        self._arrays = PlantArrays(model, plants, self.capsules)
+        self._rigid_arrays: RigidArrays | None = None
+        self.detection = ContactDetection(plants, self._arrays, self.parameters, numbers)
+        self.impulses = ImpulseSolver(plants, rigid, self._arrays, self.parameters, numbers, wires)
+        self._wires, self._deflected = wires, np.zeros(0, int)
+        self._update_rigid_world()
+        self.update_tree_bounds(np.arange(len(model.tree_first), dtype=np.int32))
+
+    # ------------------------------------------------------------------ stages of a step
+
+    def wake_near_trees(self) -> None:
+        """Wake the trees that a robot, a person or a moving object is near to; the rest cost one comparison each."""
+        if self._generation != self.rigid.generation:
+            self._update_rigid_world()
+        if self._awake is not self.plants.awake:
+            fallen_asleep = self._awake[~self.plants.state.tree_awake[self._awake]]
+            if len(fallen_asleep):
+                self.update_tree_bounds(fallen_asleep)
+        if self._wires is not None and (len(self._deflected) or len(self._wires.deflected)):
+            self.detection.move_wires(np.union1d(self._deflected, self._wires.deflected), self._wires)
+            self._deflected = self._wires.deflected.copy()
+        self.near_trees = self.detection.find_near_trees()
+        if self.detection.counters[structs.NEAR_ASLEEP]:
+            self.plants.wake(self.near_trees)
+
+    def solve(self) -> None:
+        """Find the contacts of all awake trees, and of those that these wake, and their forces."""
+        self.count, self._reported, self._touched = 0, (), ()
+        self._awake = self.plants.awake
+        if len(self._awake):
+            self._awake = awake = self._wake_reached_trees()
+            self._find_contacts(awake)
+        if self.count:
+            self.impulses.solve(self.count)
+            self._reported = self._touched = None
+        else:
+            self.impulses.clear()
+
+    def _wake_reached_trees(self) -> np.ndarray:
+        """Wake the sleeping trees that awake ones touch, those that these touch, and so on.
+
+        Returns all awake trees [k].
+        """
+        plants, detection, candidates = self.plants, self.detection, self.detection.candidates
+        while len(reached := detection.find_reached_trees(plants.awake, self.plant_plant_contacts)):
+            plants.wake(reached)
+            plants.predict(reached)
+        if detection.candidates is not candidates:
+            self.impulses.bind_launches(detection)
+        return plants.awake
+
+    def _find_contacts(self, awake: np.ndarray) -> None:
+        """List the contacts of the awake trees; of too many, the deepest."""
+        detection, impulses, capacity = self.detection, self.impulses, self.impulses.capacity
+        impulses.find_contacts()
+        counters = detection.counters.tolist()
+        count, overflow = counters[structs.CONTACTS], counters[structs.OVERFLOW]
+        self.skipped_geoms += counters[structs.SKIPPED_GEOMS]
+        if count > capacity:
+            overflow += count - capacity
+            impulses.contacts.source[:] = detection.deepest(len(awake), capacity)
+            detection.counters[structs.CONTACTS] = count = capacity
+            impulses.build_islands()
+        if overflow:
+            self.dropped_contacts += overflow
+            self.overflow_message = (
+                f"{overflow} of {count + overflow} contacts of one step were left out, the shallowest; there is room "
+                f"for {capacity}, and for {len(detection.slots)} at one tree: raise contact_capacity or "
+                "max_contacts_per_tree of PhysicsParameters, or touch less at once"
+            )
+        if counters[structs.IMPACTED_TREES]:
+            self._predict_impacted(awake)
+        self.count = count
+
+    def _predict_impacted(self, awake: np.ndarray) -> None:
+        """Integrate trees that are about to suffer an impact with phi = 1 from this step on.
+
+        The trapezoidal rule moves a body by the mean of its velocities before and after: a body hit from rest would
+        give way only half as far as it must, overlap, and be thrown out again.
+        """
+        impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
+        changed = impacted[self.plants.phi_used[impacted] < 1.0]
+        if len(changed):
+            self.plants.use_backward_euler(impacted)
+            self.plants.predict(changed)
+
+    def report_wires(self) -> None:
+        """Tell the wires what plants pressed on them in the last step."""
+        if self.count:
+            self.impulses.report_wires()
+
+    # ------------------------------------------------------------------ results
+
+    @property
+    def bodies(self) -> np.ndarray:
+        """Plant bodies in contact [n], sorted."""
+        return self.impulses.bodies
+
+    @property
+    def wrenches(self) -> np.ndarray:
+        """[n, 6] N, N m on ``bodies``, at their origins, world axes."""
+        return self.impulses.wrenches
+
+    @property
+    def rigid_force(self) -> np.ndarray | None:
+        """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
+        return self.impulses.rigid_force
+
+    @property
+    def trees_touched_by_copies(self) -> np.ndarray:
+        """[tree] whether copies of remote actors touch it; to be written by the client."""
+        return self._arrays.trees.is_remote
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """The contacts of the last step that press, sorted by (tree, body, capsule, other).
+
+        Static geoms have the actor ``world`` (links ``ground``, ``fixed/7``), other plants the actor ``plants`` (links
+        ``body/42``).
+        """
+        if self._reported is None:
+            n, contacts = self.count, self.impulses.contacts
+            force, pressure = contacts.force[:n], self.impulses.rows.impulse[0 : 3 * n : 3]
+            self._reported = tuple(
+                Contact(
+                    *self._actor_and_link(other), int(contacts.body[c]), contacts.point[c].copy(), -force[c],
+                    float(contacts.gap[c]),
+                )
+                for c, other in enumerate(contacts.other[:n].tolist())
+                if pressure[c] > 0.0
+            )  # fmt: skip
+        return self._reported
+
+    @property
+    def contact_pairs(self) -> np.ndarray:
+        """[k, 2] Pairs of awake trees that were in contact in the last step."""
+        contacts = self.impulses.contacts
+        of_plants = np.flatnonzero(contacts.other_body[: self.count] >= 0)
+        return self.model.body_tree[np.stack([contacts.body[of_plants], contacts.other_body[of_plants]], -1)]
+
+    @property
+    def touched_trees(self) -> tuple[tuple[int, str], ...]:
+        """(tree, actor) for every tree that an actor pressed on in the last step, sorted."""
+        if self._touched is None:
+            self._touched = tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
+        return self._touched
+
+    def _actor_and_link(self, other: int) -> tuple[str, str]:
+        """Actor and link of the other side of a contact."""
+        if other < 0:
+            return "plants", f"body/{self.capsules.body[-1 - other]}"
+        assert self._rigid_arrays is not None
+        return self._rigid_arrays.listed.actor[other], self._rigid_arrays.listed.link[other]
+
+    # ------------------------------------------------------------------ queries and updates between steps
+
+    def nearest_body(self, points: np.ndarray, max_distance: float) -> tuple[float, int] | None:
+        """See :func:`vinesim.contact.plant_capsules.nearest_body`; searches all trees near ``points`` [k, 3]
+        m."""
+        low, high = points.min(0) - max_distance, points.max(0) + max_distance
+        boxes = self.detection.tree_boxes
+        trees = np.flatnonzero(((boxes.low <= high) & (low <= boxes.high)).all(1))
+        if len(trees) == 0:
+            return None
+        self.plants.forward_kinematics(trees)
+        return nearest_body(self.capsules, self.model, self.plants.state, trees, points, max_distance)
+
+    def update_tree_bounds(self, trees: np.ndarray) -> None:
+        """Bring the boxes of trees [k] that sleep up to date after they were moved."""
+        self.detection.update_tree_bounds(trees)
+
+    def let_pass(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
+        """See :meth:`ContactDetection.let_pass`."""
+        self.detection.let_pass(bunch, low, high)
+
+    def _update_rigid_world(self) -> None:
+        """Take over the rigid world after an actor came or went, a hand opened or closed, or a bunch took a body."""
+        previous = self._rigid_arrays
+        if previous is not None and previous.world is self.rigid.mj_model:
+            self._generation = self.rigid.generation
+            self.impulses.renumber_geoms(previous.update(self.rigid, self.remote_actors))
+            self.detection.update_rigid_geoms()
+            return
+        self._rigid_arrays = arrays = RigidArrays(self.rigid, self.remote_actors, self._kernel_parameters, previous)
+        self._generation = self.rigid.generation
+        self.detection.set_rigid_world(arrays)
+        self.impulses.set_rigid_world(arrays, self.detection, previous)

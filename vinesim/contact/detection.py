@@ -1,0 +1,266 @@
+"""Collision detection of plants: boxes of trees and geoms, trees that actors are near, and candidates of contacts.
+
+The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then, with the
+prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake ones touch) and
+:attr:`ContactDetection.narrowphase` (of the awake trees). Kernels are bound to their arrays once for each listing of
+the rigid world: a bound launch costs a fifth of a plain one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+import warp as wp
+
+from vinesim.contact.collision_arrays import PlantArrays, RigidArrays
+from vinesim.core.warp_arrays import SharedArrays, entry, share
+from vinesim.kernels.contact import (
+    broadphase,
+    narrowphase_plants,
+    narrowphase_rigid,
+    sleeping_trees,
+    structs,
+    sweep_order,
+)
+from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.kernels.shared_launch import ONCE
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.rigid.collision_geoms import PLANE_HALF_SIZE
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.wires.deflected_wires import DeflectedWires
+
+AABB_BLOCK = int(structs.AABB_BLOCK)
+TREES_PER_CHUNK = {"boxes": 8, "rigid": 2, "plants": 4}
+"""Trees that a thread takes at a time: work of 3 to 8 us. DERIVED from the times of one tree of 17 bodies."""
+MAX_PASSING_BUNCHES = 4
+"""Picked bunches that can pass through one tree at once; a further one touches it at once."""
+PAIRS_AT_ONCE = 64
+"""Pairs of capsules and geoms of one tree that are looked at in one go."""
+MIN_TREE_ROOM = 64
+"""Rows of the candidates that are allocated at least; more when more trees are awake."""
+_NO_TREES = np.zeros(0, np.intp)
+
+
+class ContactDetection:
+    """Finds which trees actors are near, and where awake trees touch rigid geoms, each other and themselves."""
+
+    def __init__(
+        self,
+        plants: ArticulationSolver,
+        arrays: PlantArrays,
+        parameters: PhysicsParameters,
+        kernel_parameters: structs.Parameters,
+    ) -> None:
+        self.plants, self.arrays, self.parameters = plants, arrays, parameters
+        self._kernel_parameters = kernel_parameters
+        trees = len(arrays.trees.is_fine)
+        self._order = np.arange(trees, dtype=np.int32)
+        self._sorted_rows = np.zeros((2, trees), np.int32)
+        self._is_near, self._is_reached = np.zeros(trees, np.bool_), np.zeros(trees, np.bool_)
+        self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
+        self._passing = np.full((trees, MAX_PASSING_BUNCHES), -1, np.int32)
+        self.counters = np.zeros(structs.COUNTERS, np.int32)
+        """See :mod:`vinesim.kernels.contact.structs`."""
+        self.tree_boxes = SharedArrays.zeros(structs.Aabbs, trees)
+        self._wood_boxes = SharedArrays.zeros(structs.Aabbs, trees)
+        blocks = -(-trees // AABB_BLOCK)
+        self._blocks, self._block_boxes = np.zeros(blocks, np.int32), SharedArrays.zeros(structs.Aabbs, blocks)
+        self._listed: np.ndarray | None = None
+        """Awake trees that the kernels' lists are about; None after others were listed."""
+        self._block_count = ctypes.c_int32()
+        """Blocks of these trees."""
+        self._searching_trees, self._paired_trees = ctypes.c_int32(), ctypes.c_int32()
+        """Awake trees that look for sleeping ones, and for each other."""
+        self.slots = np.arange(parameters.max_contacts_per_tree)
+        self._room = 0
+
+    def set_rigid_world(self, rigid_arrays: RigidArrays) -> None:
+        """Take over the geoms of the rigid world after it was compiled anew."""
+        self.rigid_arrays, self._static_bounded = rigid_arrays, False
+        self._static_blocks = SharedArrays.zeros(structs.Aabbs, -(-rigid_arrays.static // AABB_BLOCK))
+        self._actor_boxes = SharedArrays.zeros(structs.Aabbs, len(rigid_arrays.actors.is_remote))
+        self._passing_bunches = SharedArrays(
+            structs.PassingBunches, by_tree=self._passing, of_geom=rigid_arrays.bunch_of_geom
+        )
+        self._allocate_candidates(max(self._room, MIN_TREE_ROOM))
+
+    def update_rigid_geoms(self) -> None:
+        """The same rigid world has listed its geoms anew: the static ones have other numbers."""
+        self._static_bounded = False
+
+    def _allocate_candidates(self, trees: int) -> None:
+        """Room for the candidates of so many awake trees."""
+        self._room, slots = trees, len(self.slots)
+        static = min(self.rigid_arrays.static, self.parameters.max_static_geoms_per_tree)
+        near = self.rigid_arrays.capacity - self.rigid_arrays.static + static
+        self.candidates = SharedArrays.zeros(
+            structs.Candidates, trees, slots, count=np.zeros(trees, np.int32), is_impact=np.zeros(trees, np.bool_),
+            near_geoms=np.zeros((trees, near), np.int32), skipped_geoms=np.zeros(trees, np.int32),
+            near_pairs=np.zeros((trees * PAIRS_AT_ONCE, 2), np.int32),
+        )  # fmt: skip
+        self._bind_launches()
+
+    # ------------------------------------------------------------------ broadphase
+
+    def update_tree_bounds(self, trees: np.ndarray) -> None:
+        """Bring the boxes of some trees [k], and of their blocks, up to the poses of their bodies."""
+        self._list(trees)
+        self._listed = None
+        self._searching_trees.value = 0
+        self._find_reached_trees()
+        self.compare_anew()
+
+    def _list(self, trees: np.ndarray) -> None:
+        """Write the lists of kernels that are about some trees [k], and their blocks."""
+        blocks = np.unique(trees // AABB_BLOCK)
+        self.arrays.trees.awake[: len(trees)], self._blocks[: len(blocks)] = trees, blocks
+        self.counters[structs.AWAKE_TREES], self._block_count.value = len(trees), len(blocks)
+
+    def compare_anew(self) -> None:
+        """Compare all capsules of awake trees with the sleeping ones in the next step, however little they move."""
+        self._clearances.distance[:] = -1.0
+
+    def find_near_trees(self) -> np.ndarray:
+        """Trees [k] whose box a geom of an actor overlaps within the step."""
+        if not self._static_bounded:
+            self._bound_static_geoms()
+        self.counters[structs.NEAR_ASLEEP] = 0
+        self._find_near_trees()
+        return self._is_near.nonzero()[0]
+
+    def move_wires(self, pieces: np.ndarray, wires: DeflectedWires) -> None:
+        """Bring the geoms of wires [k] to where these are deflected to."""
+        if not self._static_bounded:
+            self._bound_static_geoms()
+        arrays, states, boxes = self.rigid_arrays, self.rigid_arrays.geom_states, self._static_blocks
+        geoms = arrays.geom_of_wire[pieces]
+        ends = np.stack([wires.start[pieces], wires.end[pieces]], 1) + wires.offset[pieces]
+        states.offset[geoms] = wires.offset[pieces].mean(1)
+        states.center[geoms] = ends.mean(1)
+        # it may spring back within the step
+        states.speed[geoms] = np.sqrt((wires.offset[pieces] ** 2).sum(2).max(1)) / self.parameters.dt
+        grown = (arrays.geoms.size[geoms, 0] + self.parameters.contact_margin)[:, None]
+        states.low[geoms], states.high[geoms] = ends.min(1) - grown, ends.max(1) + grown
+        block = (geoms - arrays.movable) // AABB_BLOCK
+        np.minimum.at(boxes.low, block, states.low[geoms])
+        np.maximum.at(boxes.high, block, states.high[geoms])
+
+    def _bound_static_geoms(self) -> None:
+        """Boxes around blocks of static geoms; the ground reaches down without end."""
+        self._geom_aabbs(self.rigid_arrays.count)
+        first, states, boxes = self.rigid_arrays.movable, self.rigid_arrays.geom_states, self._static_blocks
+        states.offset[:] = 0.0  # move_wires() follows
+        ground = np.flatnonzero(self.rigid_arrays.geoms.kind[first:] == 0) + first
+        states.low[ground, 2] = -PLANE_HALF_SIZE
+        for block in range(len(boxes.low)):
+            of = slice(first + AABB_BLOCK * block, first + AABB_BLOCK * (block + 1))
+            boxes.low[block], boxes.high[block] = states.low[of].min(0), states.high[of].max(0)
+        self._static_bounded = True
+
+    # ------------------------------------------------------------------ narrowphase
+
+    def let_pass(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
+        """Let a bunch that was picked within the box ``low`` [3] to ``high`` [3] m pass through the trees that it
+        overlaps, until it is clear of them: as it hung there, that overlap was no contact."""
+        near = np.flatnonzero(((self.tree_boxes.low <= high) & (low <= self.tree_boxes.high)).all(1))
+        room = self._passing[near] < 0
+        near, room = near[room.any(1)], room[room.any(1)]
+        self._passing[near, room.argmax(1)] = bunch
+
+    def find_reached_trees(self, awake: np.ndarray, among_plants: bool) -> np.ndarray:
+        """Take the awake trees [k] and bring their boxes up to their predicted motion. Returns the sleeping trees [j]
+        that they touch, or will before the step ends; none unless plants touch each other (``among_plants``)."""
+        if awake is not self._listed:
+            self._list(awake)
+            self._listed = awake
+            if len(awake) > self._room:
+                self._allocate_candidates(2 * len(awake))
+        count, sleep = len(awake), among_plants and len(awake) < len(self._is_reached)
+        self._paired_trees.value = count if among_plants else 0
+        self._searching_trees.value = count if sleep else 0  # one that falls asleep has them compared anew
+        self._find_reached_trees()
+        if not sleep:
+            return _NO_TREES
+        reached = self._is_reached.nonzero()[0]
+        self._is_reached[reached] = False
+        return reached
+
+    def deepest(self, trees: int, count: int) -> np.ndarray:
+        """The ``count`` candidates with the smallest gap, as numbers row * slots + slot in ascending order."""
+        found = np.flatnonzero(self.slots < self.candidates.count[:trees, None])
+        return np.sort(found[np.argsort(self.candidates.gap.ravel()[found], kind="stable")[:count]])
+
+    # ------------------------------------------------------------------ launches
+
+    def _bind_launches(self) -> None:
+        """Bind every kernel to its arrays."""
+        parameters, plants, rigid = self._kernel_parameters, self.arrays, self.rigid_arrays
+        trees, bodies = plants.trees.struct, plants.bodies.struct
+        capsules, capsule_states = plants.capsules.struct, plants.capsule_states.struct
+        geoms, geom_states, actors = rigid.geoms.struct, rigid.geom_states.struct, rigid.actors.struct
+        tree_boxes, wood_boxes = self.tree_boxes.struct, self._wood_boxes.struct
+        actor_boxes, block_boxes = self._actor_boxes.struct, self._block_boxes.struct
+        order, candidates = share(self._order, wp.int32), self.candidates.struct
+
+        def bind_shared(kernel: wp.Kernel, given: list, results: list, chunk: str) -> BoundLaunch:
+            """The same of a kernel over trees, which the threads of the plants share."""
+            pool = self.plants.launch_pool
+            launch = bind_launch(kernel, given, results, index_list="order", partitions=pool.size)
+            return pool.share([launch], TREES_PER_CHUNK[chunk])
+
+        self._geom_aabbs = bind_launch(broadphase.geom_aabbs, [parameters, geoms, rigid.bodies.struct], [geom_states])
+        actor_aabbs = bind_launch(
+            broadphase.actor_aabbs, [actors, geoms, rigid.bodies.struct, geom_states], [actor_boxes]
+        )
+        mark_near_trees = bind_launch(
+            broadphase.mark_near_trees,
+            [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
+            [share(self._is_near, wp.bool), share(self.counters, wp.int32)],
+        )
+        tree_aabbs = bind_shared(
+            broadphase.tree_aabbs,
+            [parameters, capsules, order, trees, bodies],
+            [capsule_states, wood_boxes, tree_boxes],
+            "boxes",
+        )
+        block_aabbs = bind_launch(broadphase.block_aabbs, [share(self._blocks, wp.int32), tree_boxes], [block_boxes])
+        find_reached_trees = bind_shared(
+            sleeping_trees.find_reached_trees,
+            [parameters, capsules, order, trees, block_boxes, tree_boxes, bodies, capsule_states],
+            [self._clearances.struct, share(self._is_reached, wp.bool)],
+            "boxes",
+        )
+        find_rigid_contacts = bind_shared(
+            narrowphase_rigid.find_rigid_contacts,
+            [parameters, self.parameters.max_static_geoms_per_tree, capsules, geoms, order, trees, tree_boxes, bodies,
+             capsule_states, rigid.bodies.struct, rigid.hulls.struct, geom_states, self._static_blocks.struct],
+            [self._passing_bunches.struct, candidates],
+            "rigid",
+        )  # fmt: skip
+        sorted_rows, scratch = (share(rows, wp.int32) for rows in self._sorted_rows)
+        sort_awake_trees = bind_launch(
+            sweep_order.sort_awake_trees, [trees, tree_boxes], [share(self.counters, wp.int32), sorted_rows, scratch]
+        )
+        find_plant_contacts = bind_shared(
+            narrowphase_plants.find_plant_contacts,
+            [parameters, capsules, order, sorted_rows, share(self.counters, wp.int32), trees,
+             tree_boxes, wood_boxes, bodies, capsule_states],
+            [candidates],
+            "plants",
+        )  # fmt: skip
+        sequence, awake = self.plants.launch_pool.sequence, entry(self.counters, structs.AWAKE_TREES)
+        self._find_near_trees = sequence([
+            (rigid.take_free_velocities, rigid.dofs),
+            (self._geom_aabbs, entry(rigid.geoms.count)),
+            (actor_aabbs, entry(rigid.actors.count)),
+            (mark_near_trees, ctypes.c_int32(len(self._blocks))),
+        ])  # fmt: skip
+        # boxes of blocks: or a tree that was dragged out of its block would have no actor near
+        self._find_reached_trees = sequence([
+            (tree_aabbs, awake), (block_aabbs, self._block_count), (find_reached_trees, self._searching_trees),
+        ])  # fmt: skip
+        self.narrowphase = [
+            (find_rigid_contacts, awake), (sort_awake_trees, ONCE), (find_plant_contacts, self._paired_trees),
+        ]  # fmt: skip
+        """Launches that fill ``candidates`` for the listed awake trees, each with its number of threads."""

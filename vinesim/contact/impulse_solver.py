@@ -1,0 +1,369 @@
+"""Solve of all contacts of a step at once: islands, Jacobians, Delassus matrix, projected Gauss-Seidel, warm start.
+
+The stages of :meth:`ImpulseSolver.solve` follow the kernels: ``islands``, ``jacobians``, ``row_response``,
+``delassus``, ``projected_gauss_seidel`` (with the steps of ``newton``), ``forces``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import warp as wp
+
+from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
+from vinesim.contact.detection import ContactDetection
+from vinesim.contact.row_response import RowResponse
+from vinesim.core import frames
+from vinesim.core.warp_arrays import SharedArrays, entry, share
+from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
+from vinesim.kernels.contact.island_system import IslandSystem
+from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.kernels.shared_launch import ONCE
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.wires.deflected_wires import DeflectedWires, WireContacts
+
+ITEMS_PER_CHUNK = {"write_contact_rows": 16, "respond_rigidly": 16, "assemble_delassus": 16, "solve_islands": 1,
+                   "store_warm_start": 48}  # fmt: skip
+"""Contacts or islands that a thread takes at a time: work of 5 us and more."""
+MATRIX_CONTACTS = 16
+"""Room for the matrices of the blocks is made for blocks of so many contacts, and more when they are larger."""
+REMOVED_GEOM = np.iinfo(np.int32).max
+"""Number that a warm start keeps for a geom that is gone."""
+
+
+class ImpulseSolver:
+    """Finds the impulses that keep plants and rigid bodies apart, and what they do to either side."""
+
+    def __init__(
+        self,
+        plants: ArticulationSolver,
+        rigid: RigidWorld,
+        arrays: PlantArrays,
+        parameters: PhysicsParameters,
+        kernel_parameters: structs.Parameters,
+        wires: DeflectedWires | None = None,
+    ) -> None:
+        """``wires``: those that give; without, none does."""
+        self._wires = None if wires is None else WireContacts(wires)
+        self._at_wires = np.zeros(0, int)
+        self.plants, self.rigid, self.arrays, self.parameters = plants, rigid, arrays, parameters
+        self._kernel_parameters = kernel_parameters
+        self._pairs = material_pairs(parameters)
+        n = self.capacity = parameters.contact_capacity
+        self.response = response = RowResponse(plants, n)
+        slots = {"body_slot": response.body_slot, "other_slot": response.other_slot}
+        self.contacts = SharedArrays.zeros(structs.Contacts, n, **slots)
+        self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
+        listed = {"body": response.body, "tree_end": response.tree_end}
+        self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1, **listed)
+        self._island_arrays = {
+            name: np.zeros(n + 1, np.int32)
+            for name in ("start", "first_block", "block_start", "row_start", "matrix_start", "rigid_start",
+                         "system_start", "contact", "label", "block_label", "first_dof", "sweeps")
+        }  # fmt: skip
+        self._items = np.arange(3 * n, dtype=np.int32)
+        self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
+        self._row_arrays = {
+            "plant_jacobian": response.jacobian,
+            "velocity_free": np.zeros(3 * n),
+            "bias": np.zeros(3 * n),
+            "impulse": np.zeros(3 * n),
+        }
+        self._place_arrays = {
+            "friction": np.zeros(n), "compliance": np.zeros(n), "own": np.zeros((n, 3, 3)), "mass": np.zeros((n, 2)),
+            "pressed": np.zeros(n, np.int32),
+        }  # fmt: skip
+        for name in ("free", "impulse", "impulse_first", "impulse_before", "direction"):
+            self._place_arrays[name] = np.zeros(10 * n)  # a block of one contact has eight rows
+        self._rigid_spans, self._most_contacts, self._columns = np.zeros((n, 2), np.int32), 0, 0
+        """[contact, 2] From which degree of freedom to which its rows of rigid bodies may be other than 0; the most
+        contacts of one solve, and how long their rows are."""
+        self._memory: dict[str, np.ndarray] = {}
+        """See :meth:`_kept`."""
+        self._wrench = np.zeros((2 * n, 6))
+        self.bodies = np.zeros(0, np.int32)
+        """Plant bodies in contact [n], sorted; a view that the next solve changes, as the next two."""
+        self.wrenches = np.zeros((0, 6))
+        """[n, 6] N, N m on them, at their origins, world axes."""
+        self.rigid_force: np.ndarray | None = None
+        """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
+        self._padded_rows = 0
+        """Rows of all blocks of the last solve, those that fill them up included."""
+        self.unfinished = 0
+        """How often an island of a solve ended at the largest number of sweeps, perhaps not within its tolerance."""
+
+    def set_rigid_world(
+        self, rigid_arrays: RigidArrays, detection: ContactDetection, previous: RigidArrays | None
+    ) -> None:
+        """Take over the rigid world after it was compiled anew; the warm start follows the names of the geoms."""
+        self.rigid_arrays = rigid_arrays
+        if previous is not None:
+            at = {name: i for i, name in enumerate(rigid_arrays.names)}
+            other = self.warm_start.other
+            for k, geom in enumerate(other[: self.warm_start.count[0]].tolist()):
+                if 0 <= geom < len(previous.names):
+                    other[k] = at.get(previous.names[geom], REMOVED_GEOM)
+        self._allocate()
+        self.bind_launches(detection)
+
+    def renumber_geoms(self, number: np.ndarray) -> None:
+        """The same rigid world has listed its geoms anew: ``number`` [geom] of each former one, -1 if it is gone."""
+        other = self.warm_start.other[: self.warm_start.count[0]]
+        of_geoms = (other >= 0) & (other != REMOVED_GEOM)
+        now = number[other[of_geoms]]
+        other[of_geoms] = np.where(now >= 0, now, REMOVED_GEOM)
+
+    def _allocate(self) -> None:
+        """Arrays whose size depends on the rigid world or on the matrices of the blocks.
+
+        The large ones lie in memory that is kept: new pages took 4 ms when an actor joined. Every solve overwrites what
+        it reads of them; rows of rigid bodies are 0 outside of their spans.
+        """
+        world = self.rigid.mj_model
+        for name in ("rigid_jacobian", "rigid_response"):
+            if name in self._memory:
+                self._memory[name][: 3 * self._most_contacts * self._columns] = 0.0
+        self._rigid_spans[:] = self._most_contacts = 0
+        self._columns = world.nv
+        self.rows = SharedArrays(
+            structs.Rows,
+            rigid_jacobian=self._kept("rigid_jacobian", (self.capacity, world.nv, 3)),
+            rigid_response=self._kept("rigid_response", (self.capacity, world.nv, 3)),
+            delassus=self._matrix,
+            **self._row_arrays,
+        )
+        self.system = SharedArrays(
+            IslandSystem,
+            **self._place_arrays,
+            jacobian=self._kept("jacobian", (self.capacity * world.nv, 3)),
+            response=self._kept("response", (self.capacity * world.nv, 3)),
+            velocity=np.zeros(world.nv),
+            rigid_force=np.zeros(world.nv),
+            matrix=self._kept("matrix", self._matrix.shape),
+            solution=self._kept("solution", (self.capacity * (1 + world.nv), 3)),
+            rigid_matrix=np.zeros((world.nv, 1 + world.nv)),
+        )
+        labels = np.zeros(2 * world.ntree, np.int32)  # see EffectiveMass.island_labels
+        dofs = np.zeros(world.nv, np.int32)
+        self.islands = SharedArrays(structs.Islands, rigid_last_contact=labels, dof=dofs, **self._island_arrays)
+
+    def _kept(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
+        """An array of this shape in the memory of this name, twice as large as what was asked for when that was
+        made: pages that nothing has touched take no memory."""
+        size = math.prod(shape)
+        memory = self._memory.get(name)
+        if memory is None or len(memory) < size:
+            memory = self._memory[name] = np.zeros(2 * size)
+        return memory[:size].reshape(shape)
+
+    @property
+    def island_count(self) -> int:
+        """Islands of the last solve."""
+        return int(self._detection.counters[structs.ISLANDS])
+
+    @property
+    def sweeps(self) -> int:
+        """Sweeps that the slowest island of the last solve took."""
+        return int(self.islands.sweeps[: self.island_count].max(initial=0))
+
+    def clear(self) -> None:
+        """Forget the last solve: there is no contact."""
+        self.bodies, self.wrenches, self.rigid_force = self.touched.body[:0], self._wrench[:0], None
+        self._detection.counters[structs.ISLANDS] = self.warm_start.count[0] = 0
+
+    def find_contacts(self) -> None:
+        """List the contacts of the listed awake trees, the plant bodies in contact, and the islands.
+
+        Of too many contacts no islands are built: see :meth:`build_islands`.
+        """
+        self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
+        self._find_contacts()
+
+    def build_islands(self) -> None:
+        """Build the islands of the contacts that are listed now."""
+        self._build_islands(1)
+
+    def solve(self, count: int) -> None:
+        """Find the impulses of the first ``count`` contacts, and what they do to either side."""
+        n = count
+        if self._make_room():
+            self._build_islands(1)
+        counters = self._detection.counters
+        self._padded_rows = int(self.islands.row_start[counters[structs.BLOCKS]])
+        self._most_contacts = max(self._most_contacts, n)
+        if self._wires is not None:
+            self._end_at_wires(n, self._wires)
+        self.rigid_force = self.system.rigid_force
+        self.rigid_force.fill(0.0)
+        if self.rigid.mj_data.nefc and self.rigid.is_constrained(self._touched_rigid_bodies(n)):
+            self._solve_constrained(n)
+        else:
+            self._solve()
+        self.unfinished += int(counters[structs.UNFINISHED])
+        self.warm_start.count[0] = n
+        self.bodies = self.touched.body[: counters[structs.BODIES]]
+        self.wrenches = self._wrench[: counters[structs.BODIES]]
+
+    def _solve_constrained(self, count: int) -> None:
+        """The same where MuJoCo's constraints bind rigid bodies: their response comes from MuJoCo."""
+        self._write_rows()
+        self._rigid_spans[:count] = 0, self.rigid.mj_model.nv
+        self._respond_constrained(by_rows(self.rows.rigid_jacobian[:count]))
+        self._assemble_and_solve()
+        self._follow_constraints(count)
+        self._store()
+
+    def _make_room(self) -> bool:
+        """Make room for the matrices and responses of the listed contacts; whether they must be listed again."""
+        counters = self._detection.counters
+        entries = int(counters[structs.MATRIX_ENTRIES])
+        larger = entries > len(self._matrix)
+        if larger:
+            self._matrix = np.zeros(2 * entries)
+            self._allocate()
+        if self.response.make_room(int(counters[structs.RESPONSE_NUMBERS])) or larger:
+            self.bind_launches(self._detection)
+        return larger
+
+    def _end_at_wires(self, count: int, wires: WireContacts) -> None:
+        """Find the springs of the wires that are in contact."""
+        contacts, candidates = self.contacts, self._detection.candidates
+        piece = self.rigid_arrays.wire_of_geom[np.maximum(contacts.other[:count], -1)]
+        self._at_wires = self._at_wires[:0]
+        contacts.wire_stiffness[:count] = contacts.wire_shift[:count] = 0.0
+        if piece.max() < 0:
+            return
+        at = self._at_wires = np.flatnonzero(piece >= 0)
+        row, slot = np.divmod(contacts.source[at], candidates.feature.shape[1])
+        body, point, normal = contacts.body[at], candidates.point[row, slot], candidates.normal[row, slot]
+        free, arm = self.plants.velocity_free[body], point - self.plants.state.body_q[body, :3]
+        closing = -((free[:, :3] + frames.cross(free[:, 3:], arm)) * normal).sum(1)
+        key = contacts.feature[at].astype(np.int64) * len(self.rigid_arrays.geom_of_wire) + piece[at]
+        wires.find_springs(
+            piece[at], point, normal, candidates.gap[row, slot], closing, key, self.plants.model.body_tree[body]
+        )
+        contacts.wire_stiffness[at], contacts.wire_shift[at] = wires.stiffness, wires.shift
+
+    def report_wires(self) -> None:
+        """Tell the wires what pressed on them in the last solve."""
+        wires, at, contacts, dt = self._wires, self._at_wires, self.contacts, self.parameters.dt
+        if wires is not None and len(at):
+            force = self.rows.impulse[3 * at] / dt
+            share = contacts.stiffness[at] * dt + contacts.damping[at]
+            wires.add_presses(force, -(force / share + self.rows.bias[3 * at]))
+
+    def _respond_constrained(self, jacobian: np.ndarray) -> np.ndarray:
+        """Take over the response of rigid bodies that MuJoCo's constraints bind, and return it [row, dof]."""
+        response = self.rigid.impulse_response(jacobian).T
+        self.rows.rigid_response[: len(response) // 3] = response.reshape(-1, 3, response.shape[1]).transpose(0, 2, 1)
+        return response
+
+    def _follow_constraints(self, count: int) -> None:
+        """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve took them to.
+
+        The response to impulses is linear, but contacts of a body with its support may open, or begin to slide. A light
+        body that is pushed as if its support held it gains energy. Each round is a Newton step from the last impulses,
+        with the tangent stiffness of the constraints under them. The impulses of the round with the least error are
+        kept.
+        """
+        rows, system, row_count, p = self.rows, self.system, 3 * count, self.parameters
+        jacobian, response = by_rows(rows.rigid_jacobian[:count]), by_rows(rows.rigid_response[:count])
+        impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
+        of_islands = system.impulse[: self._padded_rows]
+        kept = (impulse, velocity_free, of_islands, system.velocity, system.rigid_force)
+        free, best, best_error, error = self.rigid.velocity_free, (), np.inf, np.inf
+        for round_number in range(p.solver_constraint_steps + 1):
+            assert self.rigid_force is not None
+            self.rigid.predict_with(self.rigid_force)
+            velocity = self.rigid.velocity_free
+            error = float(np.abs(jacobian @ (velocity - free + impulse @ response)).max())
+            if error < p.solver_constraint_tolerance:
+                return
+            if error < best_error:
+                best, best_error = tuple(values.copy() for values in kept), error
+            if round_number == p.solver_constraint_steps:
+                break
+            response = self._respond_constrained(jacobian)
+            free_before, free = free, velocity + impulse @ response
+            velocity_free -= jacobian @ (free - free_before)
+            self._solve_islands(self.island_count)
+        if error > best_error:
+            for values, those in zip(kept, best, strict=True):
+                values[:] = those
+
+    def _touched_rigid_bodies(self, count: int) -> np.ndarray:
+        """MuJoCo's bodies [k] on the other side of the first ``count`` contacts, once for each."""
+        other = self.contacts.other[:count]
+        return self.rigid_arrays.geoms.body[other[other >= 0]]
+
+    def bind_launches(self, detection: ContactDetection) -> None:
+        """Bind every kernel to its arrays; to call again when ``detection`` has new arrays of candidates."""
+        self._detection = detection
+        p, parameters, rigid = self.parameters, self._kernel_parameters, self.rigid_arrays
+        capsules, bodies = self.arrays.capsules.struct, self.arrays.bodies.struct
+        geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
+        candidates, contacts = detection.candidates.struct, self.contacts.struct
+        island_lists, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
+        system, side_groups = self.system.struct, self.response.groups.struct
+        response = share(self.response.numbers, wp.float32)
+        counters, touched = share(detection.counters, wp.int32), self.touched.struct
+        items = share(self._items, wp.int32)
+
+        def bind_shared(kernel: wp.Kernel, model: list, given: list, results: list) -> BoundLaunch:
+            """The same of a kernel over items, which the threads of the plants share."""
+            pool = self.plants.launch_pool
+            launch = bind_launch(kernel, [*model, items, *given], results, index_list="items", partitions=pool.size)
+            return pool.share([launch], ITEMS_PER_CHUNK[kernel.key])
+
+        compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
+        self._build_islands = bind_launch(
+            islands.build_islands,
+            [capsules, geoms, bodies, rigid_bodies, candidates],
+            [counters, touched, contacts, island_lists, side_groups],
+        )
+        write_contact_rows = bind_shared(
+            jacobians.write_contact_rows,
+            [parameters, self._pairs.struct, capsules, geoms],
+            [bodies, rigid_bodies, rigid.factors.struct, candidates, warm_start],
+            [share(self._rigid_spans, wp.vec2i), contacts, rows],
+        )
+        respond_rigidly = bind_shared(
+            delassus.respond_rigidly, [geoms], [rigid_bodies, rigid.factors.struct, contacts], [rows]
+        )
+        assemble_delassus = bind_shared(
+            delassus.assemble_delassus, [], [contacts, touched, island_lists, side_groups, response], [rows]
+        )
+        self._solve_islands = bind_shared(
+            projected_gauss_seidel.solve_islands,
+            [parameters, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
+            [contacts],
+            [island_lists, system, rows],
+        )
+        store_warm_start = bind_shared(
+            forces.store_warm_start, [parameters], [island_lists, system, rows], [contacts, warm_start]
+        )
+        count_unfinished = bind_launch(forces.count_unfinished, [p.solver_sweeps, island_lists], [counters])
+        accumulate_wrenches = bind_launch(
+            forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
+        )
+        sequence = self.plants.launch_pool.sequence
+        of_contacts, of_groups, of_islands, have_room = (
+            entry(detection.counters, place)
+            for place in (structs.CONTACTS, structs.GROUPS, structs.ISLANDS, structs.HAVE_ROOM)
+        )
+        rows_first = [(write_contact_rows, of_contacts), (self.response.launch, of_groups)]
+        solved = [(assemble_delassus, of_contacts), (self._solve_islands, of_islands)]
+        stored = [(store_warm_start, of_contacts), (count_unfinished, ONCE), (accumulate_wrenches, ONCE)]
+        self._find_contacts = sequence([
+            *detection.narrowphase, (compact_candidates, ONCE), (self._build_islands, have_room),
+        ])  # fmt: skip
+        self._solve = sequence([*rows_first, (respond_rigidly, of_contacts), *solved, *stored])
+        self._write_rows, self._assemble_and_solve, self._store = map(sequence, (rows_first, solved, stored))
+
+
+def by_rows(jacobian: np.ndarray) -> np.ndarray:
+    """A rigid Jacobian [contact, dof, 3] as rows [row, dof]."""
+    return jacobian.transpose(0, 2, 1).reshape(-1, jacobian.shape[1])

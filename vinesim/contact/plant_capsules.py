@@ -1,0 +1,124 @@
+"""Collision capsules of plants: one for each piece of wood, a few spheres for each bunch, one for each cluster."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.core import frames
+from vinesim.scene.materials import materials_of_organs
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+
+MAX_SPHERES_PER_BUNCH = 7
+
+
+@dataclasses.dataclass(frozen=True)
+class PlantCapsules:
+    """Collision shapes of all plants: segments with a radius, sorted by body."""
+
+    tree_start: np.ndarray
+    """[tree + 1] first capsule of each tree, then their number."""
+    body: np.ndarray
+    """[capsule]"""
+    bunch: np.ndarray
+    """[capsule] the bunch it belongs to, -1 for none. A peduncle goes with its bunch: what is left of it does not
+    collide."""
+    level: np.ndarray
+    """[capsule] 0: always there; 1: while its tree is coarse; 2: while it is fine (see ``State.tree_fine``)."""
+    start: np.ndarray
+    """[capsule, 3] m, in the body's frame; equal to ``end`` for a sphere."""
+    end: np.ndarray
+    """[capsule, 3] m"""
+    radius: np.ndarray
+    """[capsule] m"""
+    material: np.ndarray
+    """[capsule] :class:`Material`"""
+
+
+def plant_capsules(model: Model) -> PlantCapsules:
+    """A capsule for each piece of wood, a few spheres for each bunch, a capsule or sphere for each of its clusters.
+
+    The spheres stand for a bunch without clusters, and for one with clusters while its tree is coarse.
+    """
+    parts: list[tuple[int, int, int, float, float, float]] = []  # body, bunch, level, start and end along x, radius
+    of_body = {int(b): i for i, b in enumerate(model.bunch_body)}
+    of_cluster = {
+        int(first) + k: i
+        for i, (first, count) in enumerate(zip(model.bunch_cluster, model.bunch_clusters, strict=True))
+        for k in range(count)
+    }
+    bunch_of = model.bunch_of_body().tolist()
+    lengths, radii = model.body_length.tolist(), model.body_radius.mean(1).tolist()
+    for b, (length, thick) in enumerate(zip(lengths, radii, strict=True)):
+        if b in of_body:
+            i = of_body[b]
+            level = int(model.bunch_clusters[i] > 0)
+            for center, radius in spheroid_spheres(0.5 * float(model.bunch_length[i]), float(model.bunch_radius[i])):
+                parts.append((b, i, level, center, center, radius))
+        elif b in of_cluster:
+            half = 0.5 * length
+            inset = min(thick, half)
+            parts.append((b, of_cluster[b], 2, inset, length - inset, thick))
+        else:
+            parts.append((b, bunch_of[b], 0, 0.0, length, thick))
+    body, bunch, level, start, end, radius = np.array(parts, float).reshape(-1, 6).T  # also of no bodies
+    along = np.array([1.0, 0.0, 0.0], np.float32)
+    return PlantCapsules(
+        tree_start=np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32),
+        body=body.astype(np.int32),
+        bunch=bunch.astype(np.int32),
+        level=level.astype(np.int32),
+        start=start.astype(np.float32)[:, None] * along,
+        end=end.astype(np.float32)[:, None] * along,
+        radius=radius.astype(np.float32),
+        material=materials_of_organs(model.body_organ[body.astype(np.int32)]),
+    )
+
+
+def spheroid_spheres(half_length: float, max_radius: float) -> list[tuple[float, float]]:
+    """Centre (along the axis, from one end) and radius [m] of the largest spheres that fit a spheroid along its axis.
+
+    About a point c of the axis between the centres of curvature of its ends: R sqrt(1 - c^2 / (a^2 - R^2)).
+    """
+    a, r = half_length, max_radius
+    furthest = (a * a - r * r) / a if a > r else 0.0
+    count = min(1 + 2 * int(np.ceil(furthest / r - 1e-6)), MAX_SPHERES_PER_BUNCH) if furthest > 1e-6 else 1
+    if count == 1:
+        return [(a + 0.0, min(a, r))]
+    return [
+        (a + c, min(a, r) * np.sqrt(1.0 - c * c / (a * a - r * r))) for c in np.linspace(-furthest, furthest, count)
+    ]
+
+
+def nearest_body(
+    capsules: PlantCapsules, model: Model, state: State, trees: np.ndarray, points: np.ndarray, max_distance: float
+) -> tuple[float, int] | None:
+    """The plant body nearest to one of some ``points`` [k, 3] m: distance [m] to its surface, and its number.
+
+    Searches ``trees`` [n], whose ``state.body_q`` must be current. Of a bunch the bunch's own body counts, whether or
+    not its clusters move. None if nothing is nearer than ``max_distance`` [m].
+    """
+    c = capsules
+    first, end = c.tree_start[trees].tolist(), c.tree_start[trees + 1].tolist()
+    at = np.concatenate([np.arange(*ends) for ends in zip(first, end, strict=True)])
+    is_fine = state.tree_fine[model.body_tree[c.body[at]]]
+    at = at[(c.level[at] == 0) | (c.level[at] == 1 + is_fine)]
+    collides = c.bunch[at] < 0
+    collides[~collides] = state.bunch_attached[c.bunch[at[~collides]]]
+    at = at[collides]
+    pose = state.body_q[c.body[at]].astype(float)
+    start = pose[:, :3] + frames.rotate(pose[:, 3:], c.start[at].astype(float))
+    along = frames.rotate(pose[:, 3:], (c.end[at] - c.start[at]).astype(float))
+    square = np.maximum((along * along).sum(1), 1e-12)
+    offset = points[:, None] - start
+    t = np.clip((offset * along).sum(-1) / square, 0.0, 1.0)
+    gap = (np.linalg.norm(offset - t[..., None] * along, axis=-1) - c.radius[at]).min(0)
+    best = int(np.argmin(gap)) if len(gap) else -1
+    if best < 0 or gap[best] >= max_distance:
+        return None
+    body, bunch = int(c.body[at[best]]), int(c.bunch[at[best]])
+    tree = model.body_tree[body]
+    is_cluster = body - model.tree_first[tree] >= model.tree_core[tree]
+    return float(gap[best]), int(model.bunch_body[bunch]) if is_cluster else body

@@ -1,0 +1,313 @@
+"""Contacts of many independent trees with the static geoms of a scene, found and solved where the trees are.
+
+For batches: every tree is a world of its own, so trees do not touch each other, and nothing they touch moves. Then the
+contacts of a tree are one island, nothing has to come back to the host between steps, and on a GPU a tree is a thread.
+Detection, rows, Delassus matrix and solve are the functions that
+:class:`vinesim.contact.contact_solver.ContactSolver` launches.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters, material_pairs
+from vinesim.contact.plant_capsules import plant_capsules
+from vinesim.core.warp_arrays import SharedArrays
+from vinesim.kernels.contact import broadphase, structs, tree_delassus, tree_islands, tree_narrowphase
+from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
+from vinesim.kernels.contact.row_solver import FEW_ROWS
+from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem
+from vinesim.kernels.contact.tree_views import GROUP
+from vinesim.kernels.launch import THREADS_PER_BLOCK, bind_launch
+from vinesim.kernels.plants import structs as plant_structs
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.device_buffers import WARP_SIZE
+from vinesim.rigid.collision_geoms import PLANE_HALF_SIZE
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.physics_parameters import PhysicsParameters
+
+FULL_BLOCK = 128
+"""CUDA threads a block of kernels with several threads for each tree."""
+AABB_BLOCK = int(structs.AABB_BLOCK)
+DEFAULT_SLOTS = 8
+"""Contacts that one tree can have at once: 10 kB a tree."""
+PAIRS_PER_SLOT = 4
+"""Pairs of capsules and geoms whose boxes may overlap, for each contact that a tree can have."""
+FIRST_LANES = 16
+"""Threads of a GPU that share a tree of few contacts, a row each."""
+WARPS = 132 * 32
+"""Warps of a GPU that solve at once: as many as one with 132 multiprocessors keeps."""
+
+Launches = list[tuple[Any, int]]
+"""Bound kernels with their numbers of threads."""
+
+
+class ResidentContacts:
+    """Contacts of all trees of a solver with the static geoms of its model, from step to step on the solver's device.
+
+    ``plants.advance(steps, contacts.solve)`` steps with them. Each tree touches ground, poles, wires and fixed wood as
+    it would in :class:`vinesim.world.Physics`, and no other tree. All trees must be awake and stand on their
+    roots, and their first modes must be slow enough for whole steps.
+
+    Args:
+        plants: trees, on any device.
+        parameters: numbers of the contacts; ``dt`` must be that of ``plants``.
+        slots: contacts that a tree can have at once; more are left out and counted in :attr:`dropped`.
+
+    Raises :class:`ValueError` for trees that sleep, float or need substeps, and for geoms that move.
+    """
+
+    def __init__(
+        self,
+        plants: ArticulationSolver,
+        parameters: PhysicsParameters = PhysicsParameters(),
+        *,
+        slots: int = DEFAULT_SLOTS,
+    ) -> None:
+        self.plants, self.parameters, self.slots = plants, parameters, slots
+        self._device = plants.buffers.device
+        model, self._trees = plants.model, len(plants.model.tree_first)
+        rigid = RigidWorld(model, parameters=parameters)
+        self._check(rigid)
+        self._numbers = kernel_parameters(parameters)
+        self._take_over_plants(PlantArrays(model, plants, plant_capsules(model)))
+        self._take_over_geoms(RigidArrays(rigid, set(), self._numbers, None))
+        self._allocate()
+        self._before, self._solves, self._after = self._bind()
+        self._beside = None if self._device.is_cpu else wp.Stream(self._device, priority=-1)
+
+    def _check(self, rigid: RigidWorld) -> None:
+        plants = self.plants
+        if plants.dt != self.parameters.dt:
+            raise ValueError(
+                f"dt {self.parameters.dt} s of the contacts, {plants.dt} s of the plants: must be the same"
+            )
+        if len(plants.awake) < self._trees or plants.state.body_cut.any():
+            raise ValueError("trees that sleep or were cut: wake all, and leave them whole")
+        plants.upload()
+        if (plants.tree_substeps > 1).any():
+            tree = int(np.argmax(plants.tree_substeps > 1))
+            raise ValueError(f"tree {tree} swings too fast for a whole step of {plants.dt} s: take a shorter dt")
+        if len(rigid.geoms.id):
+            raise ValueError("the scene has crates, which move: resident trees touch static geoms only")
+
+    # ------------------------------------------------------------------ arrays
+
+    def _on_device(self, kind: Any, source: Any, **values: Any) -> Any:
+        """A struct of copies of the arrays of ``source`` on the device; those in ``values`` instead of theirs."""
+        made = kind()
+        for name, field in kind.vars.items():
+            given = values.get(name)
+            if isinstance(given, np.ndarray):
+                given = wp.array(given, dtype=field.type.dtype, device=self._device)
+            setattr(made, name, wp.clone(getattr(source, name), self._device) if given is None else given)
+        return made
+
+    def _allocated(self, kind: Any, sizes: dict[str, int], width: dict[str, int]) -> Any:
+        """A struct of arrays of zeros: ``sizes`` by name (1 unless given) and, of tables, ``width``."""
+        made = kind()
+        for name, field in kind.vars.items():
+            size = sizes.get(name, 1)
+            shape = size if field.type.ndim == 1 else (size, width.get(name, 1))
+            setattr(made, name, wp.zeros(shape, dtype=field.type.dtype, device=self._device))
+        return made
+
+    def _take_over_plants(self, arrays: PlantArrays) -> None:
+        rows, zeros = self.plants.buffers.arrays, self._zeros
+        self._bodies = structs.PlantBodies()
+        self._bodies.parent, self._bodies.tree = rows["body_parent"], rows["body_tree"]
+        self._bodies.is_cut = zeros(wp.bool, self._places)
+        self._bodies.q, self._bodies.qd, self._bodies.qd_free = rows["body_q"], rows["body_qd"], rows["body_qd_free"]
+        self._capsules = self._interleaved(arrays.capsules)
+        self._capsule_states = self._allocated(
+            structs.CapsuleStates, dict.fromkeys(structs.CapsuleStates.vars, self._capsule_count), {}
+        )
+
+    def _interleaved(self, capsules: SharedArrays) -> Any:
+        """The capsules on the device, capsule i of a tree at ``i * trees + tree``; -1 as the body of what does not
+        collide."""
+        start = capsules.tree_start
+        number = np.arange(start[-1]) - np.repeat(start[:-1], np.diff(start))
+        self._capsule_count = (int(number.max(initial=-1)) + 1) * self._trees
+        tree = np.repeat(np.arange(self._trees), np.diff(start))
+        at = number * self._trees + tree
+        given: dict[str, np.ndarray] = {}
+        for name in structs.Capsules.vars:
+            source = getattr(capsules, name)
+            if len(source) == start[-1]:
+                given[name] = np.zeros((self._capsule_count, *source.shape[1:]), source.dtype)
+                given[name][at] = source
+        given["body"][:] = -1
+        state = self.plants.state
+        collides = (capsules.level == 0) | (capsules.level == 1 + state.tree_fine[tree])
+        if len(state.bunch_attached):
+            collides &= (capsules.bunch < 0) | state.bunch_attached[capsules.bunch]
+        given["body"][at[collides]] = self.plants.buffers.slots[capsules.body[collides]]
+        return self._on_device(structs.Capsules, capsules.struct, **given)
+
+    @property
+    def _places(self) -> int:
+        """Entries of an array with a row for each body."""
+        return len(self.plants.buffers.arrays["body_parent"])
+
+    def _zeros(self, dtype: Any, *shape: int) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self._device)
+
+    def _take_over_geoms(self, rigid: RigidArrays) -> None:
+        """The static geoms, with boxes around them and around blocks of them; the ground reaches down without end."""
+        device = self._device
+        self._geoms = self._on_device(structs.Geoms, rigid.geoms.struct)
+        self._rigid_bodies = self._on_device(structs.RigidBodies, rigid.bodies.struct)
+        self._hulls = self._on_device(structs.Hulls, rigid.hulls.struct)
+        self._geom_states = self._on_device(structs.GeomStates, rigid.geom_states.struct)
+        given = [self._numbers, self._geoms, self._rigid_bodies]
+        wp.launch(broadphase.geom_aabbs, rigid.count, inputs=given, outputs=[self._geom_states], device=device)
+        low, high = (getattr(self._geom_states, name).numpy() for name in ("low", "high"))
+        low[rigid.geoms.kind[: len(low)] == 0, 2] = -PLANE_HALF_SIZE
+        self._geom_states.low.assign(low)
+        starts = range(0, rigid.count, AABB_BLOCK)
+        boxes = [(low[i : i + AABB_BLOCK].min(0), high[i : i + AABB_BLOCK].max(0)) for i in starts]
+        self._static_blocks = structs.Aabbs()
+        self._static_blocks.low, self._static_blocks.high = (
+            wp.array(np.array(corner, np.float32), dtype=wp.vec3, device=device) for corner in zip(*boxes, strict=True)
+        )
+        self._pairs = self._on_device(structs.MaterialPairs, material_pairs(self.parameters).struct)
+
+    def _by_slot(self, dtype: Any, columns: int) -> wp.array:
+        """A table [tree, column] of zeros in which the trees of one column lie side by side."""
+        flat = self._zeros(dtype, self._trees * columns)
+        strides = (flat.strides[0], flat.strides[0] * self._trees)
+        table = wp.array(ptr=flat.ptr, shape=(self._trees, columns), strides=strides, dtype=dtype, device=self._device)
+        table._flat = flat  # keeps the memory
+        return table
+
+    def _allocate(self) -> None:
+        trees, slots = self._trees, self.slots
+        self._groups = 1 if self._device.is_cpu else min(trees, WARPS)
+        rows, pairs = 3 * slots, PAIRS_PER_SLOT * slots
+        self.candidates = self._allocated(structs.Candidates, {}, {})
+        for name in ("feature", "other", "gap", "end_gap", "normal", "point"):
+            setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, 2 * pairs))
+        of_all: dict[str, int] = dict.fromkeys(structs.Contacts.vars, trees * slots)
+        self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("island", "block", "place"), 1), {})
+        of_rows: dict[str, int] = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
+        self.rows = self._allocated(structs.Rows, of_rows, {"plant_jacobian": 12})
+        self._system = self._allocated(TreeSystem, {"free": trees * rows, "velocity": trees * rows}, {})
+        self._system.matrix = self._zeros(float, trees * rows, rows)
+        self._system.friction, self._system.compliance = self.contacts.friction, self.contacts.compliance
+        self._system.impulse = self.rows.impulse
+        searched = trees * rows if self._device.is_cpu else 1  # a GPU searches in registers
+        self._search = self._allocated(TreeSearch, dict.fromkeys(TreeSearch.vars, searched), {"factor": rows + 1})
+        busy_rows = self._groups * rows
+        self._dense = self._allocated(TreeSystem, dict.fromkeys(TreeSystem.vars, busy_rows), {"matrix": rows})
+        self._dense_search = self._allocated(
+            TreeSearch, dict.fromkeys(TreeSearch.vars, busy_rows), {"factor": rows + 1}
+        )
+        of_all = dict.fromkeys(structs.WarmStart.vars, trees * slots) | {"count": trees}
+        self._warm_start = self._allocated(structs.WarmStart, of_all, {})
+        of_trees = dict.fromkeys(tree_narrowphase.TreeContacts.vars, trees)
+        of_trees |= dict.fromkeys(("near_total", "busy_count"), 1) | {"loaded": trees * slots}
+        of_trees |= dict.fromkeys(("near", "near_place", "found"), trees * pairs)
+        self._tree_contacts = self._allocated(tree_narrowphase.TreeContacts, of_trees, {})
+        self._response = self._allocated(tree_delassus.ResponseRows, dict.fromkeys(("a", "alpha"), trees * slots), {})
+        self._was_in_contact = self._zeros(wp.bool, trees)
+
+    # ------------------------------------------------------------------ kernels
+
+    def _bind(self) -> tuple[Launches, Launches, Launches]:
+        """Every kernel of a step, bound to its arrays, with its number of threads: before the solves, these, after."""
+        p, plants, trees = self.parameters, self.plants.launches, self._trees
+        fill, s, arrays = plants.fill_resident, plant_structs, plants.resident_arrays
+        device = str(self._device)
+        parameters, capsules, geoms = self._numbers, self._capsules, self._geoms
+        model, forces, joints = fill(s.ArticulationModel), fill(s.AppliedForces), fill(s.JointState)
+        bodies, factors = fill(s.BodyState), fill(s.Factors)
+        scratch, prediction, work = fill(s.Scratch), fill(s.Prediction), fill(s.WrenchScratch)
+        onset, contacts = self.plants.onset_steps, self._tree_contacts
+        width = 3 * self.slots
+        entries = -(-trees // GROUP) * GROUP
+        few, first, lanes, block = self.slots, 1, 1, 1
+        if not self._device.is_cpu:
+            few, first, lanes, block = int(FEW_ROWS) // 3, FIRST_LANES, WARP_SIZE, FULL_BLOCK
+
+        def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
+            block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
+            return bind_launch(kernel, list(given), [], device=device, block=block), count
+
+        is_round = np.isin(self._geoms.kind.numpy(), (PLANE, SPHERE, CAPSULE)).all()
+        find = tree_narrowphase.find_round_tree_contacts if is_round else tree_narrowphase.find_tree_contacts
+        compliances = fill(tree_delassus.BodyCompliances, P="M", Q="H", R="J")  # free since the prediction
+        before = [
+            bound(tree_narrowphase.list_near_pairs, trees, parameters, capsules, geoms, trees, self._bodies,
+                  self._geom_states, self._static_blocks, self._capsule_states, contacts),
+            bound(find, trees * self.slots, parameters, capsules, geoms, trees, trees * self.slots, self._bodies,
+                  self._capsule_states, self._rigid_bodies, self._hulls, self._geom_states, contacts,
+                  self.candidates),
+            bound(tree_narrowphase.number_tree_contacts, trees, trees, self.slots, few, contacts, self.contacts.source),
+            bound(tree_islands.predict_impacted_trees, trees, plants.parameters, model, onset, contacts.is_impact,
+                  forces, joints, arrays["phi_used"], arrays["tree_euler_steps"], bodies, factors, scratch, prediction),
+            bound(tree_islands.write_tree_rows, entries * self.slots, parameters, self._pairs, capsules, geoms, trees,
+                  self.slots, self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts,
+                  self.contacts, self.rows),
+            bound(tree_delassus.respond_at_contacts, trees, model, arrays["body_branches"], trees, factors,
+                  self.contacts, self.rows, contacts, compliances, self._response),
+            bound(tree_delassus.write_delassus, entries * self.slots, model, trees, width, factors, contacts,
+                  self.contacts, self.rows, compliances, self._response, self._system),
+        ]  # fmt: skip
+        solves = [
+            bound(tree_islands.solve_trees, -(-trees * first // block) * block, p.solver_sweeps, p.solver_newton_steps,
+                  p.solver_newton_contacts, p.solver_tolerance, trees, width, first, contacts, self._system,
+                  self._search),
+            bound(tree_islands.solve_busy_trees, self._groups * lanes, p.solver_sweeps, p.solver_newton_steps,
+                  p.solver_newton_contacts, p.solver_tolerance, trees, width, lanes, self._groups, contacts,
+                  self._system, self._dense, self._dense_search),
+        ]  # fmt: skip
+        after = [
+            bound(tree_islands.apply_tree_impulses, trees, parameters, model, arrays["body_branches"], onset, trees,
+                  width, self._bodies.q, self.rows, self._system, factors, self._was_in_contact,
+                  arrays["tree_euler_steps"], contacts, self.contacts, self._warm_start, arrays["body_wrench"], work,
+                  scratch, prediction),
+        ]  # fmt: skip
+        return before, solves, after
+
+    def solve(self) -> None:
+        """Launch what comes between the prediction and the integration of a step: for ``advance()``."""
+        for launch, count in self._before:
+            launch(count)
+        (solve_most, of_most), (solve_busy, of_busy) = self._solves
+        if self._beside is None:
+            solve_most(of_most)
+            solve_busy(of_busy)
+        else:  # side by side: few trees are busy, but each of them for long
+            with wp.ScopedStream(self._beside):
+                solve_busy(of_busy)
+            solve_most(of_most)
+            self._device.stream.wait_stream(self._beside)
+        for launch, count in self._after:
+            launch(count)
+
+    # ------------------------------------------------------------------ results
+
+    @property
+    def count(self) -> np.ndarray:
+        """[tree] contacts of the last step, those without force included."""
+        return self._tree_contacts.count.numpy()
+
+    @property
+    def dropped(self) -> int:
+        """Contacts left out since the start, for want of slots."""
+        return int(self._tree_contacts.dropped.numpy().sum())
+
+    @property
+    def sweeps(self) -> np.ndarray:
+        """[tree] sweeps of the last solve of trees in contact."""
+        return np.where(self.count > 0, self._tree_contacts.sweeps.numpy(), 0)
+
+    @property
+    def force(self) -> np.ndarray:
+        """[tree, 3] N, sum of the forces of all contacts on each tree in the last step."""
+        force = self.contacts.force.numpy().reshape(self.slots, self._trees, 3)
+        return (force * (np.arange(self.slots)[:, None] < self.count)[..., None]).sum(0)

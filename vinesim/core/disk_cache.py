@@ -1,0 +1,244 @@
+"""Arrays that take long to compute, kept on disk: by name and by a digest of all that they follow from.
+
+    arrays = load_or_make("soil", digest, make)
+
+The folder is ``$VINESIM_CACHE`` if that is set, else ``vinesim`` in the user's folder for caches: ``$XDG_CACHE_HOME``
+or ``~/.cache``, ``~/Library/Caches`` on macOS, ``%LOCALAPPDATA%`` on Windows. It may be deleted at any time.
+
+Of several processes that miss an entry one makes it and the others wait. A file that is broken, truncated or of another
+version is made anew. Where the folder cannot be written, everything is computed as without a cache, after one warning.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import logging
+import os
+import pathlib
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from typing import IO
+
+import numpy as np
+
+from vinesim.core.progress import ProgressLine
+
+log = logging.getLogger(__name__)
+
+MAX_SIZE = 1 << 30
+"""Size of all entries [bytes]; those that were not used for longest are deleted."""
+LOCK_TIMEOUT = 120.0
+"""How long to wait for another process that makes an entry, before making it as well [s]."""
+_LEFTOVER_AGE = 3600.0
+"""Age from which a temporary file belongs to a process that was killed [s]."""
+_POLL_PERIOD = 0.02
+"""Between two attempts to get a lock [s]."""
+
+Arrays = dict[str, np.ndarray]
+
+_warned = threading.Event()
+
+
+def folder() -> pathlib.Path:
+    """The folder of the cache; it need not exist."""
+    if chosen := os.environ.get("VINESIM_CACHE"):
+        return pathlib.Path(chosen)
+    return user_folder() / "vinesim"
+
+
+def user_folder() -> pathlib.Path:
+    """The folder in which this user's programs keep their caches; it need not exist."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
+    elif sys.platform == "darwin":
+        base = "~/Library/Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return pathlib.Path(base).expanduser()
+
+
+def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndarray]]) -> Arrays:
+    """The arrays of ``make``, from the cache if they are there.
+
+    Args:
+        name: what they are; part of the file's name.
+        digest: of everything that the arrays follow from, the code included: see :func:`source_digest`.
+        make: computes them. Called once, and only if no entry is found; its errors are passed on.
+    """
+    try:
+        place = folder()
+    except RuntimeError as error:  # no home folder
+        _warn(error)
+        return dict(make())
+    path = place / f"{name}-{digest}.npz"
+    if (found := _read(path)) is not None:
+        return found
+    with exclusive(path.stem):
+        if (found := _read(path)) is not None:  # another process has made it meanwhile
+            return found
+        arrays = dict(make())
+        _write(path, arrays)
+    return arrays
+
+
+def load(name: str, digest: str) -> Arrays | None:
+    """The arrays that :func:`keep` was given; None if they are not there or broken."""
+    try:
+        return _read(folder() / f"{name}-{digest}.npz")
+    except RuntimeError as error:  # no home folder
+        _warn(error)
+        return None
+
+
+def keep(name: str, digest: str, arrays: Mapping[str, np.ndarray]) -> None:
+    """Keep arrays that came from elsewhere; if the folder cannot be written, that is said once."""
+    try:
+        _write(folder() / f"{name}-{digest}.npz", dict(arrays))
+    except RuntimeError as error:
+        _warn(error)
+
+
+def source_digest(*sources: pathlib.Path | str | bytes) -> str:
+    """A digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and bytes.
+
+    It holds the version of numpy too, whose functions may change a last bit between versions.
+    """
+    h = hashlib.blake2b(np.__version__.encode(), digest_size=8)
+    for source in sources:
+        if isinstance(source, pathlib.Path):
+            files = [source]
+            if source.is_dir():
+                files = sorted(f for f in source.rglob("*") if f.suffix in (".py", ".toml"))
+            parts = [part for f in files for part in (f.name.encode(), f.read_bytes())]
+        else:
+            parts = [source.encode() if isinstance(source, str) else source]
+        for part in parts:
+            h.update(len(part).to_bytes(8, "little") + part)
+    return h.hexdigest()
+
+
+def _warn(error: Exception) -> None:
+    """One warning a process: the cache cannot be used."""
+    if not _warned.is_set():
+        _warned.set()
+        log.warning("no cache on disk, so every start computes its tables anew (set VINESIM_CACHE): %s", error)
+
+
+def _read(path: pathlib.Path) -> Arrays | None:
+    """The arrays of a file; None if it is not there or broken."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}  # checks the checksum of each
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
+        log.info("%s is made anew: %s", path, error)
+        return None
+    with contextlib.suppress(OSError):
+        os.utime(path)  # its time of use
+    return arrays
+
+
+def _write(path: pathlib.Path, arrays: Arrays) -> None:
+    """Write a file under another name, then rename it: readers find the whole file or none."""
+    if sum(array.nbytes for array in arrays.values()) > MAX_SIZE:
+        return
+    draft = path.with_name(f"{path.stem}.{os.getpid()}-{threading.get_ident()}.tmp")
+    try:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(draft, "wb") as file:
+                np.savez(file, **arrays)  # pyright: ignore[reportArgumentType] the stub of savez takes bools only
+            os.replace(draft, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                draft.unlink(missing_ok=True)
+            raise
+        _prune(path.parent)
+    except OSError as error:
+        _warn(error)
+
+
+def _prune(place: pathlib.Path) -> None:
+    """Delete what killed processes have left, then entries, oldest first, until the rest is small enough."""
+    now, entries = time.time(), []
+    for file in place.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # another process prunes as well
+            stat = file.stat()
+            if file.suffix == ".npz":
+                entries.append((stat.st_mtime, stat.st_size, file))
+            elif file.suffix in (".tmp", ".lock") and now - stat.st_mtime > _LEFTOVER_AGE:
+                file.unlink(missing_ok=True)
+    size = sum(entry[1] for entry in entries)
+    for _, own, file in sorted(entries)[:-1]:
+        if size <= MAX_SIZE:
+            return
+        file.unlink(missing_ok=True)
+        size -= own
+
+
+@contextlib.contextmanager
+def exclusive(name: str, timeout: float | None = None, waiting_for: str = "") -> Iterator[bool]:
+    """Be the only process in work that has this ``name``; yields whether another process was waited for.
+
+    The lock ends with the process that holds it, however that ends. Goes on without it where there can be none, and
+    after ``timeout`` [s], :data:`LOCK_TIMEOUT` unless given. ``waiting_for``: logged after a second of waiting.
+    """
+    timeout = LOCK_TIMEOUT if timeout is None else timeout
+    start, waited = time.monotonic(), False
+    with ProgressLine() as line:
+        while (lock := try_exclusive(name)) is None:
+            waited = True
+            line.show(f"waiting for {waiting_for or f'another process that makes {name}'}")
+            if time.monotonic() > start + timeout:
+                log.warning("another process has held %s for %.0f s; going on without it", name, timeout)
+                lock = contextlib.ExitStack()
+                break
+            time.sleep(_POLL_PERIOD)
+    with lock:
+        yield waited
+
+
+def try_exclusive(name: str) -> contextlib.ExitStack | None:
+    """The lock of :func:`exclusive`, held until it is closed; None if another process has it."""
+    lock = contextlib.ExitStack()
+    try:
+        path = folder() / f"{name}.lock"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = lock.enter_context(open(path, "ab"))  # noqa: SIM115 entered
+    except (OSError, RuntimeError) as error:
+        _warn(error)
+        return lock
+    if _try_lock(file):
+        return lock
+    lock.close()
+    return None
+
+
+if sys.platform == "win32":
+    import msvcrt
+
+    def _try_lock(file: IO[bytes]) -> bool:
+        file.seek(0)
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+
+else:
+    import fcntl
+
+    def _try_lock(file: IO[bytes]) -> bool:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError as error:  # a file system without locks
+            _warn(error)
+            return True
+        return True

@@ -1,0 +1,304 @@
+"""Detachment: bunches pulled or bent off their peduncles, and what a closing blade cuts.
+
+A bunch becomes a free body of the rigid world in the same tick, with its pose, velocity and weight; on the tree stay
+its peduncle and a stub of a gram, so the tree's numbering never changes. A cane that is cut falls with all that grows
+on it, its bunches still hanging from it (:meth:`ArticulationSolver.cut`).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import dataclasses
+import math
+
+import numpy as np
+import warp as wp
+
+from vinesim.contact.contact_solver import ContactSolver
+from vinesim.core import frames
+from vinesim.core.errors import checked_index
+from vinesim.core.warp_arrays import share
+from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.plants.overloads import count_overloaded_steps
+from vinesim.plants.articulation_solver import ArticulationSolver, spans
+from vinesim.rigid.free_bunch import FreeBunch
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.ids import Organ
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.values import Contact, Detachment
+
+STUB_MASS = 1e-3
+"""What stays of a bunch on the tree [kg]."""
+
+
+@dataclasses.dataclass(slots=True)
+class Blade:
+    """The mouth of a cutter: a box fixed to a link. When it closes, it cuts the wood that passes through it."""
+
+    actor: str
+    link: str
+    pose: np.ndarray
+    """[7] of the mouth's middle in the link: x along the blades, y from blade to blade, z across their plane."""
+    half: np.ndarray
+    """[3] m, half edges of the mouth; half[1] is the reach: how far to either side wood is caught."""
+    force: float = np.inf
+    """[N] with which it closes at most."""
+    closing: bool = False
+    closures: int = 0
+    """How often it has closed so far."""
+    detachments: tuple[Detachment, ...] = ()
+    """What it cut off its plant when it closed last."""
+    resistance: float = 0.0
+    """[N] Cutting force of the strongest piece that was in its mouth then, cut or not; 0 if there was none."""
+
+    def close(self, force: float = np.inf) -> None:
+        """Shut with at most ``force`` [N], and open again: cuts what is in the mouth at the end of the coming step."""
+        self.closing, self.force = True, force
+
+
+class DetachmentMonitor:
+    """Watches the peduncles of awake trees and the blades that close, and detaches what breaks or is cut."""
+
+    def __init__(
+        self,
+        plants: ArticulationSolver,
+        rigid: RigidWorld,
+        contact_solver: ContactSolver,
+        parameters: PhysicsParameters = PhysicsParameters(),
+    ) -> None:
+        """``parameters``: ``detachment_duration`` says how long a peduncle must be overloaded, ``cutting_strength``
+        what a blade has to overcome."""
+        self._overload_limit = parameters.steps(parameters.detachment_duration)
+        self._cutting_strength = parameters.cutting_strength
+        self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
+        self.blades: list[Blade] = []
+        self.hand_contacts: tuple[Contact, ...] = ()
+        """Hands that hold plants, as contacts: the actor that holds a bunch may have pulled it off."""
+        model = plants.model
+        self._overloaded_steps = np.zeros(len(model.bunch_body), np.int32)
+        self._bunch_of = model.bunch_of_body()
+        trees = model.body_tree[model.bunch_body]
+        order = np.argsort(trees, kind="stable")
+        self._bunches = order.astype(np.int32)
+        self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
+        self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
+        self._awake: np.ndarray | None = None
+        self._awake_count, self._awake_bunches = ctypes.c_int32(), np.zeros(len(order), np.int32)
+        self._longest = np.zeros(1, np.int32)
+        self._detachments: list[Detachment] = []
+        self._bind()
+
+    def _bind(self) -> None:
+        model = self.plants.model
+        self._peduncles = peduncles = self.plants.launches.record_joint_wrenches(max(len(self._bunches), 1))
+        count_steps = bind_launch(
+            count_overloaded_steps,
+            [share(model.bunch_body, wp.int32), share(model.body_tree, wp.int32), share(model.bunch_pull, wp.float32),
+             share(model.bunch_bend, wp.float32), share(self._awake_bunches, wp.int32),
+             share(peduncles.carried, wp.spatial_vector), share(self.plants.state.bunch_attached, wp.bool),
+             share(self.contact_solver.remote_trees, wp.bool)],
+            [share(self._overloaded_steps, wp.int32), share(self._longest, wp.int32)],
+        )  # fmt: skip
+        count = self._awake_count
+        self._count_overloaded_steps = self.plants.launch_pool.sequence([
+            (peduncles.compute, count), (count_steps, count),
+        ])  # fmt: skip
+
+    # ------------------------------------------------------------------ the tick
+
+    def update(self, *, check_load: bool = True) -> tuple[Detachment, ...]:
+        """After a commit: all that parted since the last call, sorted by body. ``strain`` off: only what is cut."""
+        if check_load:
+            self._detach_overloaded()
+        if any(blade.closing for blade in self.blades):
+            self._cut_with_blades()
+        told, self._detachments = tuple(sorted(self._detachments, key=lambda parting: parting.body)), []
+        return told
+
+    def _detach_overloaded(self) -> None:
+        """Detach the bunches whose peduncles have been overloaded for long enough, on trees that this client
+        simulates."""
+        self._list_awake_bunches()
+        self._longest[0] = 0
+        self._count_overloaded_steps()
+        if self._longest[0] < self._overload_limit:
+            return
+        count = self._awake_count.value
+        model, attached = self.plants.model, self.plants.state.bunch_attached
+        for i in np.flatnonzero(self._overloaded_steps[self._awake_bunches[:count]] >= self._overload_limit).tolist():
+            bunch = int(self._awake_bunches[i])
+            is_remote = self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunch]]]
+            if attached[bunch] and not is_remote:
+                square = np.square(self._peduncles.carried[i])
+                pulled = square[:3].sum() / np.square(model.bunch_pull[bunch])
+                bent = square[3:].sum() / np.square(model.bunch_bend[bunch])
+                cause, actor = "pull" if pulled >= bent else "bend", self._hardest_pressing_actor(bunch)
+                self._pick(bunch, cause, actor, self._peduncles.carried[i].copy())
+
+    def _list_awake_bunches(self) -> None:
+        """List the bunches of awake trees, those that have been picked included."""
+        awake = self.plants.awake
+        if awake is not self._awake:
+            self._awake = awake
+            first = self._first[awake]
+            bunches = self._bunches[spans(first, self._first[awake + 1] - first)]
+            self._awake_count.value = len(bunches)
+            self._awake_bunches[: len(bunches)] = bunches
+            self._peduncles.places[: len(bunches)] = self.plants.buffers.slots[self.plants.model.bunch_body[bunches]]
+
+    def _cut_with_blades(self) -> None:
+        """Cut what is in the mouths that are closing."""
+        self.plants.forward_kinematics()
+        for blade in self.blades:
+            if blade.closing:
+                blade.closing, blade.resistance, before = False, 0.0, len(self._detachments)
+                blade.closures += 1
+                for body in self._bodies_in_mouth(blade).tolist():
+                    resistance = self.cutting_force(body)
+                    blade.resistance = max(blade.resistance, resistance)
+                    if resistance > blade.force:
+                        continue
+                    bunch = int(self._bunch_of[body])
+                    if bunch < 0:
+                        self.cut(body, "blade", blade.actor)
+                    elif self.plants.state.bunch_attached[bunch]:
+                        self.pick(bunch, "blade", blade.actor)
+                blade.detachments = tuple(self._detachments[before:])
+
+    def wood_in_mouth(self, blade: Blade) -> list[tuple[int, int]]:
+        """After a step: bodies that a blade would cut if it were strong enough, and the bunch that each carries; -1: a
+        cane."""
+        bodies = self._bodies_in_mouth(blade).tolist()
+        found = [(body, int(self._bunch_of[body])) for body in bodies]
+        return [(body, bunch) for body, bunch in found if bunch < 0 or self.plants.state.bunch_attached[bunch]]
+
+    def cutting_force(self, body: int) -> float:
+        """[N] that it takes to cut a piece of wood across: its cross-section at the root end times its strength."""
+        return self._cutting_strength * math.pi * float(self.plants.model.body_radius[body, 0]) ** 2
+
+    def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
+        """Pieces of wood [k] whose axis passes through a blade's mouth, of each branch the one next to the root."""
+        model, body_q = self.plants.model, self.plants.state.body_q
+        mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
+        far = np.linalg.norm(blade.half)
+        apart = body_q[:, :3] - mouth[:3].astype(np.float32)
+        reach = far + model.body_length
+        near = np.flatnonzero(self._wood & ((apart * apart).sum(1) < reach * reach))
+        start = frames.rotate(frames.conjugate(mouth[3:]), body_q[near, :3] - mouth[:3])
+        along = frames.rotate(frames.multiply(frames.conjugate(mouth[3:]), body_q[near, 3:]), np.array([1.0, 0.0, 0.0]))
+        along = along * model.body_length[near, None]
+        # the part of each axis between the planes of the box, side by side (slab test)
+        along = np.where(np.abs(along) < 1e-12, 1e-12, along)
+        one, other = (-blade.half - start) / along, (blade.half - start) / along
+        enter, leave = np.minimum(one, other).max(1), np.maximum(one, other).min(1)
+        caught = near[(enter <= leave) & (leave >= 0.0) & (enter <= 1.0)]
+        caught = caught[~self.plants.state.body_cut[caught]]
+        inside = np.zeros(len(self._wood), bool)
+        inside[caught] = True
+        return caught[~self._has_marked_ancestor(caught, inside)]
+
+    def _has_marked_ancestor(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
+        """Which of some bodies [k] grow on a marked one [body], with no cut between them."""
+        parent, cut = self.plants.model.body_parent, self.plants.state.body_cut
+        below, at = np.zeros(len(bodies), bool), bodies.copy()
+        while (at >= 0).any():
+            at = np.where((at >= 0) & ~cut[at], parent[at], -1)
+            below |= (at >= 0) & marked[at]
+        return below
+
+    # ------------------------------------------------------------------ one at a time
+
+    def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
+        """Detach one bunch; it keeps its pose and velocity. Call it between steps. :class:`ValueError` if it cannot
+        be."""
+        bunch = checked_index("bunch", bunch, len(self._overloaded_steps))
+        if not self.plants.state.bunch_attached[bunch]:
+            raise ValueError(f"bunch {bunch} was picked already")
+        body = self.plants.model.bunch_body[bunch]
+        self._pick(bunch, cause, actor, self.plants.joint_wrench(np.array([body]))[0])
+
+    def _pick(self, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
+        plants, model = self.plants, self.plants.model
+        body = int(model.bunch_body[bunch])
+        tree = int(model.body_tree[body])
+        plants.wake(tree)
+        plants.forward_kinematics(np.array([tree]))
+        shapes, state = self.contact_solver.capsules, plants.state
+        # as touched so far, its clusters where they are: what holds it must not feel the difference
+        here = (shapes.bunch == bunch) & (shapes.level != (1 if state.tree_fine[tree] else 2))
+        of = np.flatnonzero(here & (model.body_organ[shapes.body] == int(Organ.BUNCH)))
+        velocity = plants.berry_clusters.fuse(bunch)  # first cut, then fused: its vine and its neighbours feel nothing
+        local = frames.compose(frames.inverse(state.body_q[body].astype(float)), state.body_q[shapes.body[of]])
+        start, end = (
+            local[:, :3] + frames.rotate(local[:, 3:], at[of].astype(float)) for at in (shapes.start, shapes.end)
+        )
+        loose = FreeBunch(
+            mass=float(plants.body_mass[body]), com=plants.body_com[body].astype(float),
+            inertia=plants.body_inertia[body].astype(float), product=plants.body_product[body].astype(float),
+            start=start, end=end, radius=shapes.radius[of].astype(float),
+        )  # fmt: skip
+        self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], velocity)
+        self.rigid.let_pass(bunch)
+        self.contact_solver.let_pass(bunch, *_box_around(loose, plants.state.body_q[body].astype(float)))
+        plants.state.bunch_attached[bunch] = False
+        self._overloaded_steps[bunch] = 0
+        plants.set_mass(body, STUB_MASS)
+        if state.tree_fine[tree]:
+            plants.berry_clusters.release(bunch)
+        plants.body_drag[body] = 0.0
+        self._record(body, bunch, cause, actor, carried)
+
+    def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
+        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between steps.
+
+        :class:`ValueError` if it cannot be cut.
+        """
+        plants, body = self.plants, checked_index("body", body, len(self._wood))
+        if plants.model.body_organ[body] == int(Organ.BUNCH):
+            raise ValueError(f"body {body} is no piece of wood that can be cut")
+        if self._bunch_of[body] >= 0:
+            self.pick(int(self._bunch_of[body]), cause, actor)
+            return
+        if plants.state.body_cut[body]:
+            raise ValueError(f"body {body} was cut already")
+        carried = plants.joint_wrench(np.array([body]))[0]
+        tree = int(plants.model.body_tree[body])
+        plants.wake(tree)
+        plants.forward_kinematics(np.array([tree]))
+        plants.cut(body)
+        self._record(body, -1, cause, actor, carried)
+
+    def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Detach one bunch because another client has, and place it: ``pose`` [7] m, xyzw, ``velocity`` [6] m/s, rad/s.
+
+        It is not among this client's detachments.
+        """
+        self._pick(bunch, "told", "", np.zeros(6))
+        self._detachments.pop()
+        self.rigid.place_bunch(bunch, pose, velocity)
+
+    def apply_remote_cut(self, body: int) -> None:
+        """Cut a body off its parent because another client has."""
+        if not self.plants.state.body_cut[body]:
+            tree = int(self.plants.model.body_tree[body])
+            self.plants.wake(tree)
+            self.plants.cut(body)
+
+    def _record(self, body: int, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
+        tree = int(self.plants.model.body_tree[body])
+        force, moment = carried[:3].astype(float), carried[3:].astype(float)
+        self._detachments.append(Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
+
+    def _hardest_pressing_actor(self, bunch: int) -> str:
+        """The actor that presses hardest on a bunch; empty if none does."""
+        pushes: dict[str, float] = {}
+        for contact in self.contact_solver.contacts + self.hand_contacts:
+            if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
+                pushes[contact.actor] = pushes.get(contact.actor, 0.0) + float(np.linalg.norm(contact.force))
+        return max(sorted(pushes), key=lambda actor: pushes[actor], default="")
+
+
+def _box_around(bunch: FreeBunch, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner [3] m of the box, in the world's axes, around a bunch at ``pose`` [7]."""
+    ends = pose[:3] + frames.rotate(pose[3:], np.stack([bunch.start, bunch.end]))
+    return (ends - bunch.radius[:, None]).min((0, 1)), (ends + bunch.radius[:, None]).max((0, 1))

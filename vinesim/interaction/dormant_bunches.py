@@ -1,0 +1,120 @@
+"""Dormant free bunches: picked bunches that are known and drawn, but have no body while no actor is near.
+
+A client that joins late learns of a thousand picked bunches at once. A body for each would cost milliseconds to make
+and time in every step; an entry here costs nothing until :meth:`DormantBunches.activate` gives it a body.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.contact.contact_solver import ContactSolver
+from vinesim.core import frames
+from vinesim.interaction.detachment import STUB_MASS
+from vinesim.interaction.support_tracking import SupportTracker
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.rigid.free_bunch import FreeBunch
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.ids import Organ
+from vinesim.scene.values import RigidVisual
+
+
+class DormantBunches:
+    """Picked bunches without bodies, each at a pose in the frame of its support."""
+
+    def __init__(
+        self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver, supports: SupportTracker
+    ) -> None:
+        self.plants, self.rigid, self.contact_solver, self.supports = plants, rigid, contact_solver, supports
+        self._bunches: dict[int, FreeBunch] = {}
+        self._support: dict[int, str] = {}
+        self._relative: dict[int, np.ndarray] = {}
+        self._place: dict[int, np.ndarray] = {}
+        """Poses [7] in the world, for those whose support does not exist."""
+        self._visuals: tuple[RigidVisual, ...] | None = ()
+        self._groups: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []
+        """By support: its name, rows of :meth:`visuals`, poses [k, 7] in its frame and in the world without it."""
+        capsules = contact_solver.capsules
+        of_bunches = np.flatnonzero(
+            (plants.model.body_organ[capsules.body] == int(Organ.BUNCH)) & (capsules.level != 2)
+        )
+        self._capsules = of_bunches[np.argsort(capsules.bunch[of_bunches], kind="stable")]
+        self._first = np.searchsorted(capsules.bunch[self._capsules], np.arange(len(plants.model.bunch_body) + 1))
+
+    def __contains__(self, bunch: int) -> bool:
+        return bunch in self._bunches
+
+    def __len__(self) -> int:
+        return len(self._bunches)
+
+    def add(self, bunches: list[int], supports: list[str], poses: np.ndarray, places: np.ndarray | None = None) -> None:
+        """Add picked bunches, or move them: ``poses`` [k, 7] in the frames of their ``supports`` (names), ``places``
+        [k, 7] in the world as long as the support does not exist (None: ``poses``).
+
+        Bunches that still hang are taken off their vines without waking these.
+        """
+        plants, model = self.plants, self.plants.model
+        new = [bunch for bunch in bunches if bunch not in self._bunches]
+        if new:
+            bodies = model.bunch_body[new]
+            plants.coarsen(np.unique(model.body_tree[bodies]))
+            columns = (plants.body_mass, plants.body_com, plants.body_inertia, plants.body_product)
+            rows = zip(new, *(column[bodies].astype(float) for column in columns), strict=True)
+            capsules = self.contact_solver.capsules
+            for bunch, mass, com, inertia, product in rows:
+                of = self._capsules[self._first[bunch] : self._first[bunch + 1]]
+                start, end, radius = (
+                    column[of].astype(float) for column in (capsules.start, capsules.end, capsules.radius)
+                )
+                self._bunches[bunch] = FreeBunch(float(mass), com, inertia, product, start, end, radius)
+            plants.state.bunch_attached[new] = False
+            plants.body_drag[bodies] = 0.0
+            for body in bodies.tolist():
+                plants.set_mass(body, STUB_MASS)
+        places = poses if places is None else places
+        for bunch, support, pose, place in zip(bunches, supports, poses, places, strict=True):
+            self._support[bunch], self._relative[bunch] = support, np.asarray(pose, float)
+            self._place[bunch] = np.asarray(place, float)
+        self._visuals = None
+
+    def activate(self, bunches: list[int]) -> None:
+        """Give some bunches their bodies, at their present poses and with the velocities of their supports."""
+        if bunches:
+            states = {bunch: self._world_state(bunch) for bunch in bunches}
+            self.rigid.add_bunches({bunch: (self._bunches.pop(bunch), *states[bunch]) for bunch in bunches})
+            for bunch in bunches:
+                del self._support[bunch], self._relative[bunch], self._place[bunch]
+            self._visuals = None
+
+    def _world_state(self, bunch: int) -> tuple[np.ndarray, np.ndarray]:
+        """World pose [7] and velocity [6]."""
+        state = self.supports.to_world(self._support[bunch], self._relative[bunch])
+        return (self._place[bunch], np.zeros(6)) if state is None else state
+
+    def nearest(self, actors: np.ndarray, most: int) -> list[int]:
+        """At most ``most`` bunches within ``dormant_radius`` of one of the ``actors`` [k, 3] m, the nearest first."""
+        if not self._bunches or not len(actors):
+            return []
+        distance = np.linalg.norm(self.visual_q()[:, None, :2] - actors[None, :, :2], axis=-1).min(1)
+        visuals, radius = self.visuals(), self.rigid.parameters.dormant_radius
+        return [visuals[i].index for i in np.argsort(distance, kind="stable")[:most].tolist() if distance[i] < radius]
+
+    def visuals(self) -> tuple[RigidVisual, ...]:
+        """All dormant bunches, as in :meth:`RigidWorld.visuals`."""
+        if self._visuals is None:
+            order = sorted(self._bunches)
+            self._visuals = tuple(RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._bunches[i].shapes) for i in order)
+            supports = np.array([self._support[i] for i in order])
+            poses = np.array([self._relative[i] for i in order]).reshape(-1, 7)
+            rows_on = [(str(support), np.flatnonzero(supports == support)) for support in np.unique(supports)]
+            places = np.array([self._place[i] for i in order]).reshape(-1, 7)
+            self._groups = [(support, rows, poses[rows], places[rows]) for support, rows in rows_on]
+        return self._visuals
+
+    def visual_q(self) -> np.ndarray:
+        """World poses [visual, 7] of :meth:`visuals`."""
+        pose = np.zeros((len(self.visuals()), 7))
+        for support, rows, relative, place in self._groups:
+            frame = self.supports.support_state(support)
+            pose[rows] = place if frame is None else frames.compose(frame[0], relative)
+        return pose

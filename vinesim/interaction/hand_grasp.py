@@ -1,0 +1,175 @@
+"""Grasps of people's hands: what a hand holds, whether plant, box, bunch, robot or static geom.
+
+A rigid body is welded to the hand. A plant is held by a spring between the grasped point and the controller: the spring
+of
+the hand itself, solved implicitly with the plant's own, and the hand is placed on the plant. When a bunch is detached
+from its vine in a hand, the hand goes on holding it as a rigid body.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from vinesim.contact.contact_solver import ContactSolver
+from vinesim.core import frames
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.ties import TieLimitError
+from vinesim.rigid.hand_body import HandBody
+from vinesim.rigid.human_body import HumanBody
+from vinesim.rigid.human_shapes import GRASP_POINTS, HAND_HALF_THICKNESS
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.values import Contact, Detachment
+
+_NO_TREES = np.zeros(0, int)
+
+
+@dataclasses.dataclass(slots=True)
+class _PlantGrasp:
+    """A plant's body in a hand."""
+
+    body: int
+    tie: int
+    """Number of the spring, see :meth:`ArticulationSolver.add_tie`."""
+    point: np.ndarray
+    """[3] m, the grasped point in the body's frame."""
+    bunch: int
+    """Which bunch the body is, -1 if it is none."""
+
+
+class GraspManager:
+    """Closes and opens the hands of local people and connects plants to them."""
+
+    def __init__(self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver) -> None:
+        self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
+        self.contacts: tuple[Contact, ...] = ()
+        """Hands that held a plant in the last step, as contacts; their ``distance`` is 0."""
+        self.refused_grasps = 0
+        """Hands that closed on a plant in vain since the start: too many bodies were held, or one by too many hands."""
+        self._grasps: dict[tuple[str, str], _PlantGrasp] = {}
+        """Held plants, by person and side."""
+        self._steps_to_grasp: dict[tuple[str, str], int] = {}
+        """How many more steps a hand that closed on nothing still grasps, by person and side."""
+        self._grasp_steps = rigid.parameters.steps(rigid.parameters.grasp_duration)
+
+    @property
+    def held_trees(self) -> np.ndarray:
+        """[k] Trees that are held, sorted."""
+        if not self._grasps:
+            return _NO_TREES
+        return np.unique([int(self.plants.model.body_tree[grasp.body]) for grasp in self._grasps.values()])
+
+    # ------------------------------------------------------------------ the step
+
+    def begin_step(self) -> None:
+        """Before a step: close and open hands, and pull the plants that are held."""
+        for human, hand in self._local_hands():
+            key = human.spec.name, hand.side
+            if key in self._grasps and not hand.on_plant:  # the person left and joined again
+                self._remove_tie(key)
+            if not hand.closed:
+                self._steps_to_grasp[key] = self._grasp_steps
+                if hand.held is not None:
+                    self.release(*key)
+            elif hand.held is None and self._steps_to_grasp.get(key, self._grasp_steps) > 0:
+                self._steps_to_grasp[key] = self._steps_to_grasp.get(key, self._grasp_steps) - 1
+                self._close(human, hand)
+            if key in self._grasps:
+                self._pull(human, hand, self._grasps[key])
+        if self._grasps:
+            self.plants.wake(self.held_trees)
+
+    def end_step(self, detachments: tuple[Detachment, ...]) -> None:
+        """After a step: place hands on the plants that they hold; go on holding bunches that were detached."""
+        detached = {detachment.body: detachment.bunch for detachment in detachments if detachment.bunch >= 0}
+        contacts = []
+        if self._grasps:
+            self.plants.forward_kinematics(self.held_trees)
+        for human, hand in self._local_hands():
+            key = human.spec.name, hand.side
+            grasp = self._grasps.get(key)
+            if grasp is None:
+                continue
+            if grasp.body in detached:
+                self._remove_tie(key)
+                self.rigid.release(*key)
+                self.rigid.grasp(*key, f"bunch/{detached[grasp.body]}", "bunch")
+            elif self._is_bunch_gone(grasp):
+                self.release(*key)
+            else:
+                contacts.append(self._place_on_plant(human, hand, grasp))
+        self.contacts = tuple(contacts)
+
+    def release(self, name: str, side: str) -> None:
+        """Open a hand, whatever it holds."""
+        self._remove_tie((name, side))
+        self.rigid.release(name, side)
+
+    def remove_ties_of(self, name: str) -> None:
+        """Release all plants that a person holds who is removed."""
+        for key in [key for key in self._grasps if key[0] == name]:
+            self._remove_tie(key)
+
+    # ------------------------------------------------------------------ internal
+
+    def _local_hands(self) -> list[tuple[HumanBody, HandBody]]:
+        humans = (self.rigid.human(name) for name in self.rigid.humans)
+        return [(human, hand) for human in humans if not human.is_remote for hand in human.hands]
+
+    def _close(self, human: HumanBody, hand: HandBody) -> None:
+        """Grasp what is nearest to the hand, if anything is near enough."""
+        key, distance = (human.spec.name, hand.side), self.rigid.parameters.grasp_distance
+        palm = self.rigid.hand_sample(*key).pose
+        rigid = self.rigid.nearest_to_hand(*key, distance)
+        points = palm[:3] + frames.rotate(palm[3:], GRASP_POINTS)
+        plant = self.contact_solver.nearest_body(points, distance + HAND_HALF_THICKNESS)
+        if plant is not None and (rigid is None or plant[0] - HAND_HALF_THICKNESS < rigid[0]):
+            body = plant[1]
+            self.plants.wake(self.plants.model.body_tree[body])
+            pose = self.plants.state.body_q[body].astype(float)
+            hand.grasp_pose = frames.compose(frames.inverse(pose), palm)
+            bunch = np.flatnonzero(self.plants.model.bunch_body == body)
+            try:
+                tie = self.plants.add_tie(body, hand.grasp_pose[:3], hand.stiffness, hand.damping)
+            except TieLimitError:  # the hand has closed on nothing, and does not try again before it opens
+                self.refused_grasps += 1
+                self._steps_to_grasp[key] = 0
+                return
+            self._grasps[key] = _PlantGrasp(body, tie, hand.grasp_pose[:3].copy(), next(iter(bunch.tolist()), -1))
+            self.rigid.grasp_plant(*key, body)
+        elif rigid is not None:
+            self.rigid.grasp(*key, *rigid[1:])
+
+    def _pull(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> None:
+        """Set the anchor of the spring, no further from the plant than the hand's force allows."""
+        at = self._grasped_point(grasp)
+        velocity = human.controller_velocity(hand, self.rigid.dt)
+        pull = human.controller_pose(hand)[:3] + hand.damping / hand.stiffness * velocity - at
+        most = hand.max_force / hand.stiffness
+        self.plants.tie_anchor[grasp.tie] = at + pull * min(1.0, most / max(float(np.linalg.norm(pull)), 1e-12))
+
+    def _grasped_point(self, grasp: _PlantGrasp) -> np.ndarray:
+        """[3] m in the world."""
+        pose = self.plants.state.body_q[grasp.body].astype(float)
+        return pose[:3] + frames.rotate(pose[3:], grasp.point)
+
+    def _place_on_plant(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> Contact:
+        """Place a hand on the plant that it holds and set its force; the same as a contact."""
+        plants = self.plants
+        pose, motion = plants.state.body_q[grasp.body].astype(float), plants.state.body_qd[grasp.body].astype(float)
+        self.rigid.place_hand(human.spec.name, hand.side, frames.compose(pose, hand.grasp_pose))
+        at = self._grasped_point(grasp)
+        velocity = motion[:3] + frames.cross(motion[3:], at - pose[:3])
+        hand.force = plants.tie_stiffness[grasp.tie] * (plants.tie_anchor[grasp.tie] - at) - hand.damping * velocity
+        hand.steps_since_contact = 0
+        return Contact(human.spec.name, hand.link, grasp.body, at, -hand.force, 0.0)
+
+    def _is_bunch_gone(self, grasp: _PlantGrasp) -> bool:
+        """Whether a held bunch was detached otherwise, for example by another client."""
+        return grasp.bunch >= 0 and not self.plants.state.bunch_attached[grasp.bunch]
+
+    def _remove_tie(self, key: tuple[str, str]) -> None:
+        grasp = self._grasps.pop(key, None)
+        if grasp is not None:
+            self.plants.remove_tie(grasp.body, grasp.tie)

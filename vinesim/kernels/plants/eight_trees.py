@@ -1,0 +1,380 @@
+"""Prediction of eight trees of one topology at once: one lane of a SIMD vector is one tree.
+
+The same walk as :mod:`vinesim.kernels.plants.prediction` with the same functions of one body, on a CPU only. All that a
+walk needs of eight trees is copied into records (:mod:`vinesim.kernels.plants.lane_records`); LLVM then makes one vector instruction of eight turns of the loops over ``lane``
+(docs/decisions/eight-trees.md says what that asks of them). Lanes know nothing of each other, so that a tree gets the
+same bits whichever trees share its vector, and those of a prediction alone.
+"""
+
+import warp as wp
+
+from vinesim.kernels.compiler_flags import INLINE_ALL
+from vinesim.kernels.plants.body_dynamics import (
+    accelerate_body,
+    drag_terms,
+    joint_terms,
+    own_terms,
+    terms_left,
+    tie_terms,
+)
+from vinesim.kernels.plants.contiguous import (
+    contiguous_bodies,
+    contiguous_factors,
+    contiguous_forces,
+    contiguous_joints,
+    contiguous_model,
+    contiguous_prediction,
+    contiguous_scratch,
+)
+from vinesim.kernels.plants.kinematics import body_kinematics
+from vinesim.kernels.plants.lane_records import (
+    AXES,
+    COM,
+    CONTACT,
+    DAMPING,
+    DRAG,
+    END,
+    FACTORS,
+    INERTIA,
+    JOINT_Q,
+    JOINT_QD,
+    LANES,
+    LEVER,
+    LOAD,
+    MASS,
+    MOTION,
+    OFFSET,
+    POSE,
+    PRODUCT,
+    REST,
+    STIFFNESS,
+    STRIDE,
+    TERMS,
+    Floats,
+    load_tree,
+    mat33_at,
+    parent_record,
+    put_spatial,
+    put_vec3,
+    quat_at,
+    record,
+    spatial_at,
+    store_tree,
+    symmetric_at,
+    upper_triangle,
+    vec3_at,
+)
+from vinesim.kernels.plants.prediction import chosen_phi, is_conservative, predict_tree
+from vinesim.kernels.plants.spatial import inverse_symmetric, world_inertia
+from vinesim.kernels.plants.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    Factors,
+    JointState,
+    Prediction,
+    Scratch,
+    SolverParameters,
+    substep_parameters,
+)
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
+
+MIN_LANES = wp.constant(2)
+"""Fewer trees are predicted one by one. MEASURED: two trees take 0.7 to 0.9 of the time together, eight 0.3."""
+
+Lanes = wp.types.vector(length=LANES, dtype=wp.float32)
+LaneIndices = wp.types.vector(length=LANES, dtype=wp.int32)
+# results of a loop over lanes; a loop that wrote to the record it reads would not be vectorised
+KinematicsOut = wp.types.vector(length=LANES * 20, dtype=wp.float32)
+TermsOut = wp.types.vector(length=LANES * 30, dtype=wp.float32)
+FactorsOut = wp.types.vector(length=LANES * 27, dtype=wp.float32)
+EndOut = wp.types.vector(length=LANES * 15, dtype=wp.float32)
+
+
+@wp.func
+def assemble_eight(p: SolverParameters, phis: Lanes, top: Floats, own_out: Floats):
+    """Poses, velocities, implicit inertia, bias and tension of one body of each tree; ``top`` is its parent's record."""
+    kinematics = KinematicsOut()
+    terms = TermsOut()
+    lane = wp.int32(0)
+    while lane < LANES:
+        above = wp.transform(vec3_at(top, POSE + lane), quat_at(top, POSE + 24 + lane))
+        axes, lever, pose, motion = body_kinematics(
+            above,
+            spatial_at(top, MOTION + lane),
+            vec3_at(own_out, OFFSET + lane),
+            quat_at(own_out, REST + lane),
+            quat_at(own_out, JOINT_Q + lane),
+            vec3_at(own_out, JOINT_QD + lane),
+        )
+        origin = wp.transform_get_translation(pose)
+        q = wp.transform_get_rotation(pose)
+        for c in range(3):
+            kinematics[8 * c + lane] = origin[c]
+            kinematics[8 * (17 + c) + lane] = lever[c]
+        for c in range(4):
+            kinematics[8 * (3 + c) + lane] = q[c]
+            kinematics[8 * (13 + c) + lane] = axes[c]
+        for c in range(6):
+            kinematics[8 * (7 + c) + lane] = motion[c]
+        rotation = wp.quat_to_matrix(q)
+        inertia = world_inertia(rotation, vec3_at(own_out, INERTIA + lane), vec3_at(own_out, PRODUCT + lane))
+        J, H, M, bias, tension, _steady = own_terms(
+            p, phis[lane], motion, own_out[MASS + lane], rotation * vec3_at(own_out, COM + lane), inertia,
+            spatial_at(own_out, LOAD + lane), vec3_at(own_out, CONTACT + lane), 0.0, wp.vec3(),
+        )  # fmt: skip
+        J_upper = upper_triangle(J)
+        M_upper = upper_triangle(M)
+        for c in range(6):
+            terms[8 * c + lane] = J_upper[c]
+            terms[8 * (15 + c) + lane] = M_upper[c]
+            terms[8 * (21 + c) + lane] = bias[c]
+        for r in range(3):
+            for c in range(3):
+                terms[8 * (6 + 3 * r + c) + lane] = H[r, c]
+            terms[8 * (27 + r) + lane] = tension[r]
+        lane += 1
+    i = wp.int32(0)
+    while i < LANES * 20:
+        own_out[POSE + i] = kinematics[i]
+        i += 1
+    i = wp.int32(0)
+    while i < LANES * 30:
+        own_out[TERMS + i] = terms[i]
+        i += 1
+
+
+@wp.func
+def add_drag_eight(p: SolverParameters, phis: Lanes, air: Floats, own_out: Floats):
+    """Add the drag of the air, of velocity ``air`` [8 x 3], to one body of each tree."""
+    terms = TermsOut()
+    lane = wp.int32(0)
+    while lane < LANES:
+        rotation = wp.quat_to_matrix(quat_at(own_out, POSE + 24 + lane))
+        J, H, M, bias, tension = drag_terms(
+            p, phis[lane], own_out[DRAG + lane], vec3_at(air, lane), spatial_at(own_out, MOTION + lane),
+            rotation * vec3_at(own_out, COM + lane),
+        )  # fmt: skip
+        J_upper = upper_triangle(J)
+        M_upper = upper_triangle(M)
+        for c in range(6):
+            terms[8 * c + lane] = J_upper[c]
+            terms[8 * (15 + c) + lane] = M_upper[c]
+            terms[8 * (21 + c) + lane] = bias[c]
+        for r in range(3):
+            for c in range(3):
+                terms[8 * (6 + 3 * r + c) + lane] = H[r, c]
+            terms[8 * (27 + r) + lane] = tension[r]
+        lane += 1
+    i = wp.int32(0)
+    while i < LANES * 30:
+        own_out[TERMS + i] = own_out[TERMS + i] + terms[i]
+        i += 1
+
+
+@wp.func
+def add_ties(p: SolverParameters, phi: float, k: int, model: ArticulationModel, forces: AppliedForces, own_out: Floats):
+    """Add the ties of body k of one tree to its record, seen from its lane."""
+    ties = model.tie_span[k]
+    for t in range(ties[0], ties[1]):
+        J, H, M, bias, tension = tie_terms(
+            p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+            forces.tie_anchor_velocity[t],
+            wp.quat_to_matrix(quat_at(own_out, POSE + 24)) * model.tie_point[t], vec3_at(own_out, POSE),
+            spatial_at(own_out, MOTION),
+        )  # fmt: skip
+        put_spatial(own_out, TERMS, spatial_at(own_out, TERMS) + upper_triangle(J))
+        for r in range(3):
+            at = TERMS + 8 * (6 + 3 * r)
+            put_vec3(own_out, at, vec3_at(own_out, at) + H[r])
+        put_spatial(own_out, TERMS + 8 * 15, spatial_at(own_out, TERMS + 8 * 15) + upper_triangle(M))
+        put_spatial(own_out, TERMS + 8 * 21, spatial_at(own_out, TERMS + 8 * 21) + bias)
+        put_vec3(own_out, TERMS + 8 * 27, vec3_at(own_out, TERMS + 8 * 27) + tension)
+
+
+@wp.func
+def eliminate_eight(p: SolverParameters, phis: Lanes, top_out: Floats, own_out: Floats):
+    """Factor the joint above one body of each tree and hand the rest to its parent."""
+    factors = FactorsOut()
+    terms = TermsOut()
+    lane = wp.int32(0)
+    while lane < LANES:
+        turning = vec3_at(top_out, MOTION + 24 + lane)
+        metric, drive, _torque = joint_terms(
+            p.dt, phis[lane], quat_at(own_out, AXES + lane), quat_at(own_out, JOINT_Q + lane), vec3_at(own_out, JOINT_QD + lane),
+            vec3_at(own_out, STIFFNESS + lane), vec3_at(own_out, DAMPING + lane), turning, vec3_at(own_out, MOTION + 24 + lane),
+        )  # fmt: skip
+        J = symmetric_at(own_out, TERMS + lane)
+        H = mat33_at(own_out, TERMS + 8 * 6 + lane)
+        M = symmetric_at(own_out, TERMS + 8 * 15 + lane)
+        bias = spatial_at(own_out, TERMS + 8 * 21 + lane)
+        tension = vec3_at(own_out, TERMS + 8 * 27 + lane)
+        u = drive - wp.spatial_bottom(bias)
+        D = inverse_symmetric(J + metric)
+        DJ = D * J
+        DH = D * H
+        Du = D * u
+        D_upper = upper_triangle(D)
+        for c in range(6):
+            factors[8 * c + lane] = D_upper[c]
+        for r in range(3):
+            for c in range(3):
+                factors[8 * (6 + 3 * r + c) + lane] = DJ[r, c]
+                factors[8 * (15 + 3 * r + c) + lane] = DH[r, c]
+            factors[8 * (24 + r) + lane] = Du[r]
+        J_left, H_left, M_left, bias_left = terms_left(
+            p, phis[lane], turning, metric, vec3_at(own_out, LEVER + lane), J, H, M, bias, tension, DJ, DH, Du
+        )
+        J_upper = upper_triangle(J_left)
+        M_upper = upper_triangle(M_left)
+        for c in range(6):
+            terms[8 * c + lane] = J_upper[c]
+            terms[8 * (15 + c) + lane] = M_upper[c]
+            terms[8 * (21 + c) + lane] = bias_left[c]
+        for r in range(3):
+            for c in range(3):
+                terms[8 * (6 + 3 * r + c) + lane] = H_left[r, c]
+            terms[8 * (27 + r) + lane] = tension[r]
+        lane += 1
+    i = wp.int32(0)
+    while i < LANES * 27:
+        own_out[FACTORS + i] = factors[i]
+        i += 1
+    i = wp.int32(0)
+    while i < LANES * 30:
+        top_out[TERMS + i] = top_out[TERMS + i] + terms[i]
+        i += 1
+
+
+@wp.func
+def accelerate_eight(dt: float, top: Floats, own_out: Floats):
+    """Acceleration, joint rate and velocity of one body of each tree at the end of the step."""
+    end = EndOut()
+    lane = wp.int32(0)
+    while lane < LANES:
+        acceleration, rate, velocity = accelerate_body(
+            dt, spatial_at(top, END + lane), spatial_at(top, END + 8 * 6 + lane), vec3_at(top, MOTION + 24 + lane),
+            vec3_at(own_out, MOTION + 24 + lane), vec3_at(own_out, LEVER + lane), quat_at(own_out, AXES + lane),
+            vec3_at(own_out, JOINT_QD + lane), mat33_at(own_out, FACTORS + 8 * 6 + lane),
+            mat33_at(own_out, FACTORS + 8 * 15 + lane), vec3_at(own_out, FACTORS + 8 * 24 + lane),
+        )  # fmt: skip
+        for c in range(6):
+            end[8 * c + lane] = acceleration[c]
+            end[8 * (6 + c) + lane] = velocity[c]
+        for c in range(3):
+            end[8 * (12 + c) + lane] = rate[c]
+        lane += 1
+    i = wp.int32(0)
+    while i < LANES * 15:
+        own_out[END + i] = end[i]
+        i += 1
+
+
+@wp.func
+def walk_eight(
+    p: SolverParameters,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    joints: JointState,
+    trees: LaneIndices,
+    count: int,
+    phis: Lanes,
+    records_out: Floats,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    prediction_out: Prediction,
+):
+    """The three passes over eight trees of one topology, of which the first ``count`` are kept."""
+    first = model.tree_first[trees[0]]
+    size = model.tree_moving[trees[0]]
+    air = record(records_out, (size + 1) * STRIDE)
+    lane = wp.int32(0)  # no "for", which Warp would unroll
+    while lane < LANES:
+        load_tree(p.dt, phis[lane], lane, trees[lane], model, joints, forces, records_out)
+        put_vec3(air, lane, forces.tree_air[trees[lane]])
+        lane += 1
+    i = wp.int32(0)
+    while i < LANES * 15:
+        records_out[END + i] = 0.0
+        i += 1
+    i = wp.int32(0)
+    while i < LANES * 30:
+        records_out[TERMS + i] = 0.0
+        i += 1
+    for i in range(size):
+        own = record(records_out, (i + 1) * STRIDE)
+        assemble_eight(p, phis, parent_record(model, first + i, first, records_out), own)
+        has_drag = bool(False)
+        for lane in range(count):
+            has_drag = has_drag or own[DRAG + lane] > 0.0
+        if has_drag:
+            add_drag_eight(p, phis, air, own)
+        for lane in range(count):
+            k = model.tree_first[trees[lane]] + i
+            add_ties(p, phis[lane], k, model, forces, record(own, lane))
+    for j in range(size):
+        i = size - 1 - j
+        top = parent_record(model, first + i, first, records_out)
+        eliminate_eight(p, phis, top, record(records_out, (i + 1) * STRIDE))
+    for i in range(size):
+        top = parent_record(model, first + i, first, records_out)
+        accelerate_eight(p.dt, top, record(records_out, (i + 1) * STRIDE))
+    for lane in range(count):
+        store_tree(lane, trees[lane], model, records_out, bodies_out, factors_out, prediction_out)
+
+
+@wp.kernel
+def predict_groups(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    groups: wp.array(dtype=wp.vec2i),
+    trees: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_euler_steps: wp.array(dtype=wp.int32),
+    tree_steps: wp.array(dtype=wp.int32),
+    forces: AppliedForces,
+    joints: JointState,
+    # out
+    records_out: wp.array(dtype=float),
+    tree_phi_out: wp.array(dtype=float),
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """One thread solves the motion of up to eight trees of one topology as :func:`predict` does of each.
+
+    groups: [thread] first place in ``trees``, and how many; in a group of two or more no root floats. records_out:
+    scratch, no two threads at once; the others are those of :func:`predict`.
+    """
+    bodies = contiguous_bodies(bodies_out)
+    factors = contiguous_factors(factors_out)
+    prediction = contiguous_prediction(prediction_out)
+    trees_model = contiguous_model(model)
+    state = contiguous_joints(joints)
+    given = contiguous_forces(forces)
+    span = groups[wp.tid()]
+    count = span[1]
+    phis = Lanes()
+    listed = LaneIndices()
+    together = count >= MIN_LANES
+    for lane in range(LANES):
+        tree = trees[span[0] + wp.min(lane, count - 1)]
+        listed[lane] = tree
+        phi = chosen_phi(p, trees_model, state, tree, tree_phi[tree], tree_euler_steps[tree])
+        phis[lane] = phi
+        tree_phi_out[tree] = phi
+        together = together and tree_steps[tree] == 1 and not is_conservative(p, phi)
+    if together:
+        walk_eight(p, trees_model, given, state, listed, count, phis, records_out, bodies, factors, prediction)
+    else:
+        for lane in range(count):
+            tree = listed[lane]
+            step = substep_parameters(p, tree_steps[tree])
+            predict_tree(
+                step, trees_model, given, state, tree, phis[lane], bodies, factors, contiguous_scratch(scratch_out),
+                prediction,
+            )  # fmt: skip

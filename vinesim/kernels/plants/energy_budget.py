@@ -1,0 +1,433 @@
+"""Energy budget: what only weight, springs and ties at rest act on does not gain energy.
+
+The step is linear about its start. In modes that it does not resolve (w dt from 3 to 100: twist, high bending) its
+error feeds energy; docs/decisions/integrator.md has the figures. So the energy of a tree, kinetic and potential, is
+measured at the end of a step, and may not be above the least of the past by more than a band. If it is, the rates are
+filtered at fixed pose,
+
+    (M + c K) v' = M v,    c = 0.1 dt^2,
+
+which takes 0.9 % of the rate of a mode with w dt = 0.3, half with w dt = 3, and all of those far beyond. Kinetic energy
+can only fall. What is still too much is taken from all rates alike, and the next step is taken with phi = 1. A pose that
+alone has too much is one that the step went too far to: the tree is led back towards where the step began.
+
+The budget begins anew with whatever does work from outside: contacts, loads, moving air, ties that are moved, and
+changes of state or model between steps. Trees with a floating root or on wires have none, nor has a solver without
+geometric stiffness, which is there to be compared with others.
+
+Trees that can gain much within one step are watched closely, others seldom: :func:`choose_budget`.
+"""
+
+import warp as wp
+
+from vinesim.kernels.compiler_flags import INLINE_ALL
+from vinesim.kernels.plants.body_dynamics import terms_left
+from vinesim.kernels.plants.contiguous import (
+    contiguous_bodies,
+    contiguous_factors,
+    contiguous_forces,
+    contiguous_joints,
+    contiguous_model,
+    contiguous_prediction,
+    contiguous_scratch,
+)
+from vinesim.kernels.plants.first_mode import place_relaxed
+from vinesim.kernels.plants.kinematics import body_kinematics, parent_kinematics
+from vinesim.kernels.plants.prediction import accelerate_bodies, add_terms
+from vinesim.kernels.plants.spatial import (
+    half_rotation,
+    inverse_symmetric,
+    point_mass_inertia,
+    rotated_diagonal,
+    symmetric,
+    world_inertia,
+)
+from vinesim.kernels.plants.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    EnergyBudget,
+    Factors,
+    JointState,
+    Prediction,
+    Scratch,
+    SolverParameters,
+)
+from vinesim.kernels.plants.tree_energy import is_pushed, state_mark, tree_energy
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
+
+BAND = wp.constant(0.01)
+"""Share of the kinetic energy, the largest of the last seconds, by which energy may exceed its budget. Of motion that the
+step resolves, it varies by less. TUNED"""
+
+FADE = wp.constant(0.998)
+"""What a check leaves of that largest kinetic energy. TUNED: 5 s at 100 checks a second"""
+
+ROUNDING = wp.constant(1.0e-6)
+"""[1] Rounding errors of an energy as a share of its terms: eight units in the last place of a float. DERIVED"""
+
+FILTER = wp.constant(0.1)
+"""c / dt^2. TUNED: 0.03 to 1 serve as well"""
+
+CLOSE_STEPS = wp.constant(32)
+"""Steps that are all checked after the energy was found to rise, and in a tree that is watched closely after its budget
+began; else every so-manieth. TUNED"""
+
+NO_BUDGET = 0
+CLOSELY = 1
+NOW_AND_THEN = 2
+"""How the energy of a tree is watched. Closely: the budget is kept in every step. Now and then: energy is looked at; when it
+has risen, the tree is watched closely until :data:`CLOSE_STEPS` steps have gone by without a rise."""
+
+CHECK_PERIOD = wp.constant(8)
+"""[launch] Period of checks of a quiet tree. On a CPU there is one launch in eight steps while no tree is watched closely.
+TUNED: a check costs as much as a third of a step"""
+
+CHECK_RATE = wp.constant(2.0)
+"""[rad/s] Every step of a tree with a faster joint is checked, if it is watched closely. TUNED"""
+
+MIN_DAMPING = wp.constant(0.5)
+"""Least damping of a joint over its stiffness, in steps, in trees that are checked seldom. MEASURED, as is
+:data:`MAX_SAG`: docs/decisions/integrator.md"""
+
+MAX_SAG = wp.constant(4.0)
+"""[rad] Largest angle, along a path from root to tip, by which the weight of such a tree would bend its springs if they
+were linear and the tree kept the shape of its relaxed springs, level."""
+
+MIN_PHI = wp.constant(0.549)
+"""A tree of which less is asked is watched closely: phi does not damp what the step does not resolve."""
+
+BACKTRACKS = wp.constant(8)
+"""Times that the turn of a step may be halved. DERIVED: then 0.4 % of it is left."""
+
+NO_LIMIT = wp.constant(1.0e30)
+"""[J] Limit of a tree whose budget has not begun."""
+
+
+@wp.kernel
+def choose_budget(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    trees: wp.array(dtype=wp.int32),
+    # out
+    scratch_out: Scratch,
+    tree_budget_out: wp.array(dtype=wp.int32),
+):
+    """One thread chooses how the energy of one tree is watched: closely if it is limp or hardly damped.
+
+    trees: [thread] which tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or :data:`NO_BUDGET` with
+    a floating root or without geometric stiffness. scratch_out holds nothing that is needed later.
+    """
+    tree = trees[wp.tid()]
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    budget = wp.int32(NOW_AND_THEN)
+    floats = bool(False)
+    for k in range(first, first + size * model.pitch, model.pitch):
+        place_relaxed(model, k, scratch_out)
+        mass = model.body_mass[k]
+        scratch_out.bias[k] = wp.spatial_vector(mass * (scratch_out.J[k] * model.body_com[k]), wp.vec3(mass, 0.0, 0.0))
+        floats = floats or model.body_root[k] >= 0
+    for i in range(size):
+        k = first + (size - 1 - i) * model.pitch
+        subtree = scratch_out.bias[k]
+        moment = wp.spatial_top(subtree)
+        mass = subtree[3]
+        stiffness = model.joint_stiffness[k]
+        damping = model.joint_damping[k]
+        softest = float(NO_LIMIT)
+        for axis in range(3):
+            if stiffness[axis] > 0.0:
+                softest = wp.min(softest, stiffness[axis])
+                if damping[axis] < MIN_DAMPING * p.dt * stiffness[axis]:
+                    budget = CLOSELY
+        scratch_out.Du[k] = wp.vec3(wp.length(p.gravity) * wp.length(moment) / softest, 0.0, 0.0)
+        parent = model.body_parent[k]
+        if parent >= 0:
+            moment = moment + mass * scratch_out.tension[k]
+            scratch_out.bias[parent] = scratch_out.bias[parent] + wp.spatial_vector(moment, wp.vec3(mass, 0.0, 0.0))
+    for k in range(first, first + size * model.pitch, model.pitch):
+        parent = model.body_parent[k]
+        if parent >= 0:
+            scratch_out.Du[k] = scratch_out.Du[k] + scratch_out.Du[parent]
+        if scratch_out.Du[k][0] > MAX_SAG:
+            budget = CLOSELY
+    if floats or p.geometric_stiffness == 0.0:
+        budget = NO_BUDGET
+    tree_budget_out[tree] = budget
+
+
+@wp.func
+def is_close(budget: int, phi: float):
+    """Whether a tree of which this phi is asked is always watched closely."""
+    return budget == CLOSELY or phi < MIN_PHI
+
+
+@wp.func
+def is_watched(budget: int, phi: float, tree: int, budgets: EnergyBudget):
+    """Whether a tree's budget is kept in this step."""
+    return is_close(budget, phi) or budgets.limit[tree] >= NO_LIMIT or budgets.watch[tree] > 0
+
+
+@wp.kernel
+def begin_budget(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    trees: wp.array(dtype=wp.int32),
+    tree_budget: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    forces: AppliedForces,
+    joints: JointState,
+    # out
+    budget_out: EnergyBudget,
+    bodies_out: BodyState,
+):
+    """Before an integration: one thread begins the budget of one tree, if work was done on it since the last step.
+
+    trees: [thread] which tree; nothing happens with a tree_budget [tree] of :data:`NO_BUDGET`. tree_phi: [tree] phi asked for. forces:
+    of this step. joints: at its start. budget_out: the limit is :data:`NO_LIMIT` while outer forces act. bodies_out:
+    scratch.
+    """
+    tree = trees[wp.tid()]
+    kind = tree_budget[tree]
+    if kind == NO_BUDGET or not is_watched(kind, tree_phi[tree], tree, budget_out):
+        return
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    if wp.length_sq(forces.tree_air[tree]) != 0.0 or is_pushed(
+        forces.body_load, forces.body_wrench, first, size, model.pitch
+    ):
+        budget_out.limit[tree] = NO_LIMIT
+        return
+    for k in range(first, first + size * model.pitch, model.pitch):
+        budget_out.start_q[k] = joints.joint_q[k]
+    mark = state_mark(joints.joint_q, joints.joint_qd, first, size, model.pitch)
+    if budget_out.limit[tree] < NO_LIMIT and mark == budget_out.mark[tree]:
+        return
+    energy = tree_energy(
+        p, contiguous_model(model), contiguous_forces(forces), contiguous_joints(joints), tree,
+        contiguous_bodies(bodies_out),
+    )  # fmt: skip
+    budget_out.limit[tree] = energy[0] + energy[1] + ROUNDING * energy[2]
+    budget_out.last[tree] = energy[0] + energy[1]
+    budget_out.scale[tree] = energy[0]
+    budget_out.held[tree] = energy[3]
+    budget_out.watch[tree] = CLOSE_STEPS
+
+
+@wp.func
+def filter_rates(
+    p: SolverParameters,
+    c: float,
+    model: ArticulationModel,
+    joints: JointState,
+    tree: int,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """(M + c K)^-1 M v into ``joint_qd_free``, with v the joint rates [rad/s]; c in s^2.
+
+    The articulated-body algorithm at rest: v' - v is the acceleration by the joint torques -c K v if c K is added to
+    the inertia of the joints.
+    """
+    unloaded = SolverParameters(1.0, p.fast_rate, p.max_rate, p.fault_rate, p.contact_steps, 0.0, p.gravity)
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    for k in range(first, first + size * model.pitch, model.pitch):
+        above, _above_motion = parent_kinematics(k, tree, model, joints, bodies_out)
+        axes, lever, pose, _motion = body_kinematics(
+            above, wp.spatial_vector(), model.body_offset[k], model.body_rest[k], joints.joint_q[k], wp.vec3()
+        )
+        bodies_out.body_q[k] = pose
+        bodies_out.body_qd[k] = wp.spatial_vector()
+        factors_out.axes[k] = axes
+        factors_out.lever[k] = lever
+        rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+        com = rotation * model.body_com[k]
+        mass = model.body_mass[k]
+        inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+        scratch_out.J[k] = inertia + point_mass_inertia(mass, com)
+        scratch_out.H[k] = mass * wp.skew(com)
+        scratch_out.M[k] = mass * wp.identity(n=3, dtype=float)
+        scratch_out.bias[k] = wp.spatial_vector()
+        scratch_out.tension[k] = wp.vec3()
+    for i in range(size):
+        k = first + (size - 1 - i) * model.pitch
+        axes = factors_out.axes[k]
+        frame = wp.quat_to_matrix(axes * half_rotation(joints.joint_q[k]))
+        metric = rotated_diagonal(frame, c * model.joint_stiffness[k])
+        bias = scratch_out.bias[k]
+        J = symmetric(scratch_out.J[k])
+        H = scratch_out.H[k]
+        M = symmetric(scratch_out.M[k])
+        D = inverse_symmetric(J + metric)
+        DJ = D * J
+        DH = D * H
+        Du = -(D * (metric * wp.quat_rotate(axes, joints.joint_qd[k]) + wp.spatial_bottom(bias)))
+        factors_out.DJ[k] = DJ
+        factors_out.DH[k] = DH
+        scratch_out.Du[k] = Du
+        parent = model.body_parent[k]
+        if parent >= 0:
+            J_left, H_left, M_left, bias_left = terms_left(
+                unloaded, 1.0, wp.vec3(), metric, factors_out.lever[k], J, H, M, bias, wp.vec3(), DJ, DH, Du
+            )
+            add_terms(parent, J_left, H_left, M_left, bias_left, wp.vec3(), scratch_out)
+    accelerate_bodies(1.0, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)
+
+
+@wp.func
+def is_due(rate: float, close: bool, tree: int, budget_out: EnergyBudget):
+    """Whether this step of a tree is to be checked; counts it."""
+    watch = budget_out.watch[tree] - 1
+    due = watch >= 0 or (close and rate > CHECK_RATE)
+    if watch <= -CHECK_PERIOD:
+        watch = 0
+        due = True
+    budget_out.watch[tree] = watch
+    return due
+
+
+@wp.func
+def lead_back(
+    p: SolverParameters,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    start_q: wp.array(dtype=wp.quat),
+    goal: float,
+    tree: int,
+    joints_out: JointState,
+    bodies_out: BodyState,
+):
+    """Stop a tree and halve the way that its joints went in the step until its energy, returned, is at most ``goal``."""
+    first = model.tree_first[tree]
+    energy = wp.vec4(0.0, wp.float32(NO_LIMIT), 0.0, 0.0)
+    halved = wp.int32(0)
+    while energy[1] > goal and halved < BACKTRACKS:
+        for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
+            joints_out.joint_q[k] = wp.normalize(start_q[k] + joints_out.joint_q[k])
+            joints_out.joint_qd[k] = wp.vec3()
+        energy = tree_energy(p, model, forces, joints_out, tree, bodies_out)
+        halved += 1
+    return energy
+
+
+@wp.func
+def take_energy(
+    p: SolverParameters,
+    dt: float,
+    goal: float,
+    pose_goal: float,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    tree: int,
+    budget_out: EnergyBudget,
+    tree_euler_steps_out: wp.array(dtype=wp.int32),
+    joints_out: JointState,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """Take from a tree what energy it has above ``goal`` [J], or above ``pose_goal`` if its pose alone has so much.
+
+    Returns its kinetic and potential energy.
+    """
+    filter_rates(p, FILTER * dt * dt, model, joints_out, tree, bodies_out, factors_out, scratch_out, prediction_out)
+    first = model.tree_first[tree]
+    end = first + model.tree_moving[tree] * model.pitch
+    for k in range(first, end, model.pitch):
+        joints_out.joint_qd[k] = prediction_out.joint_qd_free[k]
+    energy = tree_energy(p, model, forces, joints_out, tree, bodies_out)
+    if energy[0] + energy[1] > goal:
+        share = wp.sqrt(wp.clamp((goal - energy[1]) / energy[0], 0.0, 1.0))
+        for k in range(first, end, model.pitch):
+            joints_out.joint_qd[k] = share * joints_out.joint_qd[k]
+        tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], 1)
+        energy[0] = share * share * energy[0]
+        if energy[1] > pose_goal:
+            energy = lead_back(p, model, forces, budget_out.start_q, pose_goal, tree, joints_out, bodies_out)
+    budget_out.filtered[tree] = budget_out.filtered[tree] + 1
+    budget_out.watch[tree] = CLOSE_STEPS
+    return energy[0] + energy[1]
+
+
+@wp.kernel
+def keep_budget(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    trees: wp.array(dtype=wp.int32),
+    tree_budget: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_steps: wp.array(dtype=wp.int32),
+    tree_rate: wp.array(dtype=float),
+    forces: AppliedForces,
+    # out
+    budget_out: EnergyBudget,
+    tree_euler_steps_out: wp.array(dtype=wp.int32),
+    joints_out: JointState,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """After an integration: one thread takes from one tree the energy that is beyond its budget.
+
+    trees: [thread] which tree; nothing happens without a limit or with tree_rate [tree] above ``p.fault_rate``.
+    tree_budget: [tree] how its energy is watched. tree_phi: [tree] phi asked for. tree_steps: [tree] substeps that the step
+    is divided into; this is one of them. joints_out: at its end, slower where energy was taken; tree_euler_steps_out:
+    [tree] then at least 1. All that follows is scratch.
+    """
+    tree = trees[wp.tid()]
+    kind = tree_budget[tree]
+    if kind == NO_BUDGET:
+        return
+    limit = budget_out.limit[tree]
+    rate = tree_rate[tree]
+    if limit >= NO_LIMIT or not rate <= p.fault_rate:
+        return
+    close = is_close(kind, tree_phi[tree])
+    watched = is_watched(kind, tree_phi[tree], tree, budget_out)
+    if is_due(rate, close, tree, budget_out):
+        dense = contiguous_model(model)
+        state = contiguous_joints(joints_out)
+        loads = contiguous_forces(forces)
+        bodies = contiguous_bodies(bodies_out)
+        energy = tree_energy(p, dense, loads, state, tree, bodies)
+        if energy[3] != budget_out.held[tree]:
+            budget_out.limit[tree] = NO_LIMIT
+            return
+        total = energy[0] + energy[1]
+        rounding = ROUNDING * energy[2]
+        band = BAND * wp.max(budget_out.scale[tree], energy[0]) + rounding
+        gain = total - budget_out.last[tree]
+        if total > limit + band and not watched:
+            budget_out.watch[tree] = CLOSE_STEPS
+            budget_out.limit[tree] = NO_LIMIT  # it may have been pushed since
+            return
+        if total > limit + band and gain > rounding:
+            goal = limit + 0.5 * band - gain  # less by what the next step may gain again
+            total = take_energy(
+                p, p.dt / float(tree_steps[tree]), goal, limit + BAND * budget_out.scale[tree] + rounding, dense, loads, tree, budget_out,
+                tree_euler_steps_out, state, bodies, contiguous_factors(factors_out), contiguous_scratch(scratch_out),
+                contiguous_prediction(prediction_out),
+            )  # fmt: skip
+        else:
+            budget_out.scale[tree] = wp.max(FADE * budget_out.scale[tree], energy[0])
+            budget_out.limit[tree] = wp.min(limit, total + rounding)
+            if total > limit + rounding and gain > rounding:
+                budget_out.watch[tree] = CLOSE_STEPS
+        budget_out.last[tree] = total
+    if close or budget_out.watch[tree] > 0:
+        budget_out.mark[tree] = state_mark(
+            joints_out.joint_q, joints_out.joint_qd, model.tree_first[tree], model.tree_moving[tree], model.pitch
+        )

@@ -1,0 +1,131 @@
+"""Slowest mode of each tree, and into how many substeps a step must be divided to show its frequency.
+
+The trapezoidal rule slows a mode of rate w by (w dt)^2 / 12, and errs in its damping alike.
+"""
+
+import math
+
+import warp as wp
+
+from vinesim.kernels.plants.spatial import world_inertia
+from vinesim.kernels.plants.structs import ArticulationModel, Scratch, WrenchScratch
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_ANGLE = 0.3
+"""[rad] by which the first mode may turn in a substep. DERIVED: it is then 0.75 % slow, and 1 % with a damping ratio of
+0.12. At 10 ms modes above 4.8 Hz take substeps."""
+
+MAX_SUBSTEPS = 4
+"""DERIVED: 19 Hz at 10 ms, beyond the 16 Hz for which the frequency is promised."""
+
+ITERATIONS = wp.constant(4)
+"""Inverse iterations: the error falls with (w1 / w2)^4 in each. For a cane, whose modes are 6.3 apart, one would do."""
+
+
+def substeps_for(frequency: float, dt: float) -> int:
+    """Substeps of a step dt [s] of a tree with a first mode of this frequency [Hz]."""
+    return min(max(math.ceil(2.0 * math.pi * frequency * dt / MAX_ANGLE), 1), MAX_SUBSTEPS)
+
+
+@wp.func
+def compliance(stiffness: wp.vec3, torque: wp.vec3):
+    """Angle by a torque on a spring; none about an axis without stiffness."""
+    angle = wp.vec3()
+    for i in range(3):
+        if stiffness[i] > 0.0:
+            angle[i] = torque[i] / stiffness[i]
+    return angle
+
+
+@wp.func
+def place_relaxed(model: ArticulationModel, k: int, scratch_out: Scratch):
+    """Axes of body k in its tree (in ``J``), and the lever to it (``tension``), with all springs relaxed."""
+    parent = model.body_parent[k]
+    axes = wp.quat_to_matrix(model.body_rest[k])
+    lever = wp.vec3()
+    if parent >= 0:
+        lever = scratch_out.J[parent] * model.body_offset[k]
+        axes = scratch_out.J[parent] * axes
+    scratch_out.J[k] = axes
+    scratch_out.tension[k] = lever
+
+
+@wp.func
+def inertial_wrench(model: ArticulationModel, k: int, axes: wp.mat33, acceleration: wp.spatial_vector):
+    """Wrench at its origin that accelerates body k from rest."""
+    com = axes * model.body_com[k]
+    alpha = wp.spatial_bottom(acceleration)
+    force = model.body_mass[k] * (wp.spatial_top(acceleration) + wp.cross(alpha, com))
+    inertia = world_inertia(axes, model.body_inertia[k], model.body_product[k])
+    return wp.spatial_vector(force, inertia * alpha + wp.cross(com, force))
+
+
+@wp.kernel
+def count_substeps(
+    # model
+    dt: float,
+    max_angle: float,
+    max_substeps: int,
+    model: ArticulationModel,
+    # in
+    trees: wp.array(dtype=wp.int32),
+    # out
+    scratch_out: Scratch,
+    work_out: WrenchScratch,
+    tree_substeps_out: wp.array(dtype=wp.int32),
+):
+    """One thread finds the slowest mode of one tree, and into how many substeps the tree's step is to be divided.
+
+    Inverse iteration x -> K^-1 M x in joint coordinates, where K is diagonal, about the relaxed shape: it depends on the
+    model and on what has been cut off or refined, but not on the pose. Weight and ties, which also stiffen a tree, are
+    left out, and what a floating root would do if free. x^T M x / x^T M K^-1 M x bounds w^2 from above.
+
+    trees: [thread] which tree. tree_substeps_out: [tree] 1 to ``max_substeps``, such that the mode turns by at most
+    ``max_angle`` [rad] in a substep. All other arrays are scratch; the factors of the last prediction stay.
+    """
+    tree = trees[wp.tid()]
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    for k in range(first, first + size * model.pitch, model.pitch):
+        place_relaxed(model, k, scratch_out)
+        scratch_out.Du[k] = compliance(model.joint_stiffness[k], wp.vec3(0.6, 1.0, 0.8))
+    square = float(0.0)
+    for _ in range(ITERATIONS):
+        for k in range(first, first + size * model.pitch, model.pitch):
+            parent = model.body_parent[k]
+            above = wp.spatial_vector()
+            if parent >= 0:
+                above = work_out.added_acceleration[parent]
+            alpha = wp.spatial_bottom(above)
+            acceleration = wp.spatial_vector(
+                wp.spatial_top(above) + wp.cross(alpha, scratch_out.tension[k]),
+                alpha + scratch_out.J[k] * scratch_out.Du[k],
+            )
+            work_out.added_acceleration[k] = acceleration
+            work_out.subtree_wrench[k] = inertial_wrench(model, k, scratch_out.J[k], acceleration)
+        kinetic = float(0.0)
+        elastic = float(0.0)
+        largest = float(0.0)
+        for i in range(size):
+            k = first + (size - 1 - i) * model.pitch
+            parent = model.body_parent[k]
+            wrench = work_out.subtree_wrench[k]
+            torque = wp.transpose(scratch_out.J[k]) * wp.spatial_bottom(wrench)
+            angle = compliance(model.joint_stiffness[k], torque)
+            kinetic += wp.dot(scratch_out.Du[k], torque)
+            elastic += wp.dot(angle, torque)
+            largest = wp.max(largest, wp.length(angle))
+            scratch_out.Du[k] = angle
+            if parent >= 0:
+                force = wp.spatial_top(wrench)
+                moment = wp.spatial_bottom(wrench) + wp.cross(scratch_out.tension[k], force)
+                work_out.subtree_wrench[parent] = work_out.subtree_wrench[parent] + wp.spatial_vector(force, moment)
+        if elastic > 0.0 and largest > 0.0:
+            square = kinetic / elastic
+            for k in range(first, first + size * model.pitch, model.pitch):
+                scratch_out.Du[k] = scratch_out.Du[k] / largest
+    count = float(1.0)
+    if square > 0.0:
+        count = wp.clamp(wp.ceil(wp.sqrt(square) * dt / max_angle), 1.0, float(max_substeps))
+    tree_substeps_out[tree] = int(count)

@@ -1,0 +1,221 @@
+"""Floating components: what has been cut off and falls keeps the momentum and the path that outer forces leave it.
+
+The integration of joints errs in the momentum of a free tree by some dt^2; here root pose and rate are corrected after
+it, so that linear and angular momentum and the centre of mass come out exact.
+
+Its centre of mass moves, and its root turns, at the mean of the rates before and after the step. What hits something is the
+exception: the contact solve lets it come as near as its rate after the step allows, and by the mean of both it would
+go half of what it did before into what it hits: through a wire, from 1.5 m/s on.
+
+What a tie holds is left out. The force of a stiff tie turns with what hangs from it; momentum would take it as it is at
+the start of the step, which is Euler's explicit method for a pendulum: (w dt)^2 of its kinetic energy are gained a step.
+"""
+
+import warp as wp
+
+from vinesim.kernels.plants.forces import tie_and_drag_wrench
+from vinesim.kernels.plants.spatial import exponential, point_mass_inertia, world_inertia
+from vinesim.kernels.plants.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    FloatingScratch,
+    JointState,
+    SolverParameters,
+    substep_parameters,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def least_change(inertia: wp.mat33, momentum: wp.vec3, missing: wp.vec3, dt: float):
+    """The x of the least change of pose, momentum x dt times x, and of rate, inertia / dt times x, that adds what is
+    missing to an angular momentum. A rate counts by what it turns in a step, so a thin rod is rather turned than spun.
+    """
+    stiff = inertia / dt
+    A = stiff * stiff + (wp.dot(momentum, momentum) * wp.identity(n=3, dtype=float) - wp.outer(momentum, momentum))
+    x = wp.inverse(wp.mat33d(A)) * wp.vec3d(missing)
+    return wp.vec3(x) / dt
+
+
+@wp.func
+def component_before(
+    p: SolverParameters,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    bodies: BodyState,
+    body_acceleration: wp.array(dtype=wp.spatial_vector),
+    lever: wp.array(dtype=wp.vec3),
+    root: int,
+    last: int,
+    phi: float,
+    scratch_out: FloatingScratch,
+):
+    """Sums over a component at the start of the step, about its root and against it.
+
+    Returns mass [kg], mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, force [N], moment
+    [N m] of everything but gravity over the step, and whether contacts are part of it.
+    """
+    tree = model.body_tree[root]
+    mass = float(0.0)
+    mass_com = wp.vec3()
+    linear = wp.vec3()
+    angular = wp.vec3()
+    force = wp.vec3()
+    moment = wp.vec3()
+    is_pressed = bool(False)
+    for k in range(root, last, model.pitch):
+        if model.body_root[k] == root:
+            is_pressed = is_pressed or wp.length_sq(forces.body_wrench[k]) > 0.0
+            arm = wp.vec3()
+            velocity = wp.vec3()
+            if k > root:  # not from world positions and velocities, whose digits go into the fall
+                above = model.body_parent[k]
+                arm = wp.spatial_top(scratch_out.before[above]) + lever[k]
+                velocity = wp.spatial_bottom(scratch_out.before[above])
+                velocity += wp.cross(wp.spatial_bottom(bodies.body_qd[above]), lever[k])
+            scratch_out.before[k] = wp.spatial_vector(arm, velocity)
+            pose = bodies.body_q[k]
+            omega = wp.spatial_bottom(bodies.body_qd[k])
+            rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            com = rotation * model.body_com[k]
+            momentum = model.body_mass[k] * (velocity + wp.cross(omega, com))
+            given = forces.body_load[k] + forces.body_wrench[k]
+            given += tie_and_drag_wrench(
+                k, p.dt, phi, forces.tree_air[tree], model, forces, pose, bodies.body_qd[k], body_acceleration[k]
+            )
+            mass += model.body_mass[k]
+            mass_com += model.body_mass[k] * (arm + com)
+            linear += momentum
+            inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+            angular += wp.cross(arm + com, momentum) + inertia * omega
+            force += wp.spatial_top(given)
+            moment += wp.cross(arm, wp.spatial_top(given)) + wp.spatial_bottom(given)
+    return mass, mass_com, linear, angular, force, moment, is_pressed
+
+
+@wp.func
+def component_after(model: ArticulationModel, joints: JointState, root: int, last: int, scratch_out: FloatingScratch):
+    """The same sums with the joints as they are now, and the moment of inertia of the component, its joints locked.
+
+    Returns mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, inertia [kg m^2], all about the
+    root and against it.
+    """
+    mass_com = wp.vec3()
+    linear = wp.vec3()
+    angular = wp.vec3()
+    locked = wp.mat33()
+    for k in range(root, last, model.pitch):
+        if model.body_root[k] == root:
+            base = wp.transform(wp.vec3(), wp.quat_identity())
+            motion = wp.spatial_vector()
+            if k > root:
+                base = scratch_out.after_q[model.body_parent[k]]
+                motion = scratch_out.after_qd[model.body_parent[k]]
+            turning = wp.spatial_bottom(motion)
+            axes = wp.transform_get_rotation(base) * model.body_rest[k]
+            lever = wp.quat_rotate(wp.transform_get_rotation(base), model.body_offset[k])
+            arm = wp.transform_get_translation(base) + lever
+            q = axes * joints.joint_q[k]
+            omega = turning + wp.quat_rotate(axes, joints.joint_qd[k])
+            velocity = wp.spatial_top(motion) + wp.cross(turning, lever)
+            scratch_out.after_q[k] = wp.transform(arm, q)
+            scratch_out.after_qd[k] = wp.spatial_vector(velocity, omega)
+            rotation = wp.quat_to_matrix(q)
+            com = rotation * model.body_com[k]
+            inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+            momentum = model.body_mass[k] * (velocity + wp.cross(omega, com))
+            mass_com += model.body_mass[k] * (arm + com)
+            linear += momentum
+            angular += wp.cross(arm + com, momentum) + inertia * omega
+            locked += inertia + point_mass_inertia(model.body_mass[k], arm + com)
+    return mass_com, linear, angular, locked
+
+
+@wp.func
+def angular_correction(locked: wp.mat33, angular: wp.vec3, goal: wp.vec3, dt: float):
+    """Rotation and rate [rad/s] to add to a component so that its angular momentum becomes the goal [N m s].
+
+    Newton's method, since angular momentum and inertia turn along.
+    """
+    rotation = wp.quat_identity()
+    rate = wp.vec3()
+    for _ in range(3):
+        frame = wp.quat_to_matrix(rotation)
+        inertia = frame * locked * wp.transpose(frame)
+        own = frame * angular + inertia * rate
+        least = least_change(inertia, own, goal - own, dt)
+        added = exponential(dt * wp.cross(own, least))
+        rotation = added * rotation
+        rate = wp.quat_rotate(added, rate) + inertia * least / dt
+    return rotation, rate
+
+
+@wp.kernel
+def correct_floating_momentum(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    roots: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_rate: wp.array(dtype=float),
+    tree_steps: wp.array(dtype=wp.int32),
+    forces: AppliedForces,
+    bodies: BodyState,
+    body_acceleration: wp.array(dtype=wp.spatial_vector),
+    lever: wp.array(dtype=wp.vec3),
+    # out
+    scratch_out: FloatingScratch,
+    joints_out: JointState,
+):
+    """One thread gives one floating component the momentum and the path of its centre of mass that outer forces leave it.
+
+    roots: [thread] the cut body, of a component that no tie holds; nothing happens in a tree with tree_rate [tree] above ``p.fault_rate``. tree_steps:
+    [tree] substeps that the step is divided into; this corrects one of them. bodies: at the
+    start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it; lever: [body] m. joints_out: joints at the end
+    of the step; rotation, rates and place of the root are corrected.
+    """
+    root = roots[wp.tid()]
+    tree = model.body_tree[root]
+    step = substep_parameters(p, tree_steps[tree])
+    dt = step.dt
+    if not tree_rate[tree] <= p.fault_rate:
+        return
+    last = model.tree_first[tree] + model.tree_moving[tree] * model.pitch
+
+    # what momentum and path must be
+    place = wp.transform_get_translation(bodies.body_q[root])
+    velocity = wp.spatial_top(bodies.body_qd[root])
+    mass, mass_com, linear, angular, force, moment, is_pressed = component_before(
+        step, model, forces, bodies, body_acceleration, lever, root, last, tree_phi[tree], scratch_out
+    )
+    com = mass_com / mass
+    goal_linear = linear + dt * (force + mass * p.gravity)
+    goal_angular = angular - wp.cross(com, linear) + dt * (moment - wp.cross(com, force))
+    path = com + dt * (velocity + 0.5 / mass * (linear + goal_linear))
+    if is_pressed and tree_phi[tree] == 1.0:
+        path = com + dt * (velocity + goal_linear / mass)
+        turned = exponential(dt * joints_out.joint_qd[root]) * wp.transform_get_rotation(bodies.body_q[root])
+        joints_out.joint_q[root] = wp.normalize(turned)
+
+    # what they are, and the difference
+    moved = joints_out.joint_x[root] - place
+    mass_com_now, linear_now, angular_now, locked = component_after(model, joints_out, root, last, scratch_out)
+    com_now = mass_com_now / mass
+    angular_now = angular_now - wp.cross(com_now, linear_now)
+    locked = locked - point_mass_inertia(mass, com_now)
+    rotation, turn = angular_correction(locked, angular_now, goal_angular, dt)
+    rate = wp.quat_rotate(rotation, joints_out.joint_qd[root]) + turn
+    square = wp.length_sq(rate)
+    if square > p.max_rate * p.max_rate:
+        turn = turn + rate * (p.max_rate / wp.sqrt(square) - 1.0)
+        rate = rate * (p.max_rate / wp.sqrt(square))
+    com_now = wp.quat_rotate(rotation, com_now)
+    joints_out.joint_q[root] = wp.normalize(rotation * joints_out.joint_q[root])
+    joints_out.joint_qd[root] = rate
+    joints_out.joint_xd[root] = (
+        velocity + (goal_linear - wp.quat_rotate(rotation, linear_now)) / mass - wp.cross(turn, com_now)
+    )
+    joints_out.joint_x[root] = joints_out.joint_x[root] + (path - moved - com_now)

@@ -1,0 +1,100 @@
+"""Integration: joints move to the end of the step; faulty trees stay where the step began."""
+
+import warp as wp
+
+from vinesim.kernels.plants.kinematics import max_rate_and_speed
+from vinesim.kernels.plants.spatial import exponential
+from vinesim.kernels.plants.structs import ArticulationModel, JointState, Prediction, SolverParameters
+
+wp.set_module_options({"enable_backward": False})
+
+EULER_ON = wp.constant(0.1)
+"""Share of ``max_rate``: a tree with phi = 1 of which a joint turns faster keeps it, until all are slower than
+``EULER_OFF``. Thrown, a limp thread under a heavy load gains energy at any other phi and would thrash for ever. TUNED"""
+
+EULER_OFF = wp.constant(0.06)
+"""Share of ``max_rate`` below which all joints of such a tree must turn for ``EULER_DURATION``. TUNED"""
+
+EULER_DURATION = wp.constant(1.0)
+"""[s] TUNED"""
+
+
+@wp.kernel
+def integrate(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    trees: wp.array(dtype=wp.int32),
+    tree_awake: wp.array(dtype=wp.bool),
+    tree_phi: wp.array(dtype=float),
+    tree_steps: wp.array(dtype=wp.int32),
+    joints: JointState,
+    prediction: Prediction,
+    # out
+    tree_rate_out: wp.array(dtype=float),
+    tree_euler_steps_out: wp.array(dtype=wp.int32),
+    joints_out: JointState,
+):
+    """One thread moves the joints of one tree to the end of the step; a faulty tree stays where the step began.
+
+    trees: [thread] which tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] as :func:`predict` used it.
+    tree_steps: [tree] substeps that the step is divided into; a tree that one of them stopped takes no other.
+    tree_rate_out: [tree] rad/s of the fastest joint and m/s of the fastest floating root, as a length; NaN or above
+    ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] steps and substeps still to be taken with phi = 1,
+    counted down here. joints_out: [body] rotations by the exponential map of the mean rate; may be ``joints``.
+    """
+    tree = trees[wp.tid()]
+    substeps = tree_steps[tree]
+    if not tree_awake[tree] or (substeps > 1 and not tree_rate_out[tree] <= p.fault_rate):
+        return
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    pitch = model.pitch
+    dt = p.dt / float(substeps)
+    turning, falling = max_rate_and_speed(
+        prediction.joint_qd_free, joints.joint_x, prediction.joint_xd_free, model.body_parent, model.body_root, first,
+        size, pitch,
+    )  # fmt: skip
+    most = wp.length(wp.vec2(turning, falling))
+    tree_rate_out[tree] = most
+    steps = wp.max(tree_euler_steps_out[tree] - 1, 0)
+    phi = tree_phi[tree]
+    if (phi == 1.0 and turning > EULER_ON * p.max_rate) or (
+        steps > p.contact_steps and turning > EULER_OFF * p.max_rate
+    ):
+        steps = wp.max(steps, int(EULER_DURATION / dt))
+    tree_euler_steps_out[tree] = steps
+    sound = most <= p.fault_rate
+    # a tree beyond max_rate is slowed as a whole and well below it: holding back single joints would feed energy into
+    # the others, and a loaded cane would thrash at the limit for ever
+    slower = float(1.0)
+    if turning > p.max_rate:
+        slower = 0.5 * p.max_rate / turning
+    for k in range(first, first + size * pitch, pitch):
+        # all that a body needs is read before anything is asked: a GPU then waits for memory once
+        parent = model.body_parent[k]
+        root = model.body_root[k]
+        free = prediction.joint_qd_free[k]
+        rate_before = joints.joint_qd[k]
+        q = joints.joint_q[k]
+        floats = parent < 0 and root >= 0
+        if sound:
+            rate = slower * free
+            share = phi
+            if floats:
+                if model.body_falls[k]:  # no spring turns it: phi beyond 1/2 would only add error
+                    share = 0.5
+                joints_out.joint_x[k] = joints.joint_x[k] + dt * (
+                    (1.0 - share) * joints.joint_xd[k] + share * prediction.joint_xd_free[k]
+                )
+                joints_out.joint_xd[k] = prediction.joint_xd_free[k]
+            mean = (1.0 - share) * rate_before + share * rate
+            joints_out.joint_qd[k] = rate
+            joints_out.joint_q[k] = wp.normalize(exponential(dt * mean) * q)
+        else:
+            joints_out.joint_qd[k] = wp.vec3()
+            joints_out.joint_q[k] = q
+            if floats:
+                joints_out.joint_xd[k] = wp.vec3()
+                joints_out.joint_x[k] = joints.joint_x[k]

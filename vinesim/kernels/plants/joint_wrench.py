@@ -1,0 +1,65 @@
+"""Wrench that a joint carries, from the motion of all that hangs on it."""
+
+import warp as wp
+
+from vinesim.kernels.plants.forces import tie_and_drag_wrench
+from vinesim.kernels.plants.spatial import world_inertia
+from vinesim.kernels.plants.structs import AppliedForces, ArticulationModel, BodyState, SolverParameters
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def joint_wrench(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    joint_bodies: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_steps: wp.array(dtype=wp.int32),
+    forces: AppliedForces,
+    bodies: BodyState,
+    body_acceleration: wp.array(dtype=wp.spatial_vector),
+    # out
+    wrench_out: wp.array(dtype=wp.spatial_vector),
+):
+    """One thread adds up what one joint must carry so that everything beyond it moves as it did in the last step.
+
+    Newton-Euler of the subtree (Featherstone 2008, section 5.3). joint_bodies: [thread] body beyond the joint.
+    bodies: at the start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it; of the last substep if the step was
+    divided into tree_steps [tree]. wrench_out: [thread] N, and N m
+    about the body's origin, world axes; zero for what has been cut off.
+    """
+    slot = wp.tid()
+    body = joint_bodies[slot]
+    tree = model.body_tree[body]
+    pivot = wp.transform_get_translation(bodies.body_q[body])
+    force = wp.vec3()
+    moment = wp.vec3()
+    last = model.tree_first[tree] + model.tree_moving[tree] * model.pitch
+    if model.body_parent[body] < 0 and model.body_root[body] >= 0:
+        last = body  # nothing holds what has been cut off
+    for k in range(body, last, model.pitch):
+        up = int(k)
+        while up > body:
+            up = model.body_parent[up]
+        if up == body:
+            pose = bodies.body_q[k]
+            rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+            com = rotation * model.body_com[k]
+            omega = wp.spatial_bottom(bodies.body_qd[k])
+            alpha = wp.spatial_bottom(body_acceleration[k])
+            a = wp.spatial_top(body_acceleration[k]) + wp.cross(alpha, com) + wp.cross(omega, wp.cross(omega, com))
+            own = model.body_mass[k] * (a - p.gravity)
+            given = forces.body_load[k] + forces.body_wrench[k]
+            given += tie_and_drag_wrench(
+                k, p.dt / float(tree_steps[tree]), tree_phi[tree], forces.tree_air[tree], model, forces, pose, bodies.body_qd[k],
+                body_acceleration[k],
+            )  # fmt: skip
+            arm = wp.transform_get_translation(pose) - pivot
+            force += own - wp.spatial_top(given)
+            moment += wp.cross(arm + com, own) + inertia * alpha + wp.cross(omega, inertia * omega)
+            moment -= wp.cross(arm, wp.spatial_top(given)) + wp.spatial_bottom(given)
+    wrench_out[slot] = wp.spatial_vector(force, moment)

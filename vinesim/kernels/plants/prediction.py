@@ -1,0 +1,332 @@
+"""Prediction: the motion of each tree over a step without new contacts, by the articulated-body algorithm.
+
+Featherstone, Rigid Body Dynamics Algorithms, 2008, section 7.3: one pass outward for kinematics, inertia and bias of
+each body, one inward that eliminates the joints, one outward for accelerations. Springs, ties, drag and the stiffness
+that loads lend to levers are implicit; :mod:`vinesim.kernels.plants` states the scheme.
+"""
+
+import warp as wp
+
+from vinesim.kernels.plants.body_dynamics import (
+    accelerate_body,
+    drag_terms,
+    joint_terms,
+    own_terms,
+    terms_left,
+    tie_terms,
+    turned_rest_moment,
+)
+from vinesim.kernels.plants.contiguous import (
+    contiguous_bodies,
+    contiguous_factors,
+    contiguous_forces,
+    contiguous_joints,
+    contiguous_model,
+    contiguous_prediction,
+    contiguous_scratch,
+)
+from vinesim.kernels.plants.forces import shear_stiffness
+from vinesim.kernels.plants.kinematics import body_kinematics, max_joint_rate, parent_kinematics
+from vinesim.kernels.plants.spatial import cross_rows, inverse_symmetric, symmetric, world_inertia
+from vinesim.kernels.plants.structs import (
+    AppliedForces,
+    ArticulationModel,
+    BodyState,
+    Factors,
+    JointState,
+    Prediction,
+    Scratch,
+    SolverParameters,
+    substep_parameters,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def is_conservative(p: SolverParameters, phi: float):
+    """Whether a step must keep energy, and couples bending with twist for it."""
+    return p.geometric_stiffness > 0.0 and phi == 0.5
+
+
+@wp.func
+def add_terms(
+    k: int, J: wp.mat33, H: wp.mat33, M: wp.mat33, bias: wp.spatial_vector, tension: wp.vec3, scratch_out: Scratch
+):
+    """Add what acts on body k besides its inertia and weight, or hangs on it."""
+    scratch_out.J[k] = scratch_out.J[k] + J
+    scratch_out.H[k] = scratch_out.H[k] + H
+    scratch_out.M[k] = scratch_out.M[k] + M
+    scratch_out.bias[k] = scratch_out.bias[k] + bias
+    scratch_out.tension[k] = scratch_out.tension[k] + tension
+
+
+@wp.func
+def assemble_bodies(
+    p: SolverParameters,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    joints: JointState,
+    tree: int,
+    phi: float,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+):
+    """From the root to the tips of one tree: pose and velocity of each body, its own implicit inertia, bias, tension."""
+    reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
+    conservative = is_conservative(p, phi)
+    first = model.tree_first[tree]
+    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
+        above, above_motion = parent_kinematics(k, tree, model, joints, bodies_out)
+        axes, lever, pose, motion = body_kinematics(
+            above, above_motion, model.body_offset[k], model.body_rest[k], joints.joint_q[k], joints.joint_qd[k]
+        )
+        bodies_out.body_q[k] = pose
+        bodies_out.body_qd[k] = motion
+        factors_out.axes[k] = axes
+        factors_out.lever[k] = lever
+        rotation = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+        com = rotation * model.body_com[k]
+        inertia = world_inertia(rotation, model.body_inertia[k], model.body_product[k])
+        falls = float(0.0)
+        fall = wp.vec3()
+        if model.body_falls[k]:
+            falls = 1.0
+            fall = joints.joint_xd[model.body_root[k]]
+        contact = wp.spatial_top(forces.body_wrench[k])
+        load = forces.body_load[k]
+        if model.body_parent[k] < 0:
+            load = load + wp.spatial_vector(
+                wp.vec3(),
+                turned_rest_moment(
+                    p.dt, phi, axes, joints.joint_q[k], model.joint_stiffness[k], model.joint_damping[k],
+                    forces.root_turn[tree], forces.root_turn_rate[tree],
+                ),
+            )  # fmt: skip
+        J, H, M, bias, tension, steady_force = own_terms(
+            p, phi, motion, model.body_mass[k], com, inertia, load, contact, falls, fall
+        )
+        scratch_out.J[k] = J
+        scratch_out.H[k] = H
+        scratch_out.M[k] = M
+        scratch_out.bias[k] = bias
+        scratch_out.tension[k] = tension
+        if conservative:
+            scratch_out.J[k] = scratch_out.J[k] + reach * shear_stiffness(com, steady_force)
+        area = model.body_drag[k]
+        if area > 0.0:
+            J, H, M, bias, tension = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
+            add_terms(k, J, H, M, bias, tension, scratch_out)
+        ties = model.tie_span[k]
+        for t in range(ties[0], ties[1]):
+            J, H, M, bias, tension = tie_terms(
+                p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+                forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
+            )  # fmt: skip
+            add_terms(k, J, H, M, bias, tension, scratch_out)
+
+
+@wp.func
+def couple_bending_and_twist(
+    k: int,
+    parent: int,
+    reach: float,
+    moment: wp.vec3,
+    centripetal: wp.vec3,
+    lever: wp.vec3,
+    DJ: wp.mat33,
+    DH: wp.mat33,
+    scratch_out: Scratch,
+):
+    """Hand on to the parent that a lever bears a force across, and a joint a moment.
+
+    Beside its spring, the joint asks alpha x moment of a parent's acceleration alpha, and its own acceleration asks as
+    much of the parent (DJ holds the first).
+    """
+    H_more = wp.skew(-moment) * DH
+    H_arm = cross_rows(H_more, lever)
+    scratch_out.J[parent] = (
+        scratch_out.J[parent]
+        + reach * shear_stiffness(lever, scratch_out.tension[k])
+        + wp.skew(-moment) * DJ
+        + wp.skew(moment)
+        - H_arm
+        - wp.transpose(H_arm)
+    )
+    scratch_out.H[parent] = scratch_out.H[parent] + H_more
+    more = wp.cross(moment, scratch_out.Du[k]) + H_more * centripetal
+    scratch_out.bias[parent] = scratch_out.bias[parent] + wp.spatial_vector(wp.vec3(), more)
+
+
+@wp.func
+def eliminate_joints(
+    p: SolverParameters,
+    model: ArticulationModel,
+    joints: JointState,
+    bodies: BodyState,
+    tree: int,
+    phi: float,
+    factors_out: Factors,
+    scratch_out: Scratch,
+):
+    """From the tips to the root of one tree: factor each joint's implicit inertia and hand the rest to the parent."""
+    ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
+    reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
+    conservative = is_conservative(p, phi)
+    first = model.tree_first[tree]
+    size = model.tree_moving[tree]
+    for i in range(size):
+        k = first + (size - 1 - i) * model.pitch
+        parent = model.body_parent[k]
+        turning = wp.vec3()
+        if parent >= 0:
+            turning = wp.spatial_bottom(bodies.body_qd[parent])
+        omega = wp.spatial_bottom(bodies.body_qd[k])
+        metric, drive, torque = joint_terms(
+            p.dt, phi, factors_out.axes[k], joints.joint_q[k], joints.joint_qd[k], model.joint_stiffness[k],
+            model.joint_damping[k], turning, omega,
+        )  # fmt: skip
+        bias = scratch_out.bias[k]
+        J = symmetric(scratch_out.J[k])
+        H = scratch_out.H[k]
+        M = symmetric(scratch_out.M[k])
+        u = drive - wp.spatial_bottom(bias)
+        if conservative:
+            turns = turning + omega
+            u = u - 0.5 * ahead * wp.cross(turns, torque)
+        D = inverse_symmetric(J + metric)
+        DJ = D * J
+        if conservative and parent >= 0:
+            DJ = DJ - cross_rows(D, 0.5 * reach * torque)
+        DH = D * H
+        factors_out.D[k] = D
+        factors_out.DJ[k] = DJ
+        factors_out.DH[k] = DH
+        Du = D * u
+        scratch_out.Du[k] = Du
+        if parent >= 0:
+            lever = factors_out.lever[k]
+            tension = scratch_out.tension[k]
+            J_left, H_left, M_left, bias_left = terms_left(
+                p, phi, turning, metric, lever, J, H, M, bias, tension, DJ, DH, Du
+            )
+            add_terms(parent, J_left, H_left, M_left, bias_left, tension, scratch_out)
+            if conservative:
+                centripetal = wp.cross(turning, wp.cross(turning, lever))
+                couple_bending_and_twist(
+                    k, parent, reach, 0.5 * reach * torque, centripetal, lever, DJ, DH, scratch_out
+                )
+        else:
+            factors_out.root_inverse_mass[k] = wp.mat33()
+            if model.body_root[k] >= 0:
+                factors_out.root_inverse_mass[k] = wp.inverse(M - wp.transpose(H) * DH)
+
+
+@wp.func
+def accelerate_bodies(
+    dt: float,
+    model: ArticulationModel,
+    joints: JointState,
+    bodies: BodyState,
+    factors: Factors,
+    scratch: Scratch,
+    tree: int,
+    prediction_out: Prediction,
+):
+    """From the root to the tips of one tree: accelerations, and the rates and velocities they lead to."""
+    first = model.tree_first[tree]
+    for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
+        parent = model.body_parent[k]
+        above = wp.spatial_vector()
+        motion = wp.spatial_vector()
+        turning = wp.vec3()
+        if parent >= 0:
+            above = prediction_out.body_acceleration[parent]
+            motion = prediction_out.body_qd_free[parent]
+            turning = wp.spatial_bottom(bodies.body_qd[parent])
+        elif model.body_root[k] >= 0:
+            force = wp.spatial_top(scratch.bias[k]) + wp.transpose(scratch.H[k]) * scratch.Du[k]
+            falling = -(factors.root_inverse_mass[k] * force)
+            above = wp.spatial_vector(falling, wp.vec3())
+            prediction_out.joint_xd_free[k] = joints.joint_xd[k] + dt * falling
+            motion = wp.spatial_vector(prediction_out.joint_xd_free[k], wp.vec3())
+        acceleration, rate, velocity = accelerate_body(
+            dt, above, motion, turning, wp.spatial_bottom(bodies.body_qd[k]), factors.lever[k], factors.axes[k],
+            joints.joint_qd[k], factors.DJ[k], factors.DH[k], scratch.Du[k],
+        )  # fmt: skip
+        prediction_out.body_acceleration[k] = acceleration
+        prediction_out.joint_qd_free[k] = rate
+        prediction_out.body_qd_free[k] = velocity
+
+
+@wp.func
+def chosen_phi(
+    p: SolverParameters, model: ArticulationModel, joints: JointState, tree: int, asked: float, euler_steps: int
+):
+    """phi of this step of a tree: as ``asked``, but 1 while a joint is fast or ``euler_steps`` are left."""
+    fastest = max_joint_rate(joints.joint_qd, model.tree_first[tree], model.tree_moving[tree], model.pitch)
+    phi = asked
+    if fastest > p.fast_rate or euler_steps > 0:
+        phi = 1.0
+    return phi
+
+
+@wp.func
+def predict_tree(
+    p: SolverParameters,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    joints: JointState,
+    tree: int,
+    phi: float,
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """The three passes over one tree."""
+    assemble_bodies(p, model, forces, joints, tree, phi, bodies_out, factors_out, scratch_out)
+    eliminate_joints(p, model, joints, bodies_out, tree, phi, factors_out, scratch_out)
+    accelerate_bodies(p.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)
+
+
+@wp.kernel
+def predict(
+    # model
+    p: SolverParameters,
+    model: ArticulationModel,
+    # in
+    trees: wp.array(dtype=wp.int32),
+    tree_phi: wp.array(dtype=float),
+    tree_euler_steps: wp.array(dtype=wp.int32),
+    tree_steps: wp.array(dtype=wp.int32),
+    forces: AppliedForces,
+    joints: JointState,
+    # out
+    tree_phi_out: wp.array(dtype=float),
+    bodies_out: BodyState,
+    factors_out: Factors,
+    scratch_out: Scratch,
+    prediction_out: Prediction,
+):
+    """One thread solves the motion of one tree over a step without new contacts, and keeps the factors it used.
+
+    The articulated-body algorithm (Featherstone 2008, table 7.1) with implicit springs.
+
+    trees: [thread] which tree. tree_phi: [tree] phi asked for, 1/2 to 1; tree_phi_out: [tree] phi used, 1 for a tree
+    with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] substeps that the
+    step is divided into; this is one of them. bodies_out: poses and velocities
+    at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
+    that is needed later.
+    """
+    trees_model = contiguous_model(model)
+    state = contiguous_joints(joints)
+    tree = trees[wp.tid()]
+    phi = chosen_phi(p, trees_model, state, tree, tree_phi[tree], tree_euler_steps[tree])
+    tree_phi_out[tree] = phi
+    predict_tree(
+        substep_parameters(p, tree_steps[tree]), trees_model, contiguous_forces(forces), state, tree, phi,
+        contiguous_bodies(bodies_out), contiguous_factors(factors_out), contiguous_scratch(scratch_out),
+        contiguous_prediction(prediction_out),
+    )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Kernels of rigid bodies: posture of people, and the servos of robots."""

@@ -1,0 +1,426 @@
+"""Contacts with wires that give: the springs at which they end, what presses on wires, and where their geoms are.
+
+Each kernel is run by one thread: few contacts are with wires, and every one of them depends on all others of its wire. See
+:mod:`vinesim.wires.deflected_wires` for what it is about.
+"""
+
+import warp as wp
+
+from vinesim.kernels.wires.elastic_supports import SupportedBodies, SupportedSprings, SupportNodes, Wires, wire_spring
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class WireNumbers:
+    """Numbers of the model, see :mod:`vinesim.wires.deflected_wires`."""
+
+    dt: wp.float64
+    followed: wp.float64
+    extrapolated: wp.float64
+    forgetting: wp.float64  # [1] dt over the time of the means
+    recovery: wp.float64  # [1] share of its deflection that a wire keeps in a step when it is let go
+    least_weight: wp.float64
+    least_share: wp.float64  # [1] of a wire's length: least distance between its nodes
+    least_spread: wp.float64
+    least_deflection: wp.float64
+    max_deflection: wp.float64
+    touching: wp.float64
+    same_place: wp.float64
+    most_along: wp.float64
+    out_of_reach: wp.float64
+
+
+@wp.struct
+class WireGeoms:
+    """The wires as shapes. [piece], of all fixed pieces."""
+
+    start: wp.array(dtype=wp.vec3d)  # [m] where they were drawn
+    axis: wp.array(dtype=wp.vec3d)  # unit vector to the end
+    offset: wp.array2d(dtype=wp.vec3d)  # [piece, 2] m by which both ends are away from there
+    is_held: wp.array(dtype=wp.bool)  # whether something presses on it, or is near
+    deflected: wp.array(dtype=wp.int32)  # [k] those whose offset is not 0, in the order in which they were pressed
+    count: wp.array(dtype=wp.int32)  # [2] number of those, and of the supports that are loaded
+    loaded: wp.array(dtype=wp.int32)  # [k] these supports, in the order in which they were pressed
+
+
+@wp.struct
+class WireContacts:
+    """Contacts with wires in one solve. [contact]"""
+
+    count: wp.array(dtype=wp.int32)  # [1]
+    piece: wp.array(dtype=wp.int32)
+    key: wp.array(dtype=wp.int64)  # number of the pair of shapes
+    tree: wp.array(dtype=wp.int32)  # the tree that presses, or -1 less the kinematic tree of the rigid world
+    point: wp.array(dtype=wp.vec3d)  # [m]
+    normal: wp.array(dtype=wp.vec3d)  # from the wire to the other side
+    gap: wp.array(dtype=wp.float64)  # [m] to the wire's geom
+    closing: wp.array(dtype=wp.float64)  # [m/s] how fast the gap would get smaller without the contacts
+    force: wp.array(dtype=wp.float64)  # [N] found by the solve
+    velocity: wp.array(dtype=wp.float64)  # [m/s] along the normal, found by the solve
+    along: wp.array(dtype=wp.float64)  # [m] from the wire's start
+    stiffness: wp.array(dtype=wp.float64)  # [N/m] of the spring
+    shift: wp.array(dtype=wp.float64)  # [m] gap at which the spring is at rest, less that to the geom
+    geom: wp.array(dtype=wp.vec3d)  # [m] by which the geom is away there from where it was drawn
+    place: wp.array(dtype=wp.vec3d)  # [m] the same of the wire, under the forces of the last step
+    last: wp.array(dtype=wp.int32)  # which press of the last step it was, -1 if it is new
+    last_force: wp.array(dtype=wp.float64)  # [N] of that, extrapolated
+    weight: wp.array(dtype=wp.float64)  # [N] mean of it
+    others: wp.array(dtype=wp.float64)  # [m] mean deflection by the others, along the normal
+
+
+@wp.struct
+class WirePresses:
+    """What presses on wires. [press]"""
+
+    count: wp.array(dtype=wp.int32)  # [1]
+    piece: wp.array(dtype=wp.int32)
+    key: wp.array(dtype=wp.int64)
+    tree: wp.array(dtype=wp.int32)
+    along: wp.array(dtype=wp.float64)  # [m]
+    normal: wp.array(dtype=wp.vec3d)
+    place: wp.array(dtype=wp.vec3d)  # [m] where the wire is, from where it was drawn
+    force: wp.array(dtype=wp.float64)  # [N] as expected in the next step
+    weight: wp.array(dtype=wp.float64)
+    others: wp.array(dtype=wp.float64)
+
+
+@wp.func
+def interval_of(piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes):
+    """The node behind a point of a wire, and where [m] the stretch between its two nodes, or posts, begins and ends."""
+    low = wp.float64(0.0)
+    high = wires.length[piece]
+    node = int(0)
+    support = wires.support[piece]
+    if support >= 0:
+        node = nodes.first[support]
+        end = nodes.first[support + 1]
+        while node < end and wires.node_along[node] < x:
+            low = wires.node_along[node]
+            node = node + 1
+        if node < end:
+            high = wires.node_along[node]
+    return node, low, high
+
+
+@wp.func
+def deflection_between(piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes, presses: WirePresses):
+    """By how much loads between the two nodes of a point deflect it [m] from the line between these."""
+    zero = wp.float64(0.0)
+    _, low, high = interval_of(piece, x, wires, nodes)
+    found = wp.vec3d()
+    for j in range(presses.count[0]):
+        y = presses.along[j]
+        if presses.piece[j] == piece and presses.force[j] > zero and y <= high and (y > low or low == zero):
+            share = wp.max(wp.min(x, y) - low, zero) * wp.max(high - wp.max(x, y), zero)
+            compliance = share / wp.max(wires.tension[piece] * (high - low), wp.float64(1.0e-12))
+            found = found - compliance * presses.force[j] * presses.normal[j]
+    return found
+
+
+@wp.func
+def last_press(i: int, same_place: wp.float64, contacts: WireContacts, presses: WirePresses):
+    """The press of the last step that a contact was: of those with its key the nearest; -1 if it is new."""
+    best = int(-1)
+    nearest = same_place
+    for j in range(presses.count[0]):
+        if presses.key[j] == contacts.key[i] and presses.force[j] > wp.float64(0.0):
+            distance = wp.abs(presses.along[j] - contacts.along[i])
+            if distance < nearest:
+                nearest = distance
+                best = j
+    return best
+
+
+@wp.func
+def string_ratio(x: wp.float64, y: wp.float64, length: wp.float64):
+    """Deflection of a string at x by a force at y, over that by the same force at x."""
+    least = wp.float64(1.0e-3) * length
+    here = wp.clamp(x, least, length - least)
+    ratio = y / here
+    if y > x:
+        ratio = (length - y) / (length - here)
+    return wp.clamp(ratio, wp.float64(0.0), wp.float64(1.0))
+
+
+@wp.func
+def is_reached(i: int, numbers: WireNumbers, contacts: WireContacts):
+    """Whether a new contact is touched before the step ends."""
+    return contacts.last[i] < 0 and contacts.gap[i] - numbers.dt * contacts.closing[i] < numbers.touching
+
+
+@wp.func
+def sharing(i: int, numbers: WireNumbers, wires: Wires, contacts: WireContacts, presses: WirePresses):
+    """By how much less stiff a wire is taken to be for a contact than for it alone."""
+    zero = wp.float64(0.0)
+    piece = contacts.piece[i]
+    x = contacts.along[i]
+    length = wires.length[piece]
+    largest = contacts.weight[i]
+    for j in range(presses.count[0]):
+        if presses.piece[j] == piece:
+            largest = wp.max(largest, presses.weight[j])
+    mine = wp.max(contacts.weight[i], numbers.least_weight * largest + wp.float64(1.0e-9))
+    sum = wp.float64(1.0)
+    for j in range(presses.count[0]):
+        if presses.piece[j] == piece and j != contacts.last[i] and presses.weight[j] > zero:
+            faces = wp.abs(wp.dot(presses.normal[j], contacts.normal[i]))
+            sum = sum + presses.weight[j] / mine * string_ratio(x, presses.along[j], length) * faces
+    for k in range(contacts.count[0]):
+        if contacts.piece[k] == piece and k != i and is_reached(k, numbers, contacts):
+            faces = wp.abs(wp.dot(contacts.normal[k], contacts.normal[i]))
+            sum = sum + contacts.weight[k] / mine * string_ratio(x, contacts.along[k], length) * faces
+    return sum
+
+
+@wp.kernel
+def find_wire_springs(
+    # model
+    numbers: WireNumbers,
+    wires: Wires,
+    nodes: SupportNodes,
+    # in
+    geoms: WireGeoms,
+    bodies: SupportedBodies,
+    springs: SupportedSprings,
+    loads: wp.array(dtype=wp.vec3d),
+    presses: WirePresses,
+    # out
+    contacts_out: WireContacts,
+):
+    """One thread in all: the springs at which contacts end. loads: [node] N; presses: of the last step."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    count = contacts_out.count[0]
+    for i in range(count):
+        piece = contacts_out.piece[i]
+        length = wires.length[piece]
+        contacts_out.along[i] = wp.clamp(
+            wp.dot(contacts_out.point[i] - geoms.start[piece], geoms.axis[piece]), zero, length
+        )
+        last = last_press(i, numbers.same_place, contacts_out, presses)
+        contacts_out.last[i] = last
+        weight = wp.float64(1.0e-9)
+        if last >= 0:
+            weight = presses.weight[last]
+        else:  # taken to press as hard as any
+            for j in range(presses.count[0]):
+                if presses.piece[j] == piece:
+                    weight = wp.max(weight, presses.weight[j])
+        contacts_out.weight[i] = weight
+    for i in range(count):
+        piece = contacts_out.piece[i]
+        x = contacts_out.along[i]
+        normal = contacts_out.normal[i]
+        last = contacts_out.last[i]
+        alone, rest, deflection = wire_spring(piece, x, numbers.least_share, wires, nodes, bodies, springs, loads)
+        deflection = deflection + deflection_between(piece, x, wires, nodes, presses)
+        stiffness = alone / sharing(i, numbers, wires, contacts_out, presses)
+        force = zero
+        if last >= 0:
+            force = presses.force[last]
+        now = wp.dot(deflection, normal) + force / stiffness  # by the others, and by the force shared with them
+        mean = now
+        if last >= 0:
+            mean = presses.others[last] + numbers.forgetting * (now - presses.others[last])
+        share = x / wp.max(wires.length[piece], wp.float64(1.0e-9))
+        geom = (one - share) * geoms.offset[piece, 0] + share * geoms.offset[piece, 1]
+        shift = wp.dot(geom - rest, normal) - numbers.followed * now - (one - numbers.followed) * mean
+        if contacts_out.gap[i] > numbers.touching:
+            shift = zero  # another holds the wire off it
+        if wp.abs(wp.dot(normal, geoms.axis[piece])) > numbers.most_along:
+            # with its axis inside a box, the nearest way out may be along it, where a wire does not push
+            shift = numbers.out_of_reach
+        contacts_out.stiffness[i] = stiffness
+        contacts_out.shift[i] = shift
+        contacts_out.geom[i] = geom
+        contacts_out.place[i] = rest + deflection
+        contacts_out.last_force[i] = force
+        contacts_out.others[i] = mean
+
+
+@wp.kernel
+def add_presses(
+    # model
+    numbers: WireNumbers,
+    # in
+    contacts: WireContacts,
+    # out
+    found_out: WirePresses,
+):
+    """One thread in all: add what a solve has found for its contacts; what there is no room for is left out."""
+    zero = wp.float64(0.0)
+    for i in range(contacts.count[0]):
+        k = found_out.count[0]
+        if k < found_out.piece.shape[0]:
+            found_out.count[0] = k + 1
+            force = contacts.force[i]
+            place = contacts.place[i]
+            expected = zero
+            weight = zero
+            if force > zero:
+                last = contacts.last_force[i]
+                place = contacts.geom[i] + (contacts.gap[i] + numbers.dt * contacts.velocity[i]) * contacts.normal[i]
+                expected = wp.max(force + numbers.extrapolated * (force - last), zero)
+                weight = wp.max(contacts.weight[i], force)
+                if last > zero:
+                    weight = contacts.weight[i] + numbers.forgetting * (force - contacts.weight[i])
+            found_out.piece[k] = contacts.piece[i]
+            found_out.key[k] = contacts.key[i]
+            found_out.tree[k] = contacts.tree[i]
+            found_out.along[k] = contacts.along[i]
+            found_out.normal[k] = contacts.normal[i]
+            found_out.place[k] = place
+            found_out.force[k] = expected
+            found_out.weight[k] = weight
+            found_out.others[k] = contacts.others[i]
+
+
+@wp.func
+def copy_press(j: int, k: int, presses: WirePresses, presses_out: WirePresses):
+    """Copy press ``j`` to place ``k`` of another list."""
+    presses_out.piece[k] = presses.piece[j]
+    presses_out.key[k] = presses.key[j]
+    presses_out.tree[k] = presses.tree[j]
+    presses_out.along[k] = presses.along[j]
+    presses_out.normal[k] = presses.normal[j]
+    presses_out.place[k] = presses.place[j]
+    presses_out.force[k] = presses.force[j]
+    presses_out.weight[k] = presses.weight[j]
+    presses_out.others[k] = presses.others[j]
+
+
+@wp.func
+def load_nodes(
+    j: int, sign: wp.float64, wires: Wires, nodes: SupportNodes, presses: WirePresses,
+    loads_out: wp.array(dtype=wp.vec3d), is_loaded_out: wp.array(dtype=wp.bool),
+):  # fmt: skip
+    """Put a press on the two nodes beside it, by its shares of the distance; ``sign`` 0: clear these nodes instead."""
+    piece = presses.piece[j]
+    support = wires.support[piece]
+    if support >= 0:
+        node, low, high = interval_of(piece, presses.along[j], wires, nodes)
+        share = (presses.along[j] - low) / wp.max(high - low, wp.float64(1.0e-9))
+        force = -presses.force[j] * presses.normal[j]
+        if node > nodes.first[support]:
+            loads_out[node - 1] = sign * (loads_out[node - 1] + (wp.float64(1.0) - share) * force)
+        if node < nodes.first[support + 1]:
+            loads_out[node] = sign * (loads_out[node] + share * force)
+        is_loaded_out[support] = sign > wp.float64(0.0)
+
+
+@wp.func
+def rod_through(piece: int, first: int, numbers: WireNumbers, wires: Wires, presses: WirePresses, geoms_out: WireGeoms):
+    """Move the geom of a wire as a rod through the points displaced by what presses on it; if these are near each other,
+    by their mean. ``first``: one of its presses."""
+    zero = wp.float64(0.0)
+    presses_hard = bool(False)
+    for j in range(presses.count[0]):
+        presses_hard = presses_hard or (presses.piece[j] == piece and presses.force[j] > zero)
+    low = int(-1)
+    high = int(-1)
+    mean = wp.vec3d()
+    sum = zero
+    for j in range(first, presses.count[0]):
+        if presses.piece[j] == piece and (presses.force[j] > zero or not presses_hard):
+            if low < 0 or presses.along[j] < presses.along[wp.max(low, 0)]:
+                low = j
+            if high < 0 or presses.along[j] > presses.along[wp.max(high, 0)]:
+                high = j
+            weight = wp.where(presses_hard, presses.force[j], wp.float64(1.0))
+            mean = mean + weight * presses.place[j]
+            sum = sum + weight
+    length = wires.length[piece]
+    spread = presses.along[high] - presses.along[low]
+    start = mean / sum
+    end = start
+    if spread > numbers.least_spread * length:
+        slope = (presses.place[high] - presses.place[low]) / spread
+        start = presses.place[low] - presses.along[low] * slope
+        end = start + length * slope
+    geoms_out.offset[piece, 0] = start
+    geoms_out.offset[piece, 1] = end
+
+
+@wp.kernel
+def deflect_wires(
+    # model
+    numbers: WireNumbers,
+    wires: Wires,
+    nodes: SupportNodes,
+    # in
+    tree_awake: wp.array(dtype=wp.bool),
+    rigid_asleep: wp.array(dtype=wp.int32),
+    # out
+    found_out: WirePresses,
+    presses_out: WirePresses,
+    loads_out: wp.array(dtype=wp.vec3d),
+    is_loaded_out: wp.array(dtype=wp.bool),
+    geoms_out: WireGeoms,
+):
+    """One thread in all: keep what sleepers pressed with, load the supports, and move the geoms.
+
+    rigid_asleep: [kinematic tree] not negative while it sleeps. found_out: of this step, its count is cleared.
+    presses_out: those of the last step, then of this. loads_out: [node] N. is_loaded_out: [support].
+    """
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    for j in range(presses_out.count[0]):
+        tree = presses_out.tree[j]
+        sleeps = bool(False)
+        if tree >= 0:
+            sleeps = not tree_awake[tree]
+        elif -1 - tree < rigid_asleep.shape[0]:
+            sleeps = rigid_asleep[-1 - tree] >= 0
+        if sleeps and found_out.count[0] < found_out.piece.shape[0]:
+            copy_press(j, found_out.count[0], presses_out, found_out)
+            found_out.count[0] = found_out.count[0] + 1
+        load_nodes(j, zero, wires, nodes, presses_out, loads_out, is_loaded_out)
+        geoms_out.is_held[presses_out.piece[j]] = False
+    presses_out.count[0] = found_out.count[0]
+    found_out.count[0] = 0
+    loaded = int(0)
+    for j in range(presses_out.count[0]):
+        copy_press(j, j, found_out, presses_out)
+        support = wires.support[presses_out.piece[j]]
+        if support >= 0:
+            if not is_loaded_out[support]:
+                geoms_out.loaded[loaded] = support
+                loaded = loaded + 1
+        load_nodes(j, one, wires, nodes, presses_out, loads_out, is_loaded_out)
+    kept = int(0)
+    for k in range(geoms_out.count[0]):  # decay; those that are held follow below
+        piece = geoms_out.deflected[k]
+        for end in range(2):
+            geoms_out.offset[piece, end] = numbers.recovery * geoms_out.offset[piece, end]
+        if (
+            wp.max(wp.length(geoms_out.offset[piece, 0]), wp.length(geoms_out.offset[piece, 1]))
+            > numbers.least_deflection
+        ):
+            geoms_out.deflected[kept] = piece
+            kept = kept + 1
+        else:
+            geoms_out.offset[piece, 0] = wp.vec3d()
+            geoms_out.offset[piece, 1] = wp.vec3d()
+    for j in range(presses_out.count[0]):
+        piece = presses_out.piece[j]
+        if not geoms_out.is_held[piece]:
+            geoms_out.is_held[piece] = True
+            rod_through(piece, j, numbers, wires, presses_out, geoms_out)
+            largest = zero
+            for end in range(2):
+                size = wp.length(geoms_out.offset[piece, end])
+                largest = wp.max(largest, size)
+                if size > numbers.max_deflection:
+                    geoms_out.offset[piece, end] = numbers.max_deflection / size * geoms_out.offset[piece, end]
+            listed = bool(False)
+            for k in range(kept):
+                listed = listed or geoms_out.deflected[k] == piece
+            if not listed and largest > numbers.least_deflection:
+                geoms_out.deflected[kept] = piece
+                kept = kept + 1
+            elif not listed:
+                geoms_out.offset[piece, 0] = wp.vec3d()
+                geoms_out.offset[piece, 1] = wp.vec3d()
+    geoms_out.count[0] = kept
+    geoms_out.count[1] = loaded

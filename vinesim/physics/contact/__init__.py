@@ -1,6 +1,0 @@
-"""Contacts of plants: detection, and one solve shared by plants and rigid bodies.
-
-Stages of a step, all called by ``contact_solver``: broadphase and narrowphase (``detection``), islands and impulses
-(``impulse_solver``). ``plant_capsules`` and ``collision_geoms`` list the collision shapes, ``effective_mass`` the
-response of constrained rigid bodies; ``scene_arrays`` holds what the kernels read.
-"""

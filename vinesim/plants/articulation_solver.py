@@ -1,0 +1,1401 @@
+"""Articulation solver: all plants of a vineyard as trees of bodies on ball joints, stepped with implicit springs.
+
+One step of the plants alone is ``predict()`` then ``integrate()``. A contact solver works in between: it reads
+``state.body_q`` and ``velocity_free``, asks for the ``impulse_response()`` of the bodies in contact, and integrates
+with the wrenches that it found. Trees that sleep cost nothing.
+
+A tree with berry clusters is *coarse* (each bunch one compound, its clusters riding on it) until ``refine()`` lets them
+move and ``coarsen()`` locks them again. ``cut()`` makes a body the floating root of what grows on it. All three are
+called between steps, after ``integrate()`` and before the next ``predict()``.
+
+The scheme (:mod:`vinesim.kernels.plants`) damps as if every joint's beta (damping / stiffness) were larger by
+``(2 phi - 1) dt``, so the solver takes that off what the model asks, down to nothing: what is asked is what is seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vinesim.core import frames
+from vinesim.core.errors import checked_index
+from vinesim.kernels.launch import BoundLaunch as Launch
+from vinesim.kernels.launch import bind_launch, bound, join_partitions
+from vinesim.kernels.plants import first_mode, structs
+from vinesim.kernels.plants.eight_trees import predict_groups
+from vinesim.kernels.plants.energy_budget import (
+    CLOSELY,
+    MIN_PHI,
+    NO_BUDGET,
+    NO_LIMIT,
+    begin_budget,
+    choose_budget,
+    keep_budget,
+)
+from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, substeps_for
+from vinesim.kernels.plants.floating_components import correct_floating_momentum
+from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response
+from vinesim.kernels.plants.integration import integrate
+from vinesim.kernels.plants.joint_wrench import joint_wrench
+from vinesim.kernels.plants.kinematics import forward_kinematics
+from vinesim.kernels.plants.lane_records import LANES, RECORD
+from vinesim.kernels.plants.lean_prediction import predict_lean
+from vinesim.kernels.plants.prediction import predict
+from vinesim.kernels.shared_launch import LaunchPool
+from vinesim.plants.contact_loads import ContactLoads
+from vinesim.plants.device_buffers import DeviceBuffers
+from vinesim.plants.ties import RootRests, TieTable, turning_damping
+from vinesim.plants.validation import checked_trees, validate
+from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.state import State
+
+_NO_TREES, _NO_WRENCHES = np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
+
+
+class ArticulationSolver:
+    """The trees of one model and their state, in memory shared by NumPy and Warp.
+
+    ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
+    a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after contact
+    began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
+    ``predict()`` before them.
+
+    Args:
+        model: constants; :class:`ValueError` in words if a tree cannot be simulated.
+        state: its arrays are read and written in place.
+        parameters: numbers of the scheme; those that follow replace single ones and may be infinite.
+        dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
+        device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
+            them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
+        threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
+        fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
+            ``PhysicsParameters``, and :mod:`vinesim.plants.fault_guard`.
+        geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
+            it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
+        substeps: divide the step of trees whose first mode is too fast for it; off only to compare with other solvers.
+        buffers: where arrays live, instead of what ``device`` says."""
+
+    def __init__(
+        self,
+        model: Model,
+        state: State,
+        parameters: PhysicsParameters = PhysicsParameters(),
+        *,
+        dt: float | None = None,
+        phi: float | None = None,
+        device: str = "cpu",
+        threads: int = 1,
+        fast_rate: float | None = None,
+        max_rate: float | None = None,
+        fault_rate: float | None = None,
+        geometric_stiffness: bool = True,
+        substeps: bool = True,
+        buffers: DeviceBuffers | None = None,
+    ) -> None:
+        p = parameters
+        dt, phi = p.dt if dt is None else dt, p.phi if phi is None else phi
+        buffers = DeviceBuffers(device) if buffers is None else buffers
+        if not isinstance(threads, int) or threads < 1 or (threads > 1 and not buffers.device.is_cpu):
+            raise ValueError(f"{threads} threads on {device}: 1 or more on cpu; a GPU needs none, leave threads at 1")
+        if not 0.0 < dt < math.inf or not 0.5 <= phi <= 1.0:
+            raise ValueError(f"dt {dt} s, phi {phi}: need a finite dt above 0 and phi from 0.5 to 1")
+        validate(model, state)
+        self.model, self.state, self._dt, self._gravity = model, state, dt, p.gravity
+        self.fast_rate = p.fast_joint_rate if fast_rate is None else fast_rate
+        self.max_rate = p.max_joint_rate if max_rate is None else max_rate
+        self.fault_rate = p.fault_joint_rate if fault_rate is None else fault_rate
+        self.buffers, self.threads = buffers, threads
+        """Where arrays live, for NumPy and for kernels."""
+        self.tick = 0
+        """Integrations so far."""
+        self.ties, self.root_rests = TieTable(model, p.max_held_bodies, p.max_hands_per_body), RootRests(model)
+        self._allocate(phi)
+        self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
+        self._pin_arrays()
+        self.launch_pool = LaunchPool(threads)
+        """Threads that share launches over trees."""
+        weakref.finalize(self, self.launch_pool.close)
+        numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
+        self.onset_steps = numbers["contact_steps"] - 1  # with phi = 1 after contact began
+        self.launches = KernelLaunches(self, numbers, self.launch_pool, MAX_SUBSTEPS if substeps else 1)
+        """Kernels on these arrays."""
+        self._runner = StepRunner(
+            buffers, self.launches, tree_substeps=self.tree_substeps, tree_steps=self._steps,
+            tree_rate=self.tree_rate, tree_budget=self.tree_budget, stepping=self._stepping, groups=self._groups,
+            floating=self._floating, topologies=Topologies(model, state.body_cut, self.tree_moving),
+            whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
+            | model.is_on_arm(),
+        )  # fmt: skip
+
+        def apply_on_device(touched: int, first: int = 0, partition: int = 0) -> None:
+            self.launches.upload_wrenches(len(self._runner.stepped))
+            self.launches.apply_wrenches(touched)
+
+        self._loads = ContactLoads(
+            body_tree=model.body_tree, place_in_tree=self._place_in_tree, is_stepped=self._runner.is_stepped,
+            tree_moving=self.tree_moving, body_wrench=self._wrench, touched=self._subset,
+            euler_steps=self._euler_steps, onset=self.onset_steps + 1,  # the first step counts
+            apply=bound(apply_on_device) if buffers.has_copies else self.launches.apply_wrenches,
+            pool=self.launch_pool,
+        )  # fmt: skip
+        self._list_awake()
+        self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
+        self.berry_clusters = BerryClusters(self)
+        """Locks and unlocks berry clusters; for what leaves the tree, see :class:`DetachmentMonitor`."""
+
+    @property
+    def dt(self) -> float:
+        """[s] Duration of a step. Fixed: kernels, damping and counts of steps follow from it at the start."""
+        return self._dt
+
+    def _allocate(self, phi: float) -> None:
+        """Arrays of the solver beside model and state."""
+        model, state, trees, bodies = self.model, self.state, len(self.model.tree_first), len(self.model.body_mass)
+        self.phi = np.full(trees, phi, np.float32)
+        """phi asked for each tree [tree]; set it as you like. 1 where a tie is stiff (``stiff_tie_mass``)."""
+        self.phi_used = np.zeros(trees, np.float32)
+        """phi of each tree's last ``predict()`` [tree]."""
+        self.awake_list = np.zeros(trees, np.int32)
+        """Its first entries are :attr:`awake`: for kernels, which stay bound to it [tree]."""
+        self.tree_rate = np.zeros(trees, np.float32)
+        """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
+        self.tree_substeps = np.ones(trees, np.int32)
+        """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
+        self.tree_budget = np.zeros(trees, np.int32)
+        """How the energy of each awake tree is watched [tree]: :mod:`vinesim.kernels.plants.energy_budget`."""
+        self.tree_air = np.zeros((trees, 3), np.float32)
+        """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.wind.plant_wind`."""
+        self.body_load = np.zeros((bodies, 6), np.float32)
+        """Wrenches that last until changed (wind, a rope): force [N], moment about the body's origin [N m], world."""
+        self.velocity_free = np.zeros((bodies, 6), np.float32)
+        """Velocity of each body of an awake tree at the end of the step if nothing touches it [body, 6]."""
+        self.acceleration = np.zeros((bodies, 6), np.float32)
+        """Acceleration over the last step [body, 6] m/s^2, rad/s^2, world axes."""
+        self.body_mass, self.body_com = model.body_mass.copy(), model.body_com.copy()
+        self.body_inertia, self.body_drag = model.body_inertia.copy(), model.body_drag.copy()
+        """What moves now, in the model's units: the body of a bunch is its compound while the tree is coarse, its head
+        while it is fine; a picked bunch is a stub."""
+        self.body_product = np.zeros((bodies, 3), np.float32)
+        """Entries yz, zx, xy of the inertia in the body's axes [body, 3] kg m^2: a compound is not symmetric."""
+        self.joint_stiffness, self.joint_damping = model.joint_stiffness.copy(), model.joint_damping.copy()
+        """The model's, but none where a body has been cut off; if ties hold that, the damping is how they resist that
+        it turns."""
+        self.tree_moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
+        """Bodies of each tree that move [tree]: all, or all but the clusters."""
+        self.body_impulse = np.zeros((bodies, 6), np.float32)
+        """Impulses of a plastic impact while it is solved [body, 6] N s, N m s."""
+        self.joint_xd_free, self.joint_qd_free = np.zeros((bodies, 3), np.float32), np.zeros((bodies, 3), np.float32)
+        """Predicted rates of roots and joints [body, 3] m/s, rad/s."""
+        self._place_in_tree = (np.arange(bodies) - model.tree_first[model.body_tree]).astype(np.int32)
+        # as the kernels see the trees: a cut body has no parent and no lever
+        self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
+        self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
+        self._falls = np.zeros(bodies, np.bool_)  # of a floating component that no tie holds
+        self._floating, self._falling_roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
+        self._wrench = np.zeros((bodies, 6), np.float32)
+        self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
+        self._stepping, self._subset, self._groups = (np.zeros(n, np.int32) for n in (trees, trees, (trees, 2)))
+
+    def _pin_arrays(self) -> None:
+        """Move the arrays of solver, ties and state to where the device can reach them."""
+        for owner in (self, self.ties, self.root_rests, self.state):
+            for name, value in vars(owner).items():
+                if isinstance(value, np.ndarray):
+                    setattr(owner, name, self.buffers.pinned(value))
+
+    def kernel_arrays(self) -> dict[Any, dict[str, np.ndarray]]:
+        """All arrays that kernels read or write, by element type and name."""
+        model, state, ties, rests = self.model, self.state, self.ties, self.root_rests
+        return {
+            wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
+                       "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
+                       "tree_euler_steps": self._euler_steps, "tree_steps": self._steps, "floating": self._floating,
+                       "tree_substeps": self.tree_substeps, "tree_budget": self.tree_budget},
+            float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
+                    "tie_damping": ties.damping, "tie_softening": ties.softening, "tree_phi": self.phi,
+                    "phi_used": self.phi_used, "tree_rate": self.tree_rate},
+            wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
+            wp.bool: {"tree_awake": state.tree_awake, "body_falls": self._falls},
+            wp.vec3: {"body_offset": self._offset, "body_com": self.body_com, "body_inertia": self.body_inertia,
+                      "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
+                      "joint_damping": self.joint_damping, "tie_point": ties.point, "tie_anchor": ties.anchor,
+                      "tie_anchor_velocity": ties.anchor_velocity, "tie_axis": ties.axis, "tree_air": self.tree_air,
+                      "root_turn": rests.turn, "root_turn_rate": rests.rate, "root_softening": rests.softening,
+                      "joint_x": state.joint_x, "joint_xd": state.joint_xd, "joint_qd": state.joint_qd,
+                      "joint_xd_free": self.joint_xd_free, "joint_qd_free": self.joint_qd_free},
+            wp.quat: {"body_rest": self._rest, "joint_q": state.joint_q},
+            wp.transform: {"body_q": state.body_q},
+            wp.spatial_vector: {"body_qd": state.body_qd, "body_load": self.body_load, "body_wrench": self._wrench,
+                                "body_impulse": self.body_impulse, "body_acceleration": self.acceleration,
+                                "body_qd_free": self.velocity_free},
+        }  # fmt: skip
+
+    # ------------------------------------------------------------------ awake and asleep
+
+    @property
+    def awake(self) -> np.ndarray:
+        """Ids of the awake trees, sorted [k] int32."""
+        return self._awake
+
+    def wake(self, trees: np.ndarray | int) -> None:
+        """Let trees move from the next ``predict()`` on; :class:`ValueError` if there is no such tree."""
+        trees = checked_trees(trees, len(self.state.tree_awake))
+        if not self.state.tree_awake[trees].all():
+            self.state.tree_awake[trees] = True
+            self._list_awake()
+
+    def put_to_sleep(self, trees: np.ndarray | int) -> None:
+        """Put trees to sleep where they are, with zero rates; their poses are brought up to date.
+
+        :class:`ValueError` if there is no such tree.
+        """
+        trees = checked_trees(trees, len(self.state.tree_awake))
+        if len(trees) == 0:
+            return
+        bodies = self.bodies_of(trees)
+        for rows in (self.state.joint_qd, self.state.joint_xd, self.velocity_free, self.acceleration, self._wrench):
+            rows[bodies] = 0.0
+        self.tree_rate[trees] = 0.0
+        self._euler_steps[trees] = 0
+        self.forward_kinematics(trees)
+        self.state.tree_awake[trees] = False
+        self._list_awake()
+
+    def _list_awake(self) -> None:
+        self._awake = np.flatnonzero(self.state.tree_awake).astype(np.int32)
+        self.awake_list[: len(self._awake)] = self._awake
+
+    def bodies_of(self, trees: np.ndarray) -> np.ndarray:
+        """All bodies of some trees, tree by tree [k]."""
+        return spans(self.model.tree_first[trees], self.model.tree_size[trees])
+
+    # ------------------------------------------------------------------ topology and mass
+
+    def refine(self, trees: np.ndarray | int) -> None:
+        """Let the clusters of these trees' bunches move, from where they ride and as fast as what they ride on.
+
+        Pose, velocity and momentum go on. Nothing happens to trees that are fine or have no clusters; none wakes.
+        :class:`ValueError` if there is no such tree.
+        """
+        self.berry_clusters.refine(trees)
+
+    def coarsen(self, trees: np.ndarray | int) -> None:
+        """Lock the clusters of these trees' bunches where they are: each bunch becomes one compound.
+
+        Nothing changes its pose. The clusters' motion against their bunch ends in a plastic impact that lasts a step.
+        A bunch keeps its angular momentum about its origin; what its joint must take sets the rest of the tree moving,
+        against springs as in any step (free of them, a light peduncle would be flung about). A floating tree keeps all
+        momentum. Kinetic energy does not grow, as the scheme counts it: with the rates squared times the metric.
+        """
+        self.berry_clusters.coarsen(trees)
+
+    def cut(self, body: int) -> None:
+        """Cut a body off its parent: it and what grows on it fall, from where they are and as fast as they are.
+
+        Its tree wakes; the rest of it goes on as before. Numbers never change. :class:`ValueError` if it cannot be cut.
+        """
+        model, state = self.model, self.state
+        body = checked_index("body", body, len(model.body_mass))
+        tree = int(model.body_tree[body])
+        if state.body_cut[body]:
+            raise ValueError(f"body {body} of tree {tree} has been cut off already")
+        if body - model.tree_first[tree] >= model.tree_core[tree]:
+            raise ValueError(f"body {body} of tree {tree} is a berry cluster; cut off its bunch")
+        self.forward_kinematics(tree)
+        state.joint_x[body], state.joint_q[body] = state.body_q[body, :3], state.body_q[body, 3:]
+        state.joint_xd[body], state.joint_qd[body] = state.body_qd[body, :3], state.body_qd[body, 3:]
+        state.body_cut[body] = True
+        self._detach_joints(self.bodies_of(np.array([tree])))
+        self.wake(tree)
+
+    def _detach_joints(self, bodies: np.ndarray) -> None:
+        """Take over which of the bodies of some whole trees have been cut off."""
+        cut = bodies[self.state.body_cut[bodies]]
+        self._parent[cut] = -1
+        self._offset[cut], self._rest[cut] = 0.0, frames.IDENTITY
+        self.joint_stiffness[cut], self.joint_damping[cut] = 0.0, 0.0
+        up = bodies
+        while ((above := self._parent[up]) >= 0).any():
+            up = np.where(above >= 0, above, up)
+        self._root[bodies] = np.where(self.state.body_cut[up], up, -1)
+        self._find_falling(bodies)
+
+    def _find_falling(self, bodies: np.ndarray) -> None:
+        """Note which floating components of some whole trees no tie holds; ties resist that the others turn."""
+        root, is_cut = self._root[bodies], self.state.body_cut[bodies]
+        tied = np.isin(bodies, self.ties.tied_bodies)
+        self._falls[bodies] = (root >= 0) & ~np.isin(root, root[tied])
+        if is_cut.any():
+            damping = turning_damping(self.model, bodies, root, tied, self._gravity)
+            self.joint_damping[bodies[is_cut]] = damping[is_cut, None]
+        self._falling_roots = np.flatnonzero(self.state.body_cut & self._falls).astype(np.int32)
+        self.launches.changed = True
+
+    def set_mass(self, body: int, mass: float) -> None:
+        """Give one body another mass [kg] (a picked bunch, a pruned leaf); its inertia scales along.
+
+        A bunch with clusters is meant as a whole, fine or coarse: head and clusters keep their shares.
+        """
+        if not 0.0 < mass < math.inf:
+            raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
+        self.berry_clusters.set_mass(body, mass)
+
+    # ------------------------------------------------------------------ one step
+
+    def predict(self, trees: np.ndarray | None = None) -> None:
+        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts.
+
+        ``trees`` [k]: only these, woken or given another phi after the prediction of all.
+        """
+        launches = self.launches
+        self._runner.list_trees(self._awake)
+        if trees is None:
+            launches.upload_step(count := len(self._runner.stepped))
+            self._runner.predict()
+            launches.download_prediction(count)
+        else:
+            self.list_subset(trees)
+            launches.upload_subset_step(count := len(trees))
+            launches.predict_subset(count)
+            launches.download_subset_prediction(count)
+        self.buffers.synchronize()
+
+    def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
+        """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
+
+        ``impulse_response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of
+        body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees.
+        """
+        self.require_stepped(bodies)
+        return self.launches.dense_impulse_response(bodies)
+
+    def integrate(self, bodies: np.ndarray | None = None, wrenches: np.ndarray | None = None) -> None:
+        """End the step: wrenches (N, N m, world, at the bodies' origins) act over it, joints move.
+
+        ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
+        """
+        launches, touched, loads = self.launches, _NO_TREES, self._loads
+        count = len(self._runner.stepped)
+        if bodies is not None and len(bodies):
+            touched = loads.replace(bodies, np.asarray(wrenches), self.tick)
+        elif len(loads):
+            self._unload(count)
+        self._runner.integrate(touched, *self._floating_roots())
+        launches.download_joints(count)
+        self.buffers.synchronize()
+        self.tick += 1
+
+    def _unload(self, count: int) -> None:
+        """Take the wrenches of the last contacts off the first ``count`` trees of the list."""
+        self._loads.replace(_NO_TREES, _NO_WRENCHES, self.tick)
+        self.launches.upload_wrenches(count)
+
+    def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
+        """The floating roots that this step moves: where kernels find them, and their trees."""
+        if len(self._falling_roots) == 0:
+            return _NO_TREES, _NO_TREES
+        tree = self.model.body_tree[self._falling_roots]
+        roots = self._falling_roots[self.state.tree_awake[tree] & np.isin(tree, self._runner.stepped)]
+        return self.buffers.slots[roots], self.model.body_tree[roots]
+
+    def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
+        """Many steps of the awake trees: no sleep, no fault guard, no contacts but what ``between`` launches.
+
+        Threads part once for all of them. A GPU works on its own copies meanwhile: :meth:`upload` before and
+        :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free``, ``acceleration``
+        are of the last step; a tree that went wrong stays where it was (``tree_rate`` NaN or above ``fault_rate``).
+        """
+        self._runner.list_trees(self._awake)
+        floating = self._floating_roots()
+        if len(self._loads) and steps > 0:  # the next prediction still knows the last contacts
+            self._runner.predict()
+            self._unload(len(self._runner.stepped))
+            self._runner.integrate(_NO_TREES, *floating)
+            self._runner.advance(steps - 1, *floating, between)
+        else:
+            self._runner.advance(steps, *floating, between)
+        self.tick += steps
+
+    def upload(self) -> None:
+        """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
+        self._runner.list_trees(self._awake)
+        self.launches.upload_step(len(self._runner.stepped))
+        self.buffers.synchronize()
+
+    def download(self) -> None:
+        """Bring the host's arrays of the awake trees up to the device's, as ``predict()`` and ``integrate()`` do."""
+        self.launches.download_prediction(len(self._runner.stepped))
+        self.launches.download_joints(len(self._runner.stepped))
+        self.buffers.synchronize()
+
+    def use_backward_euler(self, trees: np.ndarray) -> None:
+        """Use phi = 1 for ``contact_onset_duration``: trees about to be touched (``integrate()`` sees to touched)."""
+        self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self.onset_steps)
+
+    def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
+        """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""
+        trees = self._awake if trees is None else np.atleast_1d(trees)
+        self.list_subset(trees)
+        self.launches.upload_changed()
+        self.launches.upload_subset_joints(len(trees))
+        self.launches.forward_kinematics(len(trees))
+        self.launches.download_subset_bodies(len(trees))
+        self.buffers.synchronize()
+
+    def list_subset(self, trees: np.ndarray) -> None:
+        """List trees [k] for the kernels that do not work on all awake ones."""
+        self._subset[: len(trees)] = trees
+
+    def require_stepped(self, bodies: np.ndarray) -> None:
+        """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""
+        self._loads.require_stepped(np.asarray(bodies))
+
+    def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
+        """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
+        blend_towards(self, tree, joint_q, joint_qd, blend)
+
+    # ------------------------------------------------------------------ ties, wrenches, damping
+
+    @property
+    def tie_anchor(self) -> np.ndarray:
+        """Where ties are held [tie, 3] m, in the world; move them as you like. See :meth:`add_tie`."""
+        return self.ties.anchor
+
+    @property
+    def tie_stiffness(self) -> np.ndarray:
+        """N/m [tie]; a tie of zero does nothing."""
+        return self.ties.stiffness
+
+    @property
+    def tie_damping(self) -> np.ndarray:
+        """N s/m [tie]."""
+        return self.ties.damping
+
+    @property
+    def held_bodies(self) -> list[int]:
+        """Bodies that ties of :meth:`add_tie` hold."""
+        return self.ties.held_bodies
+
+    def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
+        """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
+
+        It pulls to ``tie_anchor`` of that tie, which starts where the point is; move it as you like.
+        :class:`TieLimitError` if too many bodies are held, or this one in too many places; :class:`ValueError` for a
+        berry cluster and for numbers that are not finite.
+        """
+        body = checked_index("body", body, len(self.model.body_mass))
+        if body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]:
+            raise ValueError(f"body {body} is a berry cluster, which cannot be held; hold its bunch")
+        self.forward_kinematics(np.array([tree]))
+        tie = self.ties.add(body, point, self.state.body_q[body].astype(float), stiffness, damping)
+        self._find_falling(self.bodies_of(np.array([tree])))
+        return tie
+
+    def remove_tie(self, body: int, tie: int) -> None:
+        """Undo a tie of :meth:`add_tie`."""
+        self.ties.remove(body, tie)
+        self._find_falling(self.bodies_of(self.model.body_tree[[body]]))
+
+    def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
+        """Force [N] and moment [N m, about the body's origin, world axes] on bodies from their parents [n, 6].
+
+        Of the last step, and only for bodies of trees that were awake in it. At rest it carries what hangs below.
+        """
+        return self.launches.joint_wrench(bodies)
+
+    def damping_floor(self, frequency: float, phi: float | None = None) -> float:
+        """Least damping ratio that a first mode of this frequency [Hz] can show: pi f (2 phi - 1) dt / substeps."""
+        phi = float(self.phi.max(initial=0.5)) if phi is None else phi
+        return math.pi * frequency * (2.0 * phi - 1.0) * self.dt / substeps_for(frequency, self.dt)
+
+
+# Berry clusters: bunches whose clusters move, or ride locked on their bunch as one compound body.
+#
+# Locking ends the clusters' motion against their bunch in a plastic impact that lasts no time: the joints take its
+# impulse through the factors of inertia and springs alone.
+
+
+def spans(first: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """The numbers ``first[i] ... first[i] + count[i] - 1``, one span after the other [sum of count]."""
+    end = np.cumsum(count)
+    return np.repeat(first - (end - count), count) + np.arange(end[-1] if len(end) else 0)
+
+
+class BerryClusters:
+    """Locks and unlocks the clusters of the bunches of one solver; see :meth:`ArticulationSolver.refine`."""
+
+    def __init__(self, solver: ArticulationSolver) -> None:
+        self._solver: ArticulationSolver = weakref.proxy(solver)  # no cycle of references
+        model = solver.model
+        clustered = np.flatnonzero(model.bunch_clusters > 0)
+        tree = model.body_tree[model.bunch_body[clustered]]
+        order = np.argsort(tree, kind="stable")
+        self.bunches, self._bunch_tree = clustered[order], tree[order]
+        """Bunches that have clusters, by tree [k]."""
+        self.head_mass, self.head_inertia = model.bunch_head_mass.copy(), model.bunch_head_inertia.copy()
+        """[bunch] kg, [bunch, 3] kg m^2 of the part of a bunch that is no cluster."""
+        fine = solver.state.tree_fine[self._bunch_tree]
+        self.lock(self.bunches[~fine])
+        self.unlock(self.bunches[fine])
+
+    def clustered_trees(self, trees: np.ndarray | int, *, fine: bool) -> np.ndarray:
+        """Those of some trees that have clusters and are fine or not [k], sorted."""
+        model, trees = self._solver.model, np.unique(checked_trees(trees, len(self._solver.state.tree_fine)))
+        return trees[(self._solver.state.tree_fine[trees] == fine) & (model.tree_core[trees] < model.tree_size[trees])]
+
+    def clusters_of(self, trees: np.ndarray) -> np.ndarray:
+        """The clusters of some trees, as bodies [k]."""
+        model = self._solver.model
+        core = model.tree_core[trees]
+        return spans(model.tree_first[trees] + core, model.tree_size[trees] - core)
+
+    def bunches_of(self, trees: np.ndarray) -> np.ndarray:
+        """The bunches of some trees that have clusters [k]."""
+        start, end = (np.searchsorted(self._bunch_tree, trees, side=side) for side in ("left", "right"))
+        return self.bunches[spans(start, end - start)]
+
+    def refine(self, trees: np.ndarray | int) -> None:
+        """See :meth:`ArticulationSolver.refine`."""
+        solver, trees = self._solver, self.clustered_trees(trees, fine=False)
+        if len(trees) == 0:
+            return
+        self.unlock(self.bunches_of(trees))
+        solver.state.tree_fine[trees] = True
+        solver.tree_moving[trees] = solver.model.tree_size[trees]
+        solver.state.joint_qd[self.clusters_of(trees)] = 0.0
+        solver.forward_kinematics(trees)
+
+    def coarsen(self, trees: np.ndarray | int) -> None:
+        """See :meth:`ArticulationSolver.coarsen`."""
+        solver, trees = self._solver, self.clustered_trees(trees, fine=True)
+        if len(trees) == 0:
+            return
+        bunches, riding = self.bunches_of(trees), self.clusters_of(trees)
+        impulse = self.lock(bunches)
+        solver.state.tree_fine[trees] = False
+        solver.tree_moving[trees] = solver.model.tree_core[trees]
+        solver.state.joint_qd[riding] = 0.0
+        solver.velocity_free[riding] = 0.0
+        solver.acceleration[riding] = 0.0
+        if impulse.any():
+            self._apply_impact(trees, solver.model.bunch_body[bunches], impulse)
+        solver.forward_kinematics(trees)
+
+    def _apply_impact(self, trees: np.ndarray, bodies: np.ndarray, impulse: np.ndarray) -> None:
+        """Change joint rates of trees by impulses [k, 6] N s, N m s on bunches [k], about their origins, in their
+        axes."""
+        solver, state, launches = self._solver, self._solver.state, self._solver.launches
+        solver.forward_kinematics(trees)
+        axes = state.body_q[bodies, 3:].astype(float)
+        solver.body_impulse[bodies, :3] = frames.rotate(axes, impulse[:, :3])
+        solver.body_impulse[bodies, 3:] = frames.rotate(axes, impulse[:, 3:])
+        springs = solver.joint_stiffness[bodies], solver.joint_damping[bodies]
+        solver.joint_stiffness[bodies], solver.joint_damping[bodies] = 0.0, 0.0
+        solver.list_subset(trees)
+        launches.changed = True
+        launches.upload_changed()
+        launches.upload_impact(len(trees))
+        launches.factor_impact(len(trees))
+        solver.buffers.synchronize()
+        solver.joint_stiffness[bodies], solver.joint_damping[bodies] = springs
+        launches.changed = True
+        moving = spans(solver.model.tree_first[trees], solver.model.tree_core[trees])
+        solver.joint_qd_free[moving], solver.joint_xd_free[moving] = state.joint_qd[moving], state.joint_xd[moving]
+        launches.upload_impact_rates(len(trees))
+        launches.apply_impulses(len(trees))
+        launches.download_impact_rates(len(trees))
+        solver.buffers.synchronize()
+        solver.body_impulse[bodies] = 0.0
+        state.joint_qd[moving] = solver.joint_qd_free[moving]
+        roots = moving[state.body_cut[moving]]
+        state.joint_xd[roots] = solver.joint_xd_free[roots]
+
+    def set_mass(self, body: int, mass: float) -> None:
+        """See :meth:`ArticulationSolver.set_mass`."""
+        solver, model = self._solver, self._solver.model
+        bunches = self.bunches[model.bunch_body[self.bunches] == body]
+        parts = spans(model.bunch_cluster[bunches], model.bunch_clusters[bunches])
+        whole = solver.body_mass[body]
+        if len(bunches):
+            whole = self.head_mass[bunches].sum() + solver.body_mass[parts].sum()
+        share = mass / float(whole)
+        self.head_mass[bunches] *= share
+        self.head_inertia[bunches] *= share
+        parts = np.append(parts, body)
+        solver.body_mass[parts] *= share
+        solver.body_inertia[parts] *= share
+        solver.body_product[parts] *= share
+        solver.launches.changed = True
+
+    def fuse(self, bunch: int) -> np.ndarray:
+        """Give one bunch's body the mass of the compound that head and clusters are now, and return the velocity [6]
+        m/s, rad/s of its frame, in world axes, with which that compound has the momentum of its parts.
+
+        The state stays as it is: it is for a bunch that leaves its tree, see :meth:`release`. Its poses and
+        velocities must be current.
+        """
+        solver, body = self._solver, int(self._solver.model.bunch_body[bunch])
+        pose, velocity = solver.state.body_q[body].astype(float), solver.state.body_qd[body].astype(float)
+        if not solver.state.tree_fine[solver.model.body_tree[body]] or solver.model.bunch_clusters[bunch] == 0:
+            return velocity
+        momentum = self.lock(np.array([bunch]))[0]
+        mass, com = float(solver.body_mass[body]), solver.body_com[body].astype(float)
+        x, y, z = solver.body_product[body].astype(float)
+        tensor = np.diag(solver.body_inertia[body].astype(float)) + np.array([[0, z, y], [z, 0, x], [y, x, 0]])
+        spin = np.linalg.solve(tensor, momentum[3:] - np.cross(com, momentum[:3]))
+        change = np.stack([momentum[:3] / mass - np.cross(spin, com), spin])
+        return velocity + frames.rotate(pose[3:], change).ravel()
+
+    def release(self, bunch: int) -> None:
+        """Let the clusters of one bunch of a fine tree move again after :meth:`fuse`."""
+        self.unlock(np.array([bunch] if self._solver.model.bunch_clusters[bunch] else [], np.int64))
+
+    def unlock(self, bunches: np.ndarray) -> None:
+        """Leave to each bunch's body its head only."""
+        solver, model = self._solver, self._solver.model
+        bodies = model.bunch_body[bunches]
+        solver.body_mass[bodies] = self.head_mass[bunches]
+        solver.body_com[bodies] = model.bunch_head_com[bunches]
+        solver.body_inertia[bodies] = self.head_inertia[bunches]
+        solver.body_product[bodies] = 0.0
+        solver.launches.changed = True
+
+    def lock(self, bunches: np.ndarray) -> np.ndarray:
+        """Make each bunch's body a compound of head and clusters as they are.
+
+        Returns the momentum of the clusters' motion against it [bunch, 6]: N s, and N m s about its origin, its axes.
+        """
+        solver, model, state = self._solver, self._solver.model, self._solver.state
+        n, bodies = len(bunches), model.bunch_body[bunches]
+        most = int(model.bunch_clusters[bunches].max(initial=0))
+        here, speed = np.zeros((n, most + 1, 7)), np.zeros((n, most + 1, 6))  # in the bunch's frame; the head first
+        here[..., 6] = 1.0
+        mass = np.zeros((n, most + 1))
+        com, inertia = np.zeros((n, most + 1, 3)), np.zeros((n, most + 1, 3))
+        mass[:, 0], com[:, 0], inertia[:, 0] = (
+            self.head_mass[bunches], model.bunch_head_com[bunches], self.head_inertia[bunches]
+        )  # fmt: skip
+        for number in range(most):  # over the clusters of one bunch, a handful
+            has = np.flatnonzero(model.bunch_clusters[bunches] > number)
+            body = model.bunch_cluster[bunches[has]] + number
+            parent = model.body_parent[body]
+            above = np.where(parent == bodies[has], 0, parent - model.bunch_cluster[bunches[has]] + 1)
+            base, motion = here[has, above], speed[has, above]
+            frame = frames.compose(base, frames.pose(model.body_offset[body].astype(float), model.body_rest[body]))
+            turn = frames.rotate(frame[:, 3:], state.joint_qd[body].astype(float))
+            here[has, number + 1, :3] = frame[:, :3]
+            here[has, number + 1, 3:] = frames.multiply(frame[:, 3:], state.joint_q[body].astype(float))
+            speed[has, number + 1, :3] = motion[:, :3] + np.cross(motion[:, 3:], frame[:, :3] - base[:, :3])
+            speed[has, number + 1, 3:] = motion[:, 3:] + turn
+            mass[has, number + 1] = solver.body_mass[body]
+            com[has, number + 1], inertia[has, number + 1] = solver.body_com[body], solver.body_inertia[body]
+        axes = frames.to_matrix(here[..., 3:])
+        tensor = np.einsum("...ij,...j,...kj->...ik", axes, inertia, axes)
+        arm = np.einsum("...ij,...j->...i", axes, com)
+        linear = mass[..., None] * (speed[..., :3] + np.cross(speed[..., 3:], arm))
+        arm += here[..., :3]
+        angular = np.cross(arm, linear) + np.einsum("...ij,...j->...i", tensor, speed[..., 3:])
+        whole = mass.sum(1)
+        center = (mass[..., None] * arm).sum(1) / whole[:, None]
+        arm -= center[:, None]
+        tensor += mass[..., None, None] * (
+            (arm * arm).sum(-1)[..., None, None] * np.eye(3) - arm[..., :, None] * arm[..., None, :]
+        )
+        tensor = tensor.sum(1)
+        solver.body_mass[bodies], solver.body_com[bodies] = whole, center
+        solver.body_inertia[bodies] = np.diagonal(tensor, axis1=1, axis2=2)
+        solver.body_product[bodies] = tensor[:, [1, 2, 0], [2, 0, 1]]
+        solver.launches.changed = True
+        return np.concatenate([linear.sum(1), angular.sum(1)], -1)
+
+
+# Poses of trees that another client simulates.
+
+
+def blend_towards(
+    plants: ArticulationSolver, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float
+) -> None:
+    """See :meth:`vinesim.plants.articulation_solver.ArticulationSolver.blend_towards`."""
+    state, bodies = plants.state, plants.model.bodies_of(tree)
+    there, rates = np.asarray(joint_q, np.float32), np.asarray(joint_qd, np.float32)
+    here = state.joint_q[bodies]
+    if there.shape != here.shape or rates.shape != (len(here), 3):
+        raise ValueError(f"tree {tree}: pulled by joints {there.shape}, {rates.shape}; it has {len(here)} bodies")
+    there = frames.normalize(there)
+    if not np.isfinite(there).all() or not np.isfinite(rates).all() or not (there != 0.0).any(-1).all():
+        raise ValueError(f"tree {tree}: pulled to a pose that is not finite or has zero quaternions; drop the update")
+    turn = frames.log(frames.multiply(frames.conjugate(here), there))
+    state.joint_q[bodies] = frames.normalize(frames.multiply(here, frames.exp(blend * turn)))
+    state.joint_qd[bodies] = rates
+    state.joint_qd[bodies.start + plants.tree_moving[tree] : bodies.stop] = 0.0  # what rides does not turn
+
+
+# Kernels of the articulation solver, each bound once to its arrays, and the transfers of rows around them.
+
+
+TREES_PER_CHUNK = {"predict": 2, "integrate": 16, "wrenches": 4}
+"""Trees that a thread takes at a time: work of 3 to 8 us, beside which taking them is nothing. DERIVED from the times
+of one tree of 17 bodies."""
+STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
+"""Rows that are carried to the device before every prediction."""
+DEVICE_RESULTS = (
+    "body_q", "body_qd", "joint_xd_free", "joint_qd_free", "body_acceleration", "body_qd_free", "body_impulse",
+)  # fmt: skip
+"""Rows that kernels write, or that are carried over when they are needed."""
+TREE_INPUTS = (
+    "stepping", "tree_moving", "tree_phi", "tree_euler_steps", "tree_steps", "tree_rate", "tree_awake", "tree_budget",
+    "tree_air", "root_turn", "root_turn_rate", "tie_stiffness", "tie_damping", "tie_anchor", "tie_anchor_velocity",
+)  # fmt: skip
+"""Lists and numbers of trees and ties that kernels of a step read."""
+TREE_RESULTS = ("tree_euler_steps", "phi_used", "tree_rate")
+"""Numbers of trees that they write."""
+SCRATCH = {
+    wp.vec3: ("lever", "tension", "Du"),
+    wp.quat: ("axes",),
+    wp.mat33: ("J", "H", "M", "D", "DJ", "DH", "root_inverse_mass"),
+    wp.transform: ("after_q",),
+    wp.spatial_vector: (
+        "bias", "subtree_wrench", "added_acceleration", "before", "after_qd", "impact_acceleration", "impact_velocity",
+    ),
+}  # fmt: skip
+"""Rows that only kernels see."""
+
+
+def kernel_parameters(
+    p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
+) -> dict[str, Any]:
+    """Fields of :class:`vinesim.kernels.plants.structs.SolverParameters`."""
+    return {
+        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
+        "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
+        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
+    }  # fmt: skip
+
+
+BUDGET_PERIOD = 8
+"""Steps in one of which energy is looked at while no tree is watched."""
+
+MIN_CAPACITY = 16
+"""Bodies that a list holds at least."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JointWrenches:
+    """Wrenches that joints carried in the last step."""
+
+    places: np.ndarray
+    """[joint] int32 bodies, where kernels find them: to be written by the caller."""
+    carried: np.ndarray
+    """[joint, 6] N, N m"""
+    compute: Launch
+    """Fills :attr:`carried` of the first joints."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """The launches of a step on the same arrays."""
+
+    predict_groups: Launch
+    """Over groups of trees; on a GPU each tree is a group."""
+    predict: Launch
+    integrate: Callable[..., None]
+    correct_floating_momentum: Launch
+
+
+class KernelLaunches:
+    """Launches of the articulation kernels on the arrays of one solver.
+
+    Arrays of the model are constants. What has a row for each body a GPU keeps a copy of, see
+    :mod:`vinesim.plants.device_buffers`: :data:`STEP_INPUTS`, :data:`DEVICE_RESULTS`, and all others, which
+    :meth:`upload_changed` carries over when :attr:`changed` says so. Everything else a GPU reads where it is, which in
+    many steps on end would cost more than the steps: those have copies of :data:`TREE_INPUTS` as well, and launches of
+    their own (:attr:`resident`), with :meth:`upload_trees` before and :meth:`download_trees` after.
+    """
+
+    def __init__(
+        self, solver: ArticulationSolver, parameters: dict[str, float], pool: LaunchPool, max_substeps: int
+    ) -> None:
+        """``parameters``: numbers of :class:`vinesim.kernels.plants.structs.SolverParameters` but gravity;
+        ``pool``: threads that share the launches over trees."""
+        self.buffers, self._pool, self._max_substeps = solver.buffers, pool, max_substeps
+        self._body_tree = solver.model.body_tree
+        self.changed = False
+        """Whether model rows (parents, masses, springs) differ from the device's copies."""
+        self.substeps_due = False
+        """Whether they have changed since the substeps of trees were counted."""
+        self._budgeted = np.zeros(0, np.int32)
+        self._keeps_budgets, self._watches_closely, self._budget_phase = False, False, -1
+        self._seldom: list[str] = []
+        self._register_arrays(solver)
+        self._record_transfers()
+        self._arrays = self.buffers.arrays
+        self.parameters = self.fill(structs.SolverParameters, **parameters)
+        self._record_step(self.parameters)
+        self.shared = Step(
+            self.predict_groups or self.predict, self.predict, self.integrate, self.correct_floating_momentum
+        )
+        """The launches of a step on what NumPy sees."""
+        self.resident = self.shared
+        """Those of steps between which nothing comes back to the host."""
+        self.resident_arrays = self.buffers.arrays
+        """The arrays that these work on."""
+        if self.buffers.has_copies:
+            self._record_resident(self.parameters)
+        self._record_impact(
+            self.fill(structs.SolverParameters, **(parameters | {"fast_rate": math.inf, "geometric_stiffness": 0.0}))
+        )
+        self.response_capacity = 0
+        self._joint_wrenches = self.record_joint_wrenches(1)  # or the first bunch that is picked would wait for it
+
+    # ------------------------------------------------------------------ arrays
+
+    def _register_arrays(self, solver: ArticulationSolver) -> None:
+        buffers, model = self.buffers, solver.model
+        buffers.set_layout(model.tree_first, model.tree_size)
+        buffers.add_constant("tree_pose", model.tree_pose, wp.transform)
+        for dtype, arrays in solver.kernel_arrays().items():
+            for name, data in arrays.items():
+                if name.startswith(("body_", "joint_", "tie_span")):
+                    buffers.add_body_rows(name, data, dtype, body_indices=name in ("body_parent", "body_root"))
+                    self._seldom += [name] if name not in DEVICE_RESULTS + STEP_INPUTS else []
+                else:
+                    buffers.add_shared(name, data, dtype)
+        for dtype, names in SCRATCH.items():
+            for name in names:
+                buffers.add_scratch(name, dtype)
+        buffers.add_constant("body_branches", self._branching(model.body_parent), wp.bool)
+        trees = len(model.tree_first)
+        self.budget = structs.EnergyBudget()
+        for name, field in structs.fields(structs.EnergyBudget).items():
+            count = buffers.slot_count if name == "start_q" else trees
+            setattr(self.budget, name, wp.zeros(count, dtype=field.type.dtype, device=buffers.device))
+        self.budget.limit.fill_(NO_LIMIT)
+        rows = (self.budget.limit, self.budget.watch)
+        self._budget_rows = [array.numpy() for array in rows] if buffers.device.is_cpu else []
+        buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
+
+    def _branching(self, parent: np.ndarray) -> np.ndarray:
+        """[place] whether a body is the parent of another than the next one, where kernels look for it."""
+        places = np.zeros(self.buffers.slot_count, np.bool_)
+        apart = (parent >= 0) & (parent != np.arange(len(parent)) - 1)
+        places[self.buffers.slots[parent[apart]]] = True
+        return places
+
+    def upload_changed(self) -> None:
+        """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
+        if self.changed:
+            self.buffers.upload(self._seldom)
+            self.budget.limit.fill_(NO_LIMIT)
+            self._budget_phase = -1
+            self.changed, self.substeps_due = False, True
+
+    def fill(self, struct: Any, **values: Any) -> Any:
+        """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named
+        so."""
+        return self._filled(struct, self._arrays, values)
+
+    def fill_resident(self, struct: Any, **values: Any) -> Any:
+        """The same with the arrays of :attr:`resident`."""
+        return self._filled(struct, self.resident_arrays, values)
+
+    def _filled(self, struct: Any, arrays: dict[str, wp.array], values: dict[str, Any]) -> Any:
+        filled = struct()
+        values = {"pitch": self.buffers.pitch} | values
+        for field in structs.fields(struct):
+            value = values.get(field, field)
+            setattr(filled, field, arrays[value] if isinstance(value, str) else value)
+        return filled
+
+    def record(self, kernel: Any, *arguments: object, **options: Any) -> Launch:
+        """Bind a kernel; a string among the arguments names an array."""
+        given = [self._arrays[value] if isinstance(value, str) else value for value in arguments]
+        return bind_launch(kernel, given, [], device=str(self.buffers.device), **options)
+
+    def record_shared(self, kernel: Any, *arguments: object, chunk: int) -> Launch:
+        """The same of a kernel whose list is ``trees``, shared in chunks of so many."""
+        launch = self.record(kernel, *arguments, index_list="trees", partitions=self._pool.size)
+        return self._pool.share([launch], chunk)
+
+    # ------------------------------------------------------------------ transfers of the listed trees' rows
+
+    def _record_transfers(self) -> None:
+        def copier(trees: str, *names: str, to_host: bool = False) -> Callable[[int], None]:
+            return self.buffers.row_copier(names, trees, to_host=to_host)
+
+        self.upload_step = copier("stepping", *STEP_INPUTS)
+        self.download_prediction = copier("stepping", "body_q", "body_qd", "body_qd_free", to_host=True)
+        self.upload_subset_step = copier("subset", *STEP_INPUTS)
+        self.download_subset_prediction = copier("subset", "body_q", "body_qd", "body_qd_free", to_host=True)
+        self.upload_wrenches = copier("stepping", "body_wrench")
+        self.download_joints = copier(
+            "stepping", "joint_x", "joint_xd", "joint_q", "joint_qd", "body_acceleration", to_host=True
+        )
+        self.upload_subset_joints = copier("subset", "joint_x", "joint_xd", "joint_q", "joint_qd")
+        self.download_subset_bodies = copier("subset", "body_q", "body_qd", to_host=True)
+        self.upload_impact = copier("subset", *STEP_INPUTS, "body_impulse")
+        self.upload_impact_rates = copier("subset", "joint_xd_free", "joint_qd_free")
+        self.download_impact_rates = copier("subset", "joint_xd_free", "joint_qd_free", to_host=True)
+
+    # ------------------------------------------------------------------ kernels
+
+    def _record_step(self, parameters: Any) -> None:
+        fill, record, s = self.fill, self.record, structs
+        self._model, self._forces = fill(s.ArticulationModel), fill(s.AppliedForces)
+        joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
+        scratch, prediction = fill(s.Scratch), fill(s.Prediction)
+        self.predict = self._record_predict(parameters, "stepping")
+        self.predict_subset = self._record_predict(parameters, "subset")
+        self.predict_groups = (
+            None if self.buffers.has_copies else self._record_groups(parameters, joints, scratch, prediction)
+        )
+        """Predicts groups of trees, on a CPU."""
+        self.integrate = self._record_integrate(parameters)
+        self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
+        self.apply_wrenches = self.record_shared(
+            apply_wrenches, parameters.dt, self._model, "subset", "body_wrench", self._factors, fill(s.WrenchScratch),
+            scratch, prediction, chunk=TREES_PER_CHUNK["wrenches"],
+        )  # fmt: skip
+        self.correct_floating_momentum = self._record_momentum(parameters)
+        self.choose_budget = record(choose_budget, parameters, self._model, "stepping", scratch, "tree_budget")
+        self.count_substeps = record(
+            first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
+            scratch, fill(s.WrenchScratch), "tree_substeps",
+        )  # fmt: skip
+
+    def _record_predict(self, parameters: Any, trees: str) -> Launch:
+        fill, s = self.fill, structs
+        kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
+        return self.record_shared(
+            kernel[0], parameters, fill(s.ArticulationModel), *kernel[1], trees, "tree_phi", "tree_euler_steps",
+            "tree_steps", fill(s.AppliedForces), fill(s.JointState), "phi_used", fill(s.BodyState), fill(s.Factors),
+            fill(s.Scratch), fill(s.Prediction), chunk=TREES_PER_CHUNK["predict"],
+        )  # fmt: skip
+
+    def _record_integrate(self, parameters: Any) -> Callable[..., None]:
+        """An integration, with the energy budgets around it."""
+        fill, record, s = self.fill, self.record, structs
+        model, forces, joints, prediction = (
+            fill(struct) for struct in (s.ArticulationModel, s.AppliedForces, s.JointState, s.Prediction)
+        )
+        partitioned = {"index_list": "trees", "partitions": self._pool.size}
+        apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
+        begin = record(
+            begin_budget, parameters, model, "stepping", "tree_budget", "tree_phi", forces, joints,
+            self.budget, apart, **partitioned,
+        )  # fmt: skip
+        move = record(
+            integrate, parameters, model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
+            "tree_rate", "tree_euler_steps", joints, **partitioned,
+        )  # fmt: skip
+        keep = record(
+            keep_budget, parameters, model, "stepping", "tree_budget", "tree_phi", "tree_steps", "tree_rate",
+            forces, self.budget, "tree_euler_steps", joints, apart, fill(s.Factors), fill(s.Scratch),
+            fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"), **partitioned,
+        )  # fmt: skip
+        chunk = TREES_PER_CHUNK["integrate"]
+        return self._keeping_budgets(self._pool.share([move], chunk), self._pool.share([begin, move, keep], chunk))
+
+    def _record_momentum(self, parameters: Any) -> Launch:
+        fill, s = self.fill, structs
+        return self.record(
+            correct_floating_momentum, parameters, fill(s.ArticulationModel), "floating", "phi_used", "tree_rate",
+            "tree_steps", fill(s.AppliedForces), fill(s.BodyState), "body_acceleration", "lever",
+            fill(s.FloatingScratch), fill(s.JointState), index_list="roots",
+        )  # fmt: skip
+
+    def _record_resident(self, parameters: Any) -> None:
+        """The launches of a step once more, on copies of what there is of each tree."""
+        device, shared = self.buffers.device, self.buffers.arrays
+        names = dict.fromkeys(TREE_INPUTS + TREE_RESULTS)
+        copies = {name: wp.empty_like(shared[name], device=device) for name in names}
+        self.resident_arrays = self._arrays = shared | copies
+        predict = self._record_predict(parameters, "stepping")
+        self.resident = Step(predict, predict, self._record_integrate(parameters), self._record_momentum(parameters))
+        self._arrays = shared
+
+    def upload_trees(self) -> None:
+        """Bring the arrays of :attr:`resident` up to those that NumPy sees."""
+        for name in TREE_INPUTS if self.buffers.has_copies else ():
+            wp.copy(self.resident_arrays[name], self.buffers.host_array(name))
+
+    def download_trees(self) -> None:
+        """The other way round, what kernels write."""
+        for name in TREE_RESULTS if self.buffers.has_copies else ():
+            wp.copy(self.buffers.host_array(name), self.resident_arrays[name])
+
+    def list_budgets(self, trees: np.ndarray) -> None:
+        """These trees [k] have energy budgets (:mod:`vinesim.kernels.plants.energy_budget`), no others."""
+        self._budgeted, self._budget_phase = trees, -1
+        kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
+        self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
+
+    def look_for_budgets(self, steps: int = 1) -> None:
+        """Once before the integrations of a step or of so many: decide whether they keep energy budgets.
+
+        Always on a GPU and in many steps. Otherwise in one step of eight, and in the seven that follow if a tree is
+        watched closely after it.
+        """
+        self._budget_phase = (self._budget_phase + 1) % BUDGET_PERIOD if steps == 1 else 0
+        if self._budget_phase == 0 or self.buffers.device.is_cuda:
+            self._keeps_budgets = len(self._budgeted) > 0
+        elif self._budget_phase == 1 and self._keeps_budgets:
+            limit, watch = (row[self._budgeted].max() for row in self._budget_rows)
+            self._keeps_budgets = self._watches_closely or bool(watch > 0 or limit >= NO_LIMIT)
+
+    def _keeping_budgets(self, move: Launch, move_with_budgets: Launch) -> Callable[..., None]:
+        """An integration, with what keeps the energy budgets around it in steps that do."""
+
+        def launch(*which: int) -> None:
+            (move_with_budgets if self._keeps_budgets else move)(*which)
+
+        return launch
+
+    def _record_groups(self, parameters: Any, joints: Any, scratch: Any, prediction: Any) -> Launch:
+        """The prediction of up to eight trees at once, each thread with memory of its own."""
+        size = LANES * RECORD * (self.buffers.max_tree_size + 2)
+        launches = [
+            self.record(
+                predict_groups, parameters, self._model, "groups", "stepping", "tree_phi", "tree_euler_steps",
+                "tree_steps", self._forces, joints, wp.zeros(size, dtype=float, device=self.buffers.device),
+                "phi_used", self._bodies, self._factors, scratch, prediction, index_list="groups",
+            )
+            for _ in range(self._pool.size)
+        ]  # fmt: skip
+        return self._pool.share([join_partitions(launches)], 1)
+
+    def _record_impact(self, parameters: Any) -> None:
+        """An impact within no time: factors of inertia and springs alone, and wrenches that are impulses."""
+        fill, s = self.fill, structs
+        joints, scratch = fill(s.JointState), fill(s.Scratch)
+        prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
+        self.factor_impact = self.record(
+            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
+            joints, "impact_phi",
+            self._bodies, self._factors, scratch, prediction, index_list="trees",
+        )  # fmt: skip
+        self.apply_impulses = self.record(
+            apply_wrenches, 1.0, self._model, "subset", "body_impulse", self._factors, fill(s.WrenchScratch), scratch,
+            prediction,
+        )  # fmt: skip
+
+    def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
+        """Response [n, 6, m, 6] of some bodies [n] to unit impulses on the listed bodies of the same tree (neighbours
+        in the list, at most m); a view, good until the next call."""
+        n, buffers = len(bodies), self.buffers
+        if n > self.response_capacity or self.response_capacity == 0:
+            self._record_response(max(2 * self.response_capacity, n, MIN_CAPACITY))
+        self._response_bodies[:n] = buffers.slots[bodies]
+        self._respond(n)
+        buffers.synchronize()
+        return self._response[:n]
+
+    def dense_impulse_response(self, bodies: np.ndarray) -> np.ndarray:
+        """The same [n, 6, n, 6] for bodies in any order, with the zeros between different trees."""
+        bodies = np.asarray(bodies)
+        order = np.argsort(bodies, kind="stable")
+        _, tree_start, tree = np.unique(self._body_tree[bodies[order]], return_index=True, return_inverse=True)
+        packed = self.impulse_response(bodies[order])
+        dense = np.zeros((len(bodies), 6, len(bodies), 6), np.float32)
+        for i, start in enumerate(tree_start):
+            of_tree = np.flatnonzero(tree == i)
+            block = packed[start : start + len(of_tree), :, : len(of_tree)]
+            at = order[of_tree]
+            dense[at[:, None], :, at] = block.transpose(0, 2, 1, 3)
+        return dense
+
+    def _record_response(self, capacity: int) -> None:
+        self.response_capacity, buffers = capacity, self.buffers
+        self._response_bodies = buffers.pinned(np.zeros(capacity, np.int32))
+        self._response = buffers.pinned(np.zeros((capacity, 6, buffers.max_tree_size, 6), np.float32))
+        buffers.add_shared("response_bodies", self._response_bodies, wp.int32)
+        buffers.add_shared("response", self._response, float)
+        stride = buffers.max_tree_extent
+        matrix: Any = wp.mat33
+        columns = {
+            name: wp.empty(capacity * stride, dtype=matrix, device=buffers.device)
+            for name in structs.fields(structs.ResponseColumns)
+        }
+        self._respond = self.record(
+            impulse_response, self._model, stride, "response_bodies", self._factors,
+            self.fill(structs.ResponseColumns, **columns), "response",
+        )  # fmt: skip
+
+    def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
+        """Wrench [n, 6] N, N m that the joints of some bodies [n] carried in the last step."""
+        wrenches = self._joint_wrenches
+        if len(bodies) > len(wrenches.places):
+            wrenches = self._joint_wrenches = self.record_joint_wrenches(2 * len(bodies))
+        wrenches.places[: len(bodies)] = self.buffers.slots[bodies]
+        wrenches.compute(len(bodies))
+        return wrenches.carried[: len(bodies)].copy()
+
+    def record_joint_wrenches(self, capacity: int) -> JointWrenches:
+        """What computes the wrenches that up to so many joints carried in the last step."""
+        buffers = self.buffers
+        places = buffers.pinned(np.zeros(capacity, np.int32))
+        carried = buffers.pinned(np.zeros((capacity, 6), np.float32))
+        launch = self.record(
+            joint_wrench, self.parameters, self._model, buffers.reach(places, wp.int32, "joint_bodies"), "phi_used",
+            "tree_steps", self._forces, self._bodies, "body_acceleration",
+            buffers.reach(carried, wp.spatial_vector, "joint_wrench"),
+        )  # fmt: skip
+
+        def launch_and_wait(count: int, first: int = 0, partition: int = 0) -> None:
+            launch(count)
+            buffers.synchronize()
+
+        return JointWrenches(places, carried, bound(launch_and_wait) if buffers.has_copies else launch)
+
+
+# Launches over the awake trees: in groups of one topology on a CPU, captured into a graph on a GPU.
+#
+# A tree whose first mode is too fast for the step takes substeps instead, of which all others see the sum:
+# :mod:`vinesim.kernels.plants.first_mode` says how many. While contacts act on it, it takes the whole step that
+# they were solved for; and so does always a tree that is tied to wires, which move once a step.
+
+
+Levels = tuple[int, ...]
+"""How many of a list take a first, a second, a third substep."""
+
+
+class StepRunner:
+    """Runs predictions and integrations of the listed trees.
+
+    The list that the kernels read has the trees of one step first, then the others, those of most substeps first. On a
+    CPU those of one topology are neighbours within that order and are predicted in groups of up to eight; on a GPU each
+    tree is a group.
+
+    Args:
+        buffers: of the solver.
+        launches: of the solver.
+        tree_substeps: [tree] into how many substeps each tree's step is to be divided.
+        tree_steps: [tree] into how many it is divided now, which the kernels read.
+        tree_budget: [tree] how each tree's energy is watched.
+        whole: [tree] bool, trees on wires, whose steps are never divided.
+        tree_rate: [tree] what the kernels write of each tree's speed.
+        stepping: [tree] int32, the list that the kernels read.
+        groups: [tree, 2] int32, groups that the kernels read: first place in the list, number of trees.
+        floating: [tree] int32, the floating roots that the kernels read.
+        topologies: of the trees.
+    """
+
+    def __init__(
+        self,
+        buffers: DeviceBuffers,
+        launches: KernelLaunches,
+        *,
+        tree_substeps: np.ndarray,
+        tree_steps: np.ndarray,
+        tree_budget: np.ndarray,
+        whole: np.ndarray,
+        tree_rate: np.ndarray,
+        stepping: np.ndarray,
+        groups: np.ndarray,
+        floating: np.ndarray,
+        topologies: Topologies,
+    ) -> None:
+        self._buffers, self._launches, self._list = buffers, launches, stepping
+        self._substeps, self._steps_of, self._rate, self._floating = tree_substeps, tree_steps, tree_rate, floating
+        self._is_whole, self._budget_kind = whole, tree_budget
+        self.stepped = np.zeros(0, np.int32)
+        """The trees of this step [k], sorted."""
+        self.is_stepped = np.zeros(len(tree_rate), np.bool_)
+        """Which these are [tree]."""
+        self.fast = np.zeros(0, np.int32)
+        """Those of them whose step is to be divided [k], sorted."""
+        self._whole, self._levels, self._roots, self._root_levels = 0, (), 0, ()
+        self._divided = np.zeros(0, np.int32)
+        """Into how many substeps the steps of ``fast`` were divided when the list was put in order [k]."""
+        self._graph: wp.Graph | None = None
+        self._graph_of: tuple = ()
+        self._groups, self._topologies = groups, topologies
+        self._starts = np.zeros(1, np.int32)
+        """Place in the list at which each group begins, and the end of the list."""
+        self._whole_groups = 0
+        """Groups of the trees of whole steps: the first ones."""
+
+    # ------------------------------------------------------------------ which trees, in which order
+
+    def list_trees(self, trees: np.ndarray) -> None:
+        """Step these trees [k] from now on, as the model is now; count their substeps if one of both has changed."""
+        self._launches.upload_changed()
+        if self.stepped is trees and not self._launches.substeps_due:
+            return
+        self._launches.substeps_due = False
+        self.is_stepped[self.stepped] = False
+        self.is_stepped[trees] = True
+        self.stepped = trees
+        self._list[: len(trees)] = trees
+        self._launches.count_substeps(len(trees))
+        self._launches.choose_budget(len(trees))
+        self._buffers.synchronize()
+        self._budget_kind[trees[self._is_whole[trees]]] = NO_BUDGET  # a wire that moves does work on them
+        self._launches.list_budgets(trees[self._budget_kind[trees] != NO_BUDGET])
+        self.fast = trees[(self._substeps[trees] > 1) & ~self._is_whole[trees]]
+        self._steps_of[trees] = 1
+        self._divided = np.ones(len(self.fast), np.int32)
+        self._order()
+
+    def _order(self) -> None:
+        """List the trees by what ``_steps_of`` says of each."""
+        trees, on_cpu = self.stepped, self._buffers.device.is_cpu
+        topologies = self._topologies.of(trees)
+        if on_cpu:
+            order = np.argsort(topologies, kind="stable")
+            trees, topologies = trees[order], topologies[order]
+        listed, self._whole, self._levels = _by_substeps(np.arange(len(trees)), self._steps_of[trees])
+        trees, topologies = trees[listed], topologies[listed]
+        self._list[: len(trees)] = trees
+        in_groups = self._launches.predict_groups is not None
+        self._starts = group_starts(topologies, self._whole) if in_groups else np.arange(len(trees) + 1)
+        counts = np.diff(self._starts)
+        self._groups[: len(counts), 0], self._groups[: len(counts), 1] = self._starts[:-1], counts
+        self._whole_groups = int(np.searchsorted(self._starts, self._whole))
+
+    def _divide(self, touched: np.ndarray) -> None:
+        """Divide the coming step of all fast trees but those ``touched`` [k]."""
+        if len(self.fast) == 0:
+            return
+        steps = self._substeps[self.fast]
+        if len(touched):
+            steps[np.isin(self.fast, touched)] = 1
+        self._steps_of[self.fast] = steps
+        self._rate[self.fast] = 0.0
+        if not np.array_equal(steps, self._divided):
+            self._divided = steps
+            self._order()
+
+    def _list_roots(self, roots: np.ndarray, trees: np.ndarray) -> None:
+        """List floating roots [k] (places of bodies) of trees [k] as their trees are listed."""
+        if len(roots) == 0:
+            self._roots, self._root_levels = 0, ()
+            return
+        order, self._roots, self._root_levels = _by_substeps(np.arange(len(roots)), self._steps_of[trees])
+        self._floating[: len(roots)] = roots[order]
+
+    # ------------------------------------------------------------------ a step
+
+    def predict(self) -> None:
+        """Predict the listed trees over the whole step."""
+        if len(self.fast):
+            self._steps_of[self.fast] = 1
+        self._launches.shared.predict_groups(len(self._starts) - 1)
+
+    def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
+        """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
+
+        ``roots`` [j]: places of floating roots, of trees ``root_trees`` [j].
+        """
+        self._divide(touched)
+        self._list_roots(roots, root_trees)
+        self._launches.look_for_budgets()
+        self._launches.integrate(self._whole)
+        self._launches.correct_floating_momentum(self._roots)
+        self._take_substeps(self._launches.shared)
+
+    def _take_substeps(self, step: Step) -> None:
+        roots, first = self._root_levels, self._whole
+        for level, count in enumerate(self._levels):
+            step.predict(count, first)
+            step.integrate(count, first)
+            if level < len(roots):
+                step.correct_floating_momentum(roots[level], self._roots)
+
+    # ------------------------------------------------------------------ many steps
+
+    def advance(
+        self, steps: int, roots: np.ndarray, root_trees: np.ndarray, between: Callable[[], None] | None = None
+    ) -> None:
+        """Predict and integrate so many times without coming back in between; ``between`` launches what comes there."""
+        self._divide(np.zeros(0, np.int32))
+        self._list_roots(roots, root_trees)
+        count = len(self.stepped)
+        if count == 0:
+            return
+        self._launches.look_for_budgets(steps)
+        self._launches.upload_trees()
+        if not self._buffers.device.is_cpu:
+            what = (self._whole, self._levels, self._roots, self._root_levels, between)
+            if self._graph is None or self._graph_of != what:
+                with wp.ScopedCapture(self._buffers.device) as capture:
+                    self._steps(1, between)
+                self._graph, self._graph_of = capture.graph, what
+            for _ in range(steps):
+                wp.capture_launch(self._graph)  # pyright: ignore[reportArgumentType]  (captured above)
+        else:
+            self._steps(steps, between)
+        self._launches.download_trees()
+        self._buffers.synchronize()
+
+    def _steps(self, steps: int, between: Callable[[], None] | None) -> None:
+        step = self._launches.resident
+        for _ in range(steps):
+            step.predict_groups(self._whole_groups)
+            if between is not None:
+                between()
+            step.integrate(self._whole)
+            step.correct_floating_momentum(self._roots)
+            self._take_substeps(step)
+
+
+def _levels(steps: np.ndarray) -> Levels:
+    """How many of some numbers of substeps [k] are above 0, above 1, and so on."""
+    return tuple(int(np.count_nonzero(steps > level)) for level in range(int(steps.max(initial=0))))
+
+
+def _by_substeps(items: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, int, Levels]:
+    """Items [k] of so many substeps each: those of one step first, then by falling number; how many of each."""
+    whole = steps == 1
+    rest = items[~whole][np.argsort(-steps[~whole], kind="stable")]
+    return np.concatenate([items[whole], rest]), int(np.count_nonzero(whole)), _levels(steps[~whole])
+
+
+# Topology: which trees have the same bodies on the same parents, so that one vector can hold them side by side.
+
+
+class Topologies:
+    """Numbers of topologies, equal for trees whose kernels walk from parent to child alike.
+
+    Args:
+        model: its trees.
+        body_cut: [body] bool, what has been cut off; such a tree shares its topology with none.
+        tree_moving: [tree] bodies that move: all of a tree's, or all but its berry clusters.
+    """
+
+    def __init__(self, model: Model, body_cut: np.ndarray, tree_moving: np.ndarray) -> None:
+        self._model, self._body_cut, self._moving = model, body_cut, tree_moving
+        known: dict[bytes, int] = {}
+        parent = np.maximum(model.body_parent - model.tree_first[model.body_tree], -1).astype(np.int32)
+
+        def number(first: int, size: int) -> int:
+            return known.setdefault(parent[first : first + size].tobytes(), len(known))
+
+        sizes = (model.tree_core.tolist(), model.tree_size.tolist())
+        first = model.tree_first.tolist()
+        self._coarse, self._fine = (np.array([*map(number, first, size)], np.int64) for size in sizes)
+
+    def of(self, trees: np.ndarray) -> np.ndarray:
+        """Numbers of the topologies of trees [k], as they are now [k]."""
+        is_fine = self._moving[trees] == self._model.tree_size[trees]
+        cut = self._model.body_tree[np.flatnonzero(self._body_cut)]
+        alone = -1 - trees.astype(np.int64)
+        return np.where(np.isin(trees, cut), alone, np.where(is_fine, self._fine[trees], self._coarse[trees]))
+
+
+def group_starts(topologies: np.ndarray, whole: int) -> np.ndarray:
+    """Where groups of up to eight trees begin in a list, and its end.
+
+    Neighbours of one topology [k] go together, but none of the first ``whole`` trees with any of the others.
+    """
+    place = np.arange(len(topologies))
+    differs = np.ones(len(topologies), bool)
+    differs[1:] = (topologies[1:] != topologies[:-1]) | (place[1:] == whole)
+    run = np.maximum.accumulate(np.where(differs, place, 0))
+    return np.append(np.flatnonzero((place - run) % LANES == 0), len(topologies)).astype(np.int32)

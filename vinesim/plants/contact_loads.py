@@ -1,0 +1,103 @@
+"""Contact loads: wrenches that act on some bodies of the plants over one step, and the trees that they touch."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from vinesim.core.warp_arrays import entry, share
+from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.kernels.plants import contact_loads as kernels
+from vinesim.kernels.shared_launch import ONCE, LaunchPool
+
+LEAST_ROOM = 64
+"""Bodies for which there is room at least."""
+
+
+class ContactLoads:
+    """Sums the wrenches of a step by body."""
+
+    def __init__(
+        self,
+        *,
+        body_tree: np.ndarray,
+        place_in_tree: np.ndarray,
+        is_stepped: np.ndarray,
+        tree_moving: np.ndarray,
+        body_wrench: np.ndarray,
+        touched: np.ndarray,
+        euler_steps: np.ndarray,
+        onset: int,
+        apply: BoundLaunch,
+        pool: LaunchPool,
+    ) -> None:
+        """Args:
+        body_tree, place_in_tree: [body] tree of each, and its number there.
+        is_stepped, tree_moving: [tree] whether it was in the last prediction, and how many of its bodies move.
+        body_wrench: [body, 6] N, N m where the sums are written; zero for bodies that are not loaded.
+        touched: [tree] where the touched trees are listed.
+        euler_steps: [tree] steps with phi = 1 that are left; raised to ``onset`` where contact begins.
+        apply: lets what has been summed act on the touched trees.
+        pool: makes the launches.
+        """
+        self._apply, self._pool = apply, pool
+        self._touched_count = np.zeros(1, np.int32)
+        self._touched, self._body_tree, self._place_in_tree = touched, body_tree, place_in_tree
+        self._is_stepped, self._tree_moving = is_stepped, tree_moving
+        self._numbers = np.zeros(kernels.NUMBERS, np.int64)
+        self._numbers[kernels.ONSET_STEPS] = onset
+        last_contact = np.full(len(touched), -2, np.int64)  # step of the last contact
+        self._given = [
+            share(body_tree, wp.int32), share(place_in_tree, wp.int32), share(is_stepped, wp.bool),
+            share(tree_moving, wp.int32),
+        ]  # fmt: skip
+        self._results = [
+            share(body_wrench, wp.spatial_vector), share(touched, wp.int32), share(self._touched_count, wp.int32),
+            share(last_contact, wp.int64), share(euler_steps, wp.int32),
+        ]  # fmt: skip
+        self._loaded = self._body = np.zeros(0, np.int32)  # room is made, and the kernel loaded, by the first contact
+
+    def _make_room(self, bodies: int) -> None:
+        loaded, self._loaded = self._loaded, np.zeros(bodies, np.int32)
+        self._loaded[: len(loaded)] = loaded
+        self._body, self._wrench = np.zeros(bodies, np.int32), np.zeros((bodies, 6), np.float32)
+        load = bind_launch(
+            kernels.load_bodies,
+            [*self._given, share(self._body, wp.int32), share(self._wrench, wp.spatial_vector)],
+            [share(self._numbers, wp.int64), share(self._loaded, wp.int32), *self._results],
+        )
+        self._load = self._pool.sequence([(load, ONCE), (self._apply, entry(self._touched_count))])
+
+    def __len__(self) -> int:
+        """How many bodies are loaded, those given several times counted so often."""
+        return int(self._numbers[kernels.LOADED])
+
+    def replace(self, bodies: np.ndarray, wrenches: np.ndarray, tick: int) -> np.ndarray:
+        """Load ``bodies`` [k] with ``wrenches`` [k, 6] in step ``tick`` instead of those of the last call, and let them
+        act.
+
+        A body may be given several times. Returns the trees touched [j], a view of the list. :class:`ValueError`, and
+        nothing is changed, if a body was not in the last prediction.
+        """
+        count = len(bodies)
+        if count > len(self._body):
+            self._make_room(max(2 * count, LEAST_ROOM))
+        self._body[:count], self._wrench[:count] = bodies, wrenches
+        self._numbers[kernels.GIVEN], self._numbers[kernels.TICK] = count, tick
+        self._load()
+        if self._numbers[kernels.REFUSED]:
+            self.require_stepped(bodies)
+        return self._touched[: self._touched_count[0]]
+
+    def require_stepped(self, bodies: np.ndarray) -> None:
+        """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""
+        trees = self._body_tree[bodies]
+        if not (is_stepped := self._is_stepped[trees]).all():
+            late = int(np.argmin(is_stepped))
+            raise ValueError(f"body {bodies[late]} is touched, but tree {trees[late]} slept: wake it before predict()")
+        if not (moves := self._place_in_tree[bodies] < self._tree_moving[trees]).all():
+            late = int(np.argmin(moves))
+            raise ValueError(
+                f"body {bodies[late]} is touched, but tree {trees[late]} is coarse and the body rides on its bunch: "
+                "touch the bunch, or refine the tree before predict()"
+            )

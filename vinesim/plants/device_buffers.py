@@ -1,0 +1,197 @@
+"""Device buffers: arrays that NumPy and kernels both use, once on a CPU, twice with a GPU.
+
+A kernel walks a tree from parent to child and back. Were its arrays in the host's memory, every step would wait for the
+bus. So with a GPU the host keeps its arrays in pinned memory that the device can reach, the device has a copy of all
+that has a row for each body, and the rows of the awake trees are carried over and back around the kernels that need
+them. Lists and numbers of trees are read where they are.
+
+The device's copies lie in another order: 32 trees side by side, first their first bodies, then their second ones, as
+far as the largest of them goes. Its 32 threads in step then read one stretch of memory where they would read 32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.plants.gather_scatter import copy_rows
+
+WARP_SIZE = 32
+"""Threads of a GPU that run in step: a warp."""
+
+
+class DeviceUnavailable(ValueError):
+    """The text says which device cannot be had, and what to do."""
+
+    exit_code = 3
+
+
+class DeviceLost(RuntimeError):
+    """A device failed while it computed; the text says which, how, and what to do."""
+
+    exit_code = 3
+
+
+def find_device(name: str) -> wp.Device:
+    """The Warp device called ``cpu``, ``cuda`` or ``cuda:N``; :class:`DeviceUnavailable` in words if there is none."""
+    if name != "cpu" and name.partition(":")[0] != "cuda":
+        raise DeviceUnavailable(f"device {name!r}: give cpu, cuda or cuda:N")
+    if name != "cpu" and wp.get_cuda_device_count() == 0:
+        raise DeviceUnavailable(
+            f"device {name!r}: Warp sees no NVIDIA GPU here (none, or no driver for it); use cpu, which needs none"
+        )
+    try:
+        return wp.get_device(name)
+    except (ValueError, RuntimeError):
+        raise DeviceUnavailable(
+            f"device {name!r}: this machine has {wp.get_cuda_device_count()} NVIDIA GPUs, counted from cuda:0"
+        ) from None
+
+
+def device_fault(name: str) -> str | None:
+    """Why a device cannot be used now, in words, or None if a number that was written there can be read."""
+    try:
+        find_device(name)
+        wp.ones(1, dtype=float, device=name).numpy()
+    except (DeviceUnavailable, RuntimeError) as fault:
+        return " ".join(str(fault).split())
+    return None
+
+
+class DeviceBuffers:
+    """The arrays of one model on one device, by name.
+
+    Args:
+        device: see :func:`find_device`.
+        interleave: how many trees lie side by side in copies that kernels work on, 0 for no copies. Unless given, 0 on
+        the
+            CPU and :data:`WARP_SIZE` with a GPU.
+    """
+
+    def __init__(self, device: str, interleave: int | None = None) -> None:
+        self.device = find_device(device)
+        interleave = (WARP_SIZE if self.device.is_cuda else 0) if interleave is None else interleave
+        self.has_copies = interleave > 0
+        """Whether kernels have copies of their own."""
+        self.pitch = max(interleave, 1)
+        """From one body of a tree to the next, as kernels count."""
+        self.arrays: dict[str, wp.array] = {}
+        """What kernels work on."""
+        self.host: dict[str, np.ndarray] = {}
+        """What NumPy works on."""
+        self._dtypes: dict[str, type] = {}
+        self._points: set[str] = set()
+
+    def set_layout(self, first: np.ndarray, size: np.ndarray) -> None:
+        """Give each body its place: ``at`` [body], out of ``places``. ``first``, ``size`` [tree] are the model's."""
+        trees = np.arange(len(first))
+        there = first
+        if self.has_copies:
+            group = trees // self.pitch
+            deepest = np.zeros(len(trees) // self.pitch + 1, np.int64)
+            np.maximum.at(deepest, group, size)
+            there = (np.cumsum(deepest) - deepest)[group] * self.pitch + trees % self.pitch
+        tree = np.repeat(trees, size)
+        self.slots = (there[tree] + (np.arange(len(tree)) - first[tree]) * self.pitch).astype(np.int32)
+        """Where kernels look for each body [body]."""
+        self.slot_count = int(deepest.sum()) * self.pitch if self.has_copies else len(tree)
+        self._largest = int(size.max(initial=1))
+        for name, data in (("tree_first", there), ("host_first", first), ("tree_size", size)):
+            self.add_constant(name, data.astype(np.int32), wp.int32)
+
+    @property
+    def max_tree_size(self) -> int:
+        """Bodies of the largest tree."""
+        return self._largest
+
+    @property
+    def max_tree_extent(self) -> int:
+        """Places from the first body of the largest tree to its last, both included."""
+        return (self._largest - 1) * self.pitch + 1
+
+    def pinned(self, data: np.ndarray) -> np.ndarray:
+        """``data`` itself if the device can reach it, a copy that it can reach otherwise: use that from now on."""
+        if self.device.is_cpu or data.size == 0:
+            return data
+        dtype = wp.dtype_from_numpy(data.dtype)
+        pinned = wp.empty(data.shape, dtype=dtype, device="cpu", pinned=True).numpy()
+        pinned[...] = data
+        return pinned
+
+    def add_constant(self, name: str, data: np.ndarray, dtype: type) -> None:
+        """An array that is never written."""
+        self.arrays[name], self.host[name] = wp.array(data, dtype=dtype, device=self.device), data
+
+    def add_shared(self, name: str, data: np.ndarray, dtype: type) -> None:
+        """An array that kernels read and write where it is; with a GPU it must come from :meth:`pinned`."""
+        self.arrays[name], self.host[name] = self.reach(data, dtype, name), data
+
+    def reach(self, data: np.ndarray, dtype: Any, name: str) -> wp.array:
+        """The same memory for kernels; with a GPU it must come from :meth:`pinned`. ``name``: for messages."""
+        if self.device.is_cpu:
+            shared = wp.array(data, dtype=dtype, device="cpu", copy=False)
+            if data.size and shared.ptr != data.ctypes.data:
+                raise ValueError(f"{name} cannot be shared with Warp; give a C-contiguous array of its own")
+            return shared
+        shape = data.shape[: data.ndim - len(getattr(dtype, "_shape_", ()))]
+        return wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
+
+    def host_array(self, name: str) -> wp.array:
+        """A shared array as one of the host, to be copied from or to."""
+        shared, data = self.arrays[name], self.host[name]
+        if self.device.is_cpu or data.size == 0:
+            return shared
+        return wp.array(ptr=data.ctypes.data, shape=shared.shape, dtype=shared.dtype, device="cpu", pinned=True)
+
+    def add_body_rows(self, name: str, data: np.ndarray, dtype: type, *, body_indices: bool = False) -> None:
+        """An array with a row of four-byte numbers for each body, written by both sides.
+
+        See :meth:`row_copier` and :meth:`upload`. ``body_indices``: its numbers are bodies, or negative.
+        """
+        if not self.has_copies:
+            self.add_shared(name, data, dtype)
+            return
+        self.host[name], self._dtypes[name] = data, dtype
+        self._points |= {name} if body_indices else set()
+        self.arrays[name] = wp.zeros(self.slot_count, dtype=dtype, device=self.device)
+        self.upload([name])
+
+    def add_scratch(self, name: str, dtype: type) -> None:
+        """Rows that only kernels see."""
+        self.arrays[name] = wp.empty(self.slot_count, dtype=dtype, device=self.device)
+
+    def upload(self, names: list[str]) -> None:
+        """Copy whole arrays of rows to the device. Not for every tick."""
+        for name in names if self.has_copies else []:
+            data = self.host[name]
+            there = np.zeros((self.slot_count, *data.shape[1:]), data.dtype)
+            there[self.slots] = np.where(data >= 0, self.slots[data], data) if name in self._points else data
+            self.arrays[name].assign(there)
+
+    def row_copier(self, names: tuple[str, ...], trees: str, *, to_host: bool = False) -> Callable[[int], None]:
+        """A function of n that copies rows of the first n ``trees`` to the device, or to the host (``to_host``).
+
+        Nothing happens where both sides share their memory.
+        """
+        if not self.has_copies:
+            return lambda count: None
+        widths = np.array([self.host[name][:1].size for name in names])
+        starts = np.append(0, np.cumsum(widths * self._largest))
+        here = (1, "host_first", [self.host[name].ctypes.data for name in names])
+        there = (self.pitch, "tree_first", [self.arrays[name].ptr for name in names])
+        (pitch, first, source), (pitch_there, first_there, target) = (there, here) if to_host else (here, there)
+        ints = [wp.array(x, dtype=wp.int32, device=self.device) for x in (starts, widths)]
+        addresses = [wp.array(np.array(x, np.uint64), dtype=wp.uint64, device=self.device) for x in (source, target)]
+        a, threads = self.arrays, int(starts[-1])
+        given = [threads, pitch, pitch_there, a[first], a[first_there], a["tree_size"], *ints, a[trees], addresses[0]]
+        launch = bind_launch(copy_rows, given, [addresses[1]], device=str(self.device), block=256)
+        return lambda count: launch(count * threads)
+
+    def synchronize(self) -> None:
+        """Wait until the device has done all its work."""
+        if self.device.is_cuda:
+            wp.synchronize_stream(self.device.stream)

@@ -1,0 +1,81 @@
+"""Equilibrium of single trees: how far they are from it, and how they are put into it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vinesim.core import frames
+from vinesim.kernels.plants import structs
+from vinesim.kernels.plants.residual_motion import REST_STEP, residual_motion
+from vinesim.plants.articulation_solver import ArticulationSolver
+
+_INPUTS = ("joint_x", "joint_xd", "joint_q", "joint_qd", "body_load", "body_wrench")
+
+
+class EquilibriumFinder:
+    """Measures trees between steps; see :mod:`vinesim.kernels.plants.residual_motion`."""
+
+    def __init__(self, plants: ArticulationSolver) -> None:
+        self._plants, buffers = plants, plants.buffers
+        trees, slots, device = len(plants.model.tree_first), buffers.slot_count, buffers.device
+        self._speed, self._distance = (buffers.pinned(np.zeros(trees, np.float32)) for _ in range(2))
+        self._is_free = buffers.pinned(np.zeros(trees, bool))
+        buffers.add_body_rows("body_length", buffers.pinned(plants.model.body_length), float)
+        for name, data, dtype in (
+            ("rest_speed", self._speed, float),
+            ("rest_distance", self._distance, float),
+            ("is_free", self._is_free, wp.bool),
+        ):
+            buffers.add_shared(name, data, dtype)
+        wrench: Any = wp.spatial_vector
+        for name, dtype in (("no_rate", wp.vec3), ("no_wrench", wrench)):
+            buffers.arrays[name] = wp.zeros(slots, dtype=dtype, device=device)
+        buffers.arrays["no_turn_rate"] = wp.zeros(trees, dtype=wp.vec3, device=device)
+        for name, dtype in (("rest_q", wp.transform), ("rest_qd", wrench), ("static_load", wrench)):
+            buffers.add_scratch(name, dtype)
+        self._upload = buffers.row_copier(_INPUTS, "subset")
+        self._record(plants)
+
+    def _record(self, plants: ArticulationSolver) -> None:
+        """Bind the kernel; scratch, factors and predicted rates are those of a step, unused between steps."""
+        launches, s = plants.launches, structs
+        fill = launches.fill
+        numbers = {name: getattr(launches.parameters, name) for name in s.fields(s.SolverParameters)}
+        prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
+        self._measure = launches.record(
+            residual_motion, fill(s.SolverParameters, **(numbers | {"dt": REST_STEP})),
+            fill(s.ArticulationModel, joint_damping="no_rate"), "body_length", "tie_axis", "tie_softening",
+            "root_softening", "subset",
+            fill(s.AppliedForces), fill(s.JointState), fill(s.JointState, joint_xd="no_rate", joint_qd="no_rate"),
+            fill(s.AppliedForces, body_load="static_load", body_wrench="no_wrench", root_turn_rate="no_turn_rate"),
+            "static_load",
+            fill(s.BodyState, body_q="rest_q", body_qd="rest_qd"), fill(s.Factors), fill(s.Scratch), prediction,
+            "rest_speed", "rest_distance", "is_free",
+        )  # fmt: skip
+
+    def residual_motion(self, trees: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Speed [k] m/s of the fastest point of some trees [k], distance [k] m of the one that is furthest from where
+        it will rest, and whether :meth:`move_to_rest` knows that place [k] bool. Call it after ``integrate()``."""
+        plants = self._plants
+        plants.list_subset(trees)
+        plants.launches.upload_changed()
+        self._upload(len(trees))
+        self._measure(len(trees))
+        plants.buffers.synchronize()
+        return self._speed[trees], self._distance[trees], self._is_free[trees]
+
+    def move_to_rest(self, trees: np.ndarray) -> None:
+        """Turn the joints of trees [k] to equilibrium, by a Newton step: the displacement that
+        :meth:`residual_motion` has just found. Only trees that nothing touches and that stand."""
+        plants = self._plants
+        plants.list_subset(trees)
+        plants.launches.download_impact_rates(len(trees))
+        plants.buffers.synchronize()
+        bodies = plants.bodies_of(trees)
+        moving = bodies - plants.model.tree_first[tree := plants.model.body_tree[bodies]] < plants.tree_moving[tree]
+        bodies, state = bodies[moving], plants.state
+        turn = frames.exp(0.25 * REST_STEP * plants.joint_qd_free[bodies])
+        state.joint_q[bodies] = frames.normalize(frames.multiply(turn, state.joint_q[bodies]))

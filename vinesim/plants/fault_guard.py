@@ -1,0 +1,91 @@
+"""Faults: a tree whose motion is not finite or too fast is stopped, put to sleep and reported; the others go on.
+
+``ArticulationSolver.integrate()`` does not integrate a tree in which a rate is not finite or beyond
+``ArticulationSolver.fault_rate``: its joints stay
+where they were when the tick began, the last state that was sound. Here such trees are found after the integration.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+
+import numpy as np
+import warp as wp
+
+from vinesim.core.warp_arrays import share
+from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.plants.fastest_tree import find_fastest
+from vinesim.plants.articulation_solver import ArticulationSolver
+
+log = logging.getLogger(__name__)
+
+MAX_PENDING_FAULTS = 1000
+"""Most faults kept for the log between two reports; the count goes on."""
+_NO_TREES = np.zeros(0, np.int32)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Fault:
+    """One tree that was stopped."""
+
+    tick: int
+    tree: int
+    rate: float
+    """[rad/s] Fastest joint that the tick would have had; NaN if it was not a number."""
+
+
+class FaultGuard:
+    """Finds trees that the solver refused to integrate and puts them to sleep in their last sound pose."""
+
+    def __init__(self, plants: ArticulationSolver) -> None:
+        self.plants = plants
+        self.count = np.zeros(len(plants.model.tree_first), np.int32)
+        """Faults of each tree so far [tree]."""
+        self.slowed = 0
+        """How often a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from it."""
+        self._faults: list[Fault] = []
+        self._fastest = np.zeros(1, np.float32)
+        self._find_fastest = bind_launch(
+            find_fastest,
+            [share(plants.awake_list, wp.int32), share(plants.tree_rate, wp.float32)],
+            [share(self._fastest, wp.float32)],
+        )
+
+    def stop_faulty_trees(self) -> np.ndarray:
+        """After an integration: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
+        plants, state = self.plants, self.plants.state
+        awake = plants.awake
+        self._fastest[0] = 0.0
+        self._find_fastest(len(awake))
+        if self._fastest[0] <= plants.max_rate and self._fastest[0] <= plants.fault_rate:
+            return _NO_TREES
+        rate = plants.tree_rate[awake]
+        stopped = awake[~(rate <= plants.fault_rate)]
+        self.slowed += int(np.count_nonzero(rate > plants.max_rate)) - int(np.count_nonzero(rate > plants.fault_rate))
+        if len(stopped) == 0:
+            return stopped
+        self.count[stopped] += 1
+        rates = plants.tree_rate[stopped].tolist()
+        room = max(MAX_PENDING_FAULTS - len(self._faults), 0)
+        self._faults += [Fault(plants.tick, *what) for what in zip(stopped.tolist(), rates, strict=True)][:room]
+        bodies = plants.bodies_of(stopped)
+        length = np.square(state.joint_q[bodies], dtype=float).sum(-1)
+        unsound = bodies[~(abs(length - 1.0) < 0.01)]  # a bad pose was written: no good one is left
+        state.joint_q[unsound] = plants.model.joint_settled[unsound]
+        cut = bodies[state.body_cut[bodies]]
+        state.joint_xd[cut] = 0.0
+        lost = cut[~np.isfinite(state.joint_x[cut]).all(-1)]
+        if len(lost):
+            state.joint_x[lost] = plants.model.forward_kinematics(plants.model.joint_settled)[lost, :3]  # where it grew
+        loads = plants.body_load[bodies]
+        plants.body_load[bodies] = np.where(np.isfinite(loads), loads, 0.0)
+        plants.put_to_sleep(stopped)
+        return stopped
+
+    def report(self) -> list[Fault]:
+        """Log what happened since the last report and return it. Call it outside the tick."""
+        faults, self._faults = self._faults, []
+        for fault in faults:
+            log.warning("tree %d stopped in tick %d at %g rad/s; it rests", fault.tree, fault.tick, fault.rate)
+        return faults

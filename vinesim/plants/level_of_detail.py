@@ -1,0 +1,105 @@
+"""Level of detail of bunches: berries move in clusters where an actor is near or watches, as one compound elsewhere.
+
+Switching changes no pose and no momentum (:meth:`ArticulationSolver.refine`, :meth:`ArticulationSolver.coarsen`), so
+it may happen in any step. Refining is never late: it happens in the step in which an actor's box reaches into the
+tree's. Coarsening waits until no actor has been near for a while and the clusters have come to rest on their bunch.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.physics_parameters import PhysicsParameters
+
+
+class LevelOfDetail:
+    """Refines the trees that an actor is near to or watches, and coarsens them when that is over."""
+
+    def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        """``parameters``: ``detail_duration``, ``detail_rate`` and ``detail_rest_duration`` say when a tree is
+        coarsened."""
+        p = parameters
+        self.plants, self.rest_rate = plants, p.detail_rate
+        self.fine_steps, self.rest_steps = p.steps(p.detail_duration), p.steps(p.detail_rest_duration)
+        """Steps that a tree stays fine with no actor near, and that its clusters must be at rest by then."""
+        model = plants.model
+        trees = len(model.tree_first)
+        self._clustered = np.flatnonzero(model.bunch_clusters > 0)
+        self._bodies = model.bunch_body[self._clustered]
+        self._tree = model.body_tree[self._bodies]
+        self._alone, self._still = np.zeros(trees, np.int32), np.zeros(trees, np.int32)
+        self._wanted = np.zeros(trees, bool)
+        self._points, self._radius = np.zeros((0, 3)), 0.0
+        self._attached = -1
+        self._worth = np.zeros(trees, bool)
+        self._rated_trees = self._clusters = self._first_cluster = np.zeros(0, np.int64)
+        """Trees of the last :meth:`_rate`, all their clusters, and where those of each tree begin."""
+
+    def set_focus(self, points: np.ndarray, radius: float) -> None:
+        """Look closely at what hangs within ``radius`` [m] of ``points`` [n, 3], until told otherwise; none: stop."""
+        self._points, self._radius = np.asarray(points, float).reshape(-1, 3), float(radius)
+
+    @property
+    def fine_trees(self) -> np.ndarray:
+        """The trees whose clusters move, sorted [k]."""
+        return self.plants.state.tree_fine.nonzero()[0]
+
+    def update(self, near: np.ndarray) -> np.ndarray:
+        """Before ``predict()``: ``near`` [k] are the awake trees that an actor reaches into; those that were coarsened
+        [k] are returned."""
+        coarsened = near[:0]
+        if len(self._clustered) == 0:
+            return coarsened
+        plants, state = self.plants, self.plants.state
+        attached = int(np.count_nonzero(state.bunch_attached))
+        if attached != self._attached:  # a tree whose bunches are gone has nothing to refine
+            self._attached = attached
+            self._worth[:] = False
+            self._worth[self._tree[state.bunch_attached[self._clustered]]] = True
+        wanted = near[self._worth[near]]
+        if len(self._points):
+            seen = self._seen()
+            wanted = np.union1d(wanted, seen) if len(seen) else wanted
+        if len(left := self._left_alone(wanted)):
+            self._alone[left] += 1
+            self._still[left] = np.where(self._rate(left) < self.rest_rate, self._still[left] + 1, 0)
+            is_done = (self._alone[left] > self.fine_steps) & (self._still[left] >= self.rest_steps)
+            if is_done.any():
+                coarsened = left[is_done]
+                plants.coarsen(coarsened)
+        if len(wanted):
+            self._alone[wanted] = self._still[wanted] = 0
+            if not state.tree_fine[wanted].all():
+                plants.refine(wanted[~state.tree_fine[wanted]])
+        return coarsened
+
+    def _left_alone(self, wanted: np.ndarray) -> np.ndarray:
+        """Fine trees [k] that are not ``wanted``."""
+        fine = self.fine_trees
+        if len(fine) == 0:
+            return fine
+        self._wanted[wanted] = True
+        left = fine[~self._wanted[fine]]
+        self._wanted[wanted] = False
+        return left
+
+    def _seen(self) -> np.ndarray:
+        """Awake trees [k] with a bunch near a watched point; poses are those of the last tick's start."""
+        state = self.plants.state
+        here = np.flatnonzero(state.tree_awake[self._tree] & state.bunch_attached[self._clustered])
+        apart = state.body_q[self._bodies[here], None, :3] - self._points
+        close = ((apart * apart).sum(-1) < self._radius * self._radius).any(1)
+        return np.unique(self._tree[here[close]])
+
+    def _rate(self, trees: np.ndarray) -> np.ndarray:
+        """The fastest cluster of each tree [k] rad/s, against what it hangs on."""
+        if not np.array_equal(trees, self._rated_trees):
+            model, self._rated_trees = self.plants.model, trees
+            core = model.tree_core[trees]
+            count = model.tree_size[trees] - core
+            self._first_cluster = np.cumsum(count) - count
+            first = np.repeat(model.tree_first[trees] + core - self._first_cluster, count)
+            self._clusters = first + np.arange(count.sum())
+        rate = self.plants.state.joint_qd[self._clusters]
+        return np.sqrt(np.maximum.reduceat((rate * rate).sum(1), self._first_cluster))

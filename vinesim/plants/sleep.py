@@ -1,0 +1,153 @@
+"""Sleep of trees: what is at rest is put to sleep, together with all that it touches.
+
+A tree is at rest when no point of it is faster than ``sleep_speed`` nor further than ``sleep_distance`` from where it
+will rest. It is then moved there, so that it sleeps in the pose in which it would have come to rest: less than a camera
+sees, and seconds earlier. What is in contact is not moved, since that would change the forces: it must have come much
+nearer to rest by itself. All this is computed (:mod:`vinesim.plants.equilibrium`) only for trees all of whose
+joints have been slower than ``sleep_rate`` for ``sleep_duration``. Trees in contact sleep together (an *island*), and
+only if nothing keeps one of them awake.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from vinesim.core.warp_arrays import share
+from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.plants.quiet_steps import count_quiet_steps
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.equilibrium import EquilibriumFinder
+from vinesim.scene.physics_parameters import PhysicsParameters
+
+CHECK_PERIOD = 0.05
+"""[s] Trees are measured and put to sleep at this period, all in the same step: a measurement costs as much as the
+prediction of a step. TUNED."""
+
+CONTACT_SHARE = 0.05
+"""[1] Share of ``sleep_distance`` within which trees that are not moved to rest must be: those in contact, and what was
+cut off. TUNED: 0.01 mm, the thousandth part of a travel of 1 cm."""
+
+STILL_DURATION = 5.0
+"""[s] What is in contact or cut off is at rest, too, if no body of it has moved by that share in so long: what bears
+it is not in the tangent stiffness, so it may be measured far from a rest in which it is. What creeps with a time
+constant of five times as much is then 0.05 mm from where it ends. TUNED."""
+
+_NO_PAIRS = np.zeros((0, 2), np.int32)
+
+
+class SleepMonitor:
+    """Finds which of the awake trees are at rest, and puts those to sleep that nothing keeps awake."""
+
+    def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        """``parameters``: those that begin with ``sleep_`` say what is at rest."""
+        self.plants, self.rate = plants, parameters.sleep_rate
+        self.speed, self.distance = parameters.sleep_speed, parameters.sleep_distance
+        self._equilibrium = EquilibriumFinder(plants)
+        self.patience = parameters.steps(parameters.sleep_duration)
+        """Steps that the joints of a tree must be slow before it is measured."""
+        self._check_steps = parameters.steps(CHECK_PERIOD)
+        trees = len(plants.model.tree_first)
+        self.quiet_steps = np.zeros(trees, np.int32)
+        """For how many steps the joints of each awake tree have been slow [tree]."""
+        self._is_at_rest = np.zeros(trees, bool)
+        self._still_steps = parameters.steps(STILL_DURATION)
+        self._seen_tick = np.full(trees, -1, np.int64)
+        """Tick of each tree's :attr:`_seen_x` [tree]; -1: it has none."""
+        self._seen_x = np.zeros((len(plants.model.body_mass), 3), np.float32)
+        """[body, 3] m where bodies were then."""
+        self._limit, self._longest = np.zeros(1, np.float32), np.zeros(1, np.int32)
+        """[1] What :attr:`rate` is, and for how many steps the joints of the quietest awake tree have been slower."""
+        self._count_quiet_steps = bind_launch(
+            count_quiet_steps,
+            [share(self._limit, wp.float32), share(plants.awake_list, wp.int32), share(plants.tree_rate, wp.float32)],
+            [share(self.quiet_steps, wp.int32), share(self._is_at_rest, wp.bool), share(self._seen_tick, wp.int64),
+             share(self._longest, wp.int32)],
+        )  # fmt: skip
+
+    @property
+    def restless(self) -> np.ndarray:
+        """Awake trees that are not at rest, whose state is still changing, sorted [k]."""
+        awake = self.plants.awake
+        return awake[~self._is_at_rest[awake]]
+
+    def wake(self, trees: np.ndarray) -> None:
+        """Wake trees, or keep them awake, for at least ``patience`` steps from now. :class:`ValueError` as in
+        :meth:`ArticulationSolver.wake`."""
+        trees = np.atleast_1d(trees)
+        self.plants.wake(trees)
+        self._forget(trees)
+
+    def wake_unbalanced(self) -> None:
+        """Wake the sleeping trees that would not stay where they are."""
+        asleep = np.flatnonzero(~self.plants.state.tree_awake).astype(np.int32)
+        _, distance, _ = self._equilibrium.residual_motion(asleep)
+        self.wake(asleep[distance > CONTACT_SHARE * self.distance])
+
+    def update(
+        self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS,
+        is_coupled: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """:meth:`watch`, and :meth:`check` where it is due: the trees that have just been put to sleep [k].
+
+        ``keep_awake`` [tree] bool: what an actor is near to, holds or owns. ``contact_pairs`` [n, 2]: awake trees that
+        touch each other. ``is_coupled`` [tree] bool: awake trees that wires join to others. They are not moved to rest:
+        where that is depends on the others.
+        """
+        return self.check(keep_awake, contact_pairs, is_coupled) if self.watch() else self.plants.awake[:0]
+
+    def watch(self) -> bool:
+        """After an integration: note which trees were slow in it; whether some are due for :meth:`check`."""
+        plants = self.plants
+        self._limit[0], self._longest[0] = self.rate, 0
+        self._count_quiet_steps(len(plants.awake))
+        return plants.tick % self._check_steps == 0 and bool(self._longest[0] >= self.patience)
+
+    def check(
+        self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS,
+        is_coupled: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Measure the trees that have been slow for long enough; see :meth:`update`."""
+        plants, awake = self.plants, self.plants.awake
+        slow = awake[self.quiet_steps[awake] >= self.patience]
+        if keep_awake is not None:  # what is at rest and stays awake all the same is measured when it has moved
+            slow = slow[~(keep_awake[slow] & self._is_at_rest[slow])]
+        if len(slow) == 0:
+            return slow
+        speed, distance, is_free = self._equilibrium.residual_motion(slow)
+        tolerance = np.where(is_free, self.distance, CONTACT_SHARE * self.distance)
+        self._is_at_rest[slow] = (speed < self.speed) & (distance < tolerance)
+        if len(bound := slow[~is_free & (speed < self.speed)]):
+            self._find_still(bound)
+        stays = ~self._is_at_rest if keep_awake is None else ~self._is_at_rest | keep_awake
+        while len(spread := contact_pairs[stays[contact_pairs[:, 0]] != stays[contact_pairs[:, 1]]]):
+            stays[spread] = True
+        asleep = slow[~stays[slow]]
+        if len(asleep) == 0:
+            return asleep
+        is_alone = is_free if is_coupled is None else is_free & ~is_coupled[slow]
+        self._equilibrium.move_to_rest(slow[~stays[slow] & is_alone])
+        plants.put_to_sleep(asleep)
+        self._forget(asleep)
+        return asleep
+
+    def _find_still(self, trees: np.ndarray) -> None:
+        """Of slow trees [k] those that have not moved for :data:`STILL_DURATION` are at rest."""
+        plants, now = self.plants, self.plants.tick
+        due = trees[(self._seen_tick[trees] >= 0) & (now - self._seen_tick[trees] >= self._still_steps)]
+        if len(due):
+            bodies = plants.bodies_of(due)
+            moved = np.linalg.norm(plants.state.body_q[bodies, :3] - self._seen_x[bodies], axis=1)
+            first = np.concatenate([[0], np.cumsum(plants.model.tree_size[due])[:-1]])
+            self._is_at_rest[due] |= np.maximum.reduceat(moved, first) < CONTACT_SHARE * self.distance
+        late = np.concatenate([trees[self._seen_tick[trees] < 0], due[~self._is_at_rest[due]]])
+        if len(late):
+            bodies = plants.bodies_of(late)
+            self._seen_x[bodies] = plants.state.body_q[bodies, :3]
+            self._seen_tick[late] = now
+
+    def _forget(self, trees: np.ndarray) -> None:
+        """Begin to watch trees anew."""
+        self.quiet_steps[trees] = 0
+        self._is_at_rest[trees] = False
+        self._seen_tick[trees] = -1

@@ -1,0 +1,166 @@
+"""Ties: springs and dampers that hold bodies at points of the world, the model's and those of hands; rests of roots.
+
+The ties of a body are adjacent in the arrays of the kernels. So behind the model's ties there are equal spans for
+bodies
+that are held: a body gets one, its own ties are copied to the front of it, and its hands take the places behind them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vinesim.core import frames
+from vinesim.scene.model import Model
+
+TURNING_TIME = 0.05
+"""[s] A tie grips what hangs from it: it resists that it turns, by so much damping for the stiffness that weight gives
+to its swing. GUESSED: a damping ratio of 0.1 where that swings in 1.5 s."""
+
+
+class TieLimitError(ValueError):
+    """Too many bodies are held, or one of them in too many places."""
+
+
+class TieTable:
+    """All ties of a solver.
+
+    Args:
+        model: its ties come first, sorted by body.
+        max_bodies: so many bodies can be held at once,
+        max_hands: each in so many places.
+    """
+
+    def __init__(self, model: Model, max_bodies: int, max_hands: int) -> None:
+        self._max_bodies, self._max_hands, self._model_ties = max_bodies, max_hands, len(model.tie_body)
+        self._model_body = np.unique(model.tie_body)
+        bodies = len(model.body_mass)
+        self._max_model_ties = int(np.bincount(model.tie_body, minlength=bodies).max(initial=0))
+        self._span_size = self._max_model_ties + max_hands
+        room = max_bodies * self._span_size
+        self.anchor = np.append(model.tie_anchor, np.zeros((room, 3), np.float32), 0)
+        """Where ties are held [tie, 3] m, in the world."""
+        self.anchor_velocity = np.zeros_like(self.anchor)
+        """How fast that place moves [tie, 3] m/s."""
+        self.axis = np.zeros_like(self.anchor)
+        """Direction of the wire that a tie is bound to [tie, 3], 0 for none."""
+        self.softening = np.zeros(len(self.anchor), np.float32)
+        """How much less stiff than the tie alone tie and wire are across the wire [tie] N/m, when all awake trees of it
+        move as one. Only the sleep of trees asks for it."""
+        self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
+        """[tie] N/m; a tie of zero does nothing."""
+        self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))
+        """[tie] N s/m"""
+        self.point = np.append(model.tie_point, np.zeros((room, 3), np.float32), 0)
+        """[tie, 3] m in the body's frame."""
+        ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
+        self.span = np.stack([ends[:-1], ends[1:]], -1)
+        """[body, 2] first tie of a body and the one after its last."""
+        bound = (model.tie_wire >= 0) & (model.fixed_tension[model.tie_wire] > 0.0) if len(model.fixed_tension) else []
+        self.on_wire = np.flatnonzero(bound)
+        """Ties of the model that are bound to wires that give [k], sorted."""
+        self._model_span = self.span.copy()
+        self._slot_of: dict[int, int] = {}
+
+    @property
+    def held_bodies(self) -> list[int]:
+        """Bodies with ties of :meth:`add`."""
+        return list(self._slot_of)
+
+    @property
+    def tied_bodies(self) -> np.ndarray:
+        """Bodies with ties [k]."""
+        return np.append(self._model_body, np.array(self.held_bodies, np.int32))
+
+    def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
+        """Tie a body with world pose [7] at a point [3] m of its frame, where that is now; returns the tie.
+
+        :class:`TieLimitError` if too many bodies are held, or this one in too many places.
+        """
+        if not (np.isfinite(point).all() and 0.0 < stiffness < math.inf and 0.0 <= damping < math.inf):
+            raise ValueError(
+                f"tie of body {body} at {point}, stiffness {stiffness} N/m, damping {damping} N s/m; give a finite "
+                "point, a stiffness above 0 and a damping of 0 or more"
+            )
+        if body not in self._slot_of:
+            self._give_span(body)
+        start = self._hands_start(body)
+        spare = np.flatnonzero(self.stiffness[start : start + self._max_hands] == 0.0)
+        if len(spare) == 0:
+            raise TieLimitError(f"body {body} is held in {self._max_hands} places already; let go of one")
+        tie = start + int(spare[0])
+        self.anchor[tie] = pose[:3] + frames.rotate(pose[3:], np.asarray(point, float))
+        self.point[tie], self.stiffness[tie], self.damping[tie] = point, stiffness, damping
+        return tie
+
+    def remove(self, body: int, tie: int) -> None:
+        """Undo a tie of :meth:`add`."""
+        self.stiffness[tie] = self.damping[tie] = 0.0
+        start = self._hands_start(body)
+        if not self.stiffness[start : start + self._max_hands].any():
+            del self._slot_of[body]
+            self.span[body] = self._model_span[body]
+
+    def _hands_start(self, body: int) -> int:
+        return self._model_ties + self._span_size * self._slot_of[body] + self._max_model_ties
+
+    def _give_span(self, body: int) -> None:
+        free = [i for i in range(self._max_bodies) if i not in self._slot_of.values()]
+        if not free:
+            raise TieLimitError(f"body {body} is one too many: {self._max_bodies} are held already, let go of one")
+        self._slot_of[body] = free[0]
+        own = slice(*self._model_span[body].tolist())
+        start = self._model_ties + self._span_size * free[0]
+        here = slice(start, start + own.stop - own.start)
+        for values in (
+            self.anchor, self.anchor_velocity, self.axis, self.softening, self.stiffness, self.damping, self.point,
+        ):  # fmt: skip
+            values[start : start + self._span_size] = 0.0
+            values[here] = values[own]
+        self.span[body] = start, start + self._span_size
+
+
+class RootRests:
+    """How arms turn the rests of the springs of roots, on which trees stand; see
+    :mod:`vinesim.wires.elastic_supports`."""
+
+    def __init__(self, model: Model) -> None:
+        trees = len(model.tree_first)
+        self.turn = np.zeros((trees, 3), np.float32)
+        """[tree, 3] rad, joint axes."""
+        self.rate = np.zeros((trees, 3), np.float32)
+        """[tree, 3] rad/s, joint axes."""
+        self.softening = np.zeros((trees, 3), np.float32)
+        """The outer product of this [tree, 3] (N m/rad)^(1/2), joint axes, with itself is by what spring and arm are
+        less stiff than the spring alone, when all awake trees of the arm move as one. Only the sleep of trees asks for
+        it."""
+
+
+def turning_damping(model: Model, bodies: np.ndarray, root: np.ndarray, tied: np.ndarray, gravity: float) -> np.ndarray:
+    """How much ties resist that floating components turn [k] N m s/rad: of each component at its root, 0 elsewhere.
+
+    :data:`TURNING_TIME` times the stiffness that weight gives to its swing if it hangs straight down: masses times
+    lengths along the wood to the nearest tie. It depends on the model, the cuts and the ties alone, so it is the same
+    for a client that joins later.
+
+    Args:
+        model: of the trees.
+        bodies: of some whole trees [k].
+        root: [k] the floating root that each moves with, -1 for none.
+        tied: [k] bool, whether it has ties.
+        gravity: [m/s^2]
+    """
+    damping = np.zeros(len(bodies), np.float32)
+    along, up = np.zeros(len(bodies)), bodies
+    while (up >= 0).any():
+        along += np.where(up >= 0, np.linalg.norm(model.body_offset[up], axis=1), 0.0)
+        up = np.where(up >= 0, model.body_parent[up], -1)
+    tree = model.body_tree[bodies]
+    core = bodies - model.tree_first[tree] < model.tree_core[tree]  # a bunch's mass has its clusters in it
+    middle = along + model.body_com[bodies, 0]
+    for cut in np.unique(root[tied & (root >= 0)]):
+        own = (root == cut) & core
+        arm = np.abs(middle[own, None] - along[own & tied]).min(1)
+        damping[bodies == cut] = TURNING_TIME * gravity * float(model.body_mass[bodies[own]] @ arm)
+    return damping

@@ -1,0 +1,155 @@
+"""Checks of a model and its state before they are simulated: what is refused, and the remedy."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from vinesim.core.errors import checked_index
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+
+_log = logging.getLogger(__name__)
+
+
+def checked_trees(trees: np.ndarray | int, count: int) -> np.ndarray:
+    """Numbers of trees [k] as an array; :class:`ValueError` naming the first not from 0 to ``count`` - 1."""
+    trees = np.atleast_1d(trees)
+    if len(trees) and (trees.dtype.kind not in "iu" or trees.min() < 0 or trees.max() >= count):
+        for tree in trees.tolist():
+            checked_index("tree", tree, count)
+    return trees
+
+
+def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
+    """Log one warning if springs ask for less damping than the scheme has at ``dt`` [s] and ``phi``."""
+    floor = (2.0 * phi - 1.0) * dt
+    stiffness = model.joint_stiffness.astype(float)
+    raised = ((stiffness > 0.0) & (model.joint_damping < (1.0 - 1e-3) * floor * stiffness)).any(1)
+    if raised.any():
+        _log.warning(
+            "%d of %d joints ask for less damping than beta = (2 phi - 1) dt = %.2g ms, least of phi %g and dt %g s,"
+            " and have that; lower dt or phi (0.5 adds none), or raise their beta",
+            raised.sum(), len(model.body_mass), 1e3 * floor, phi, dt,
+        )  # fmt: skip
+
+
+def validate(model: Model, state: State) -> None:
+    """Raise :class:`ValueError` naming the first tree or body that cannot be simulated, and the remedy."""
+    model.check()
+    state.check()
+    if len(state.joint_q) != len(model.body_mass) or len(state.tree_awake) != len(model.tree_first):
+        raise ValueError(
+            f"state of {len(state.joint_q)} bodies for a model of {len(model.body_mass)}; use State.at_rest"
+        )
+
+    def refuse(bad: np.ndarray, what: str, value: np.ndarray, remedy: str) -> None:
+        if bad.any():
+            body = int(np.argmax(bad.reshape(len(bad), -1).any(-1)))
+            tree = int(model.body_tree[body])
+            raise ValueError(f"body {body} of tree {tree}: {what} {np.asarray(value[body]).tolist()}; {remedy}")
+
+    count = len(model.body_mass)
+    owner = np.repeat(np.arange(len(model.tree_first)), model.tree_size)
+    start = np.cumsum(model.tree_size) - model.tree_size
+    if len(owner) != count or (model.tree_first != start).any() or (model.tree_size < 1).any():
+        raise ValueError(
+            "tree_first and tree_size do not tile the bodies; build the model with vinesim.scene.builder.assemble"
+        )
+    refuse(model.body_tree != owner, "is listed in tree", model.body_tree, "body_tree must agree with tree_first")
+    parent = model.body_parent
+    refuse(parent >= np.arange(count), "parent", parent, "a parent stands before its children (no cycles); reorder")
+    refuse((parent < -1) | ((parent >= 0) & (parent < start[owner])), "parent", parent, "name a body of the same tree")
+    refuse(~(model.body_length > 0.0), "length [m]", model.body_length, "give a positive length or leave the body out")
+    refuse(~(model.body_radius >= 0.0), "radius [m]", model.body_radius, "give radii of 0 or more")
+    refuse(~(model.body_mass > 0.0), "mass [kg]", model.body_mass, "give a positive mass or leave the body out")
+    refuse(~(model.body_inertia > 0.0), "inertia [kg m^2]", model.body_inertia, "give positive principal moments")
+    refuse(
+        model.joint_stiffness < 0.0, "stiffness [N m/rad]", model.joint_stiffness, "a spring pulls back: use 0 or more"
+    )
+    refuse(
+        model.joint_damping < 0.0, "damping [N m s/rad]", model.joint_damping, "a damper takes energy: use 0 or more"
+    )
+    for what, q in (("rest rotation", model.body_rest), ("joint rotation", state.joint_q)):
+        refuse(abs(np.linalg.norm(q, axis=-1) - 1.0) > 1e-3, what, q, "give a unit quaternion xyzw")
+    refuse(~(model.body_drag >= 0.0), "drag area [m^2]", model.body_drag, "air holds back: use 0 or more")
+    _validate_clusters(model)
+    _validate_ties(model)
+
+
+def _validate_clusters(model: Model) -> None:
+    """Clusters are all that stands behind a tree's core, each run on one bunch."""
+    core, size = model.tree_core, model.tree_size
+    if (bad := (core < 1) | (core > size)).any():
+        tree = int(np.argmax(bad))
+        raise ValueError(f"tree {tree}: tree_core {core[tree]} of {size[tree]} bodies; give 1 to tree_size (all)")
+    riding = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree] >= core[model.body_tree]
+    owner = np.full(len(model.body_mass), -1)
+    for bunch in np.flatnonzero(model.bunch_clusters > 0).tolist():
+        first, count, body = model.bunch_cluster[bunch], model.bunch_clusters[bunch], model.bunch_body[bunch]
+        parts = np.arange(first, first + count)
+        where = f"bunch {bunch}: clusters {first} to {first + count - 1}"
+        if first < 0 or first + count > len(owner) or not riding[parts].all():
+            raise ValueError(f"{where} are not behind the core of a tree; put clusters last and set tree_core")
+        if (owner[parts] >= 0).any():
+            raise ValueError(f"{where} are also bunch {owner[parts].max()}'s; give each bunch its own")
+        owner[parts] = bunch
+        parent = model.body_parent[parts]
+        if (bad := (parent != body) & ((parent < first) | (parent >= first + count))).any():
+            part = int(np.argmax(bad))
+            raise ValueError(
+                f"bunch {bunch}: cluster {parts[part]} hangs on body {parent[part]}; hang it on the bunch, body "
+                f"{body}, or on another of its clusters"
+            )
+        if not model.bunch_head_mass[bunch] > 0.0 or not (model.bunch_head_inertia[bunch] > 0.0).all():
+            raise ValueError(
+                f"bunch {bunch}: its head has mass {model.bunch_head_mass[bunch]} kg, moments "
+                f"{model.bunch_head_inertia[bunch].tolist()}; give positive ones"
+            )
+        whole = model.bunch_head_mass[bunch] + model.body_mass[parts].sum()
+        if abs(whole - model.body_mass[body]) > 1e-3 * whole:
+            raise ValueError(
+                f"bunch {bunch}: head and clusters weigh {whole:g} kg, its body {model.body_mass[body]:g} kg; "
+                "body_mass is the whole bunch's"
+            )
+    if (bad := riding & (owner < 0)).any():
+        body = int(np.argmax(bad))
+        raise ValueError(
+            f"body {body} of tree {model.body_tree[body]} is behind its core, but no bunch's cluster; list it in "
+            "bunch_cluster or raise tree_core"
+        )
+
+
+def _validate_ties(model: Model) -> None:
+    """Ties are sorted, on bodies that are there and always move, and pull back."""
+    body, count = model.tie_body, len(model.body_mass)
+
+    def refuse(bad: np.ndarray, what: str) -> None:
+        if bad.any():
+            tie = int(np.argmax(bad))
+            raise ValueError(f"tie {tie} on body {body[tie]}: {what}")
+
+    refuse((body < 0) | (body >= count), f"there are {count} bodies, counted from 0")
+    refuse(np.append(False, body[1:] < body[:-1]), "it stands behind a tie of a later body; sort ties by body")
+    tree = model.body_tree[body]
+    refuse(body - model.tree_first[tree] >= model.tree_core[tree], "a berry cluster cannot be tied; tie its bunch")
+    refuse(~(model.tie_stiffness >= 0.0), "stiffness below 0 N/m; a spring pulls back: use 0 or more")
+    wire, pieces = model.tie_wire, len(model.fixed_start)
+    refuse(
+        (wire < -1) | (wire >= pieces),
+        f"wire of {pieces} fixed pieces, counted from 0; give one of them, or -1 for none",
+    )
+    if (bad := (model.tree_piece < -1) | (model.tree_piece >= pieces)).any():
+        tree = int(np.argmax(bad))
+        raise ValueError(
+            f"tree {tree}: piece {model.tree_piece[tree]} of {pieces} fixed pieces, counted from 0; give one of them, "
+            "or -1 for none"
+        )
+    if (bad := ~(model.fixed_shear_modulus >= 0.0)).any():
+        piece = int(np.argmax(bad))
+        raise ValueError(f"fixed piece {piece}: shear modulus {model.fixed_shear_modulus[piece]} Pa; give 0 or more")
+    if (bad := ~((model.fixed_tension >= 0.0) & np.isfinite(model.fixed_tension))).any():
+        piece = int(np.argmax(bad))
+        raise ValueError(f"fixed piece {piece}: tension {model.fixed_tension[piece]} N; give 0 or more")
+    refuse(~(model.tie_damping >= 0.0), "damping below 0 N s/m; a damper takes energy: use 0 or more")

@@ -1,0 +1,161 @@
+"""Picked bunches as free bodies of MuJoCo: spheres and capsules on a body that is taken from a pool.
+
+Compiling a MuJoCo world takes some ten milliseconds, so each world has a pool of bodies that are asleep and touch
+nothing. A bunch that leaves its vine gets one of them, with all constants that MuJoCo derives from its mass and shapes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import mujoco
+import numpy as np
+
+from vinesim.core import frames
+from vinesim.rigid.static_world import ALL_BITS, CRATE_FLOOR, FREE_BUNCH, contact_friction, geom_user
+from vinesim.scene.materials import Material
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.values import Shape
+
+MAX_GEOMS = 12
+"""Shapes that a body of the pool has room for."""
+PARKING_HEIGHT = -100.0
+"""[m] Height of unused bodies of the pool: below the ground, where nothing is."""
+CONAFFINITY = ALL_BITS & ~CRATE_FLOOR
+"""Collision bits of what the shapes of a free bunch touch."""
+_SOLIMP = [0.99, 0.999, 0.001, 0.5, 2]
+"""MuJoCo's constraint impedance. TUNED: with still harder contacts a bunch is held a few micrometres deep, and a hand
+that moves loses contact for a step: fingers that hold with 25 N are then 3 mm further, and the bunch falls."""
+
+BODY_ARRAYS = (
+    "body_mass", "body_ipos", "body_iquat", "body_inertia", "body_subtreemass", "body_sameframe", "body_invweight0",
+    "body_contype", "body_conaffinity",
+)  # fmt: skip
+"""Constants that MuJoCo derives from the mass and the shapes of a body."""
+GEOM_ARRAYS = (
+    "geom_type", "geom_contype", "geom_conaffinity", "geom_condim", "geom_priority", "geom_size", "geom_pos",
+    "geom_quat", "geom_aabb", "geom_rbound", "geom_sameframe", "geom_friction", "geom_solimp", "geom_solref",
+)  # fmt: skip
+"""The same of a geom."""
+_Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FreeBunch:
+    """Mass and shapes of a picked bunch, in the frame that it had as a plant's body."""
+
+    mass: float
+    """[kg]"""
+    com: np.ndarray
+    """[3] m"""
+    inertia: np.ndarray
+    """[3] kg m^2 about the centre of mass: moments xx, yy, zz."""
+    product: np.ndarray
+    """[3] kg m^2: entries yz, zx, xy."""
+    start: np.ndarray
+    """[shape, 3] m; a capsule reaches from here to ``end``, a sphere has both in one place."""
+    end: np.ndarray
+    """[shape, 3] m"""
+    radius: np.ndarray
+    """[shape] m"""
+
+    @functools.cached_property
+    def shapes(self) -> tuple[Shape, ...]:
+        """Spheres and capsules, in the bunch's frame."""
+        axis, middle = self.end - self.start, 0.5 * (self.start + self.end)
+        half, rgba = 0.5 * np.linalg.norm(axis, axis=-1), (0.25, 0.05, 0.3, 1.0)
+        turn = frames.multiply(frames.from_x_axis(axis), _Z_TO_X)
+        return tuple(
+            Shape("capsule", (float(r), float(h)), frames.pose(p, q), rgba) if h > 0.0
+            else Shape("sphere", (float(r),), frames.pose(p), rgba)
+            for r, h, p, q in zip(self.radius, half, middle, turn, strict=True)
+        )  # fmt: skip
+
+
+def slot_name(slot: int) -> str:
+    """MuJoCo's name of a body of the pool, and of its joint."""
+    return f"free_bunch/{slot}"
+
+
+def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
+    """Add a body to the pool: asleep, with numbers that have no meaning yet; see :func:`disable_collision`."""
+    body = spec.worldbody.add_body(
+        name=slot_name(slot), pos=_parking_pose(slot)[:3], mass=0.5, ipos=[0.05, 0.0, 0.0], inertia=[1e-3, 1e-3, 1e-3],
+        explicitinertial=True, sleep=mujoco.mjtSleepPolicy.mjSLEEP_INIT,
+    )  # fmt: skip
+    body.add_freejoint(name=slot_name(slot))
+    for _ in range(MAX_GEOMS):
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0.05, 0.0, 0.0], mass=0.0, contype=FREE_BUNCH,
+            conaffinity=CONAFFINITY, userdata=geom_user(Material.BERRY),
+        )  # fmt: skip  # with collision bits, or MuJoCo makes no bounding volumes
+
+
+def _parking_pose(slot: int) -> np.ndarray:
+    """Pose [7] of an unused body, quaternion w first."""
+    return np.array([float(slot), 0.0, PARKING_HEIGHT, 1.0, 0.0, 0.0, 0.0])
+
+
+def compile_alone(bunch: FreeBunch, parameters: PhysicsParameters) -> mujoco.MjModel:
+    """A bunch in a world of its own; ``ValueError`` if it has too many shapes or none."""
+    spec = mujoco.MjSpec()
+    add_free_bunch(spec, bunch, parameters)
+    return spec.compile()
+
+
+def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsParameters) -> None:
+    """Add a bunch to a world as a free body; ``ValueError`` if it has too many shapes or none."""
+    if not 0 < len(bunch.radius) <= MAX_GEOMS:
+        raise ValueError(f"a bunch of {len(bunch.radius)} shapes; a free one has 1 to {MAX_GEOMS}")
+    friction = contact_friction(parameters.friction, parameters.bunch_rolling_arm)
+    softness = [parameters.bunch_contact_time, parameters.bunch_contact_damping_ratio]
+    yz, zx, xy = bunch.product
+    body = spec.worldbody.add_body(
+        mass=bunch.mass, ipos=bunch.com, fullinertia=[*bunch.inertia, xy, zx, yz], explicitinertial=True
+    )
+    body.add_freejoint()
+    for start, end, radius in zip(bunch.start, bunch.end, bunch.radius, strict=True):
+        kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}
+        if (start != end).any():
+            kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
+        body.add_geom(
+            type=kind, size=[float(radius), 0, 0], mass=0.0, contype=FREE_BUNCH, conaffinity=CONAFFINITY,
+            condim=6, friction=friction, priority=1, solref=softness, solimp=_SOLIMP, **place,
+        )  # fmt: skip
+    for _ in range(MAX_GEOMS - len(bunch.radius)):
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=bunch.start[0], mass=0.0, contype=FREE_BUNCH,
+            conaffinity=CONAFFINITY,
+        )  # fmt: skip
+
+
+def activate(world: mujoco.MjModel, slot: int, bunch: FreeBunch, derived: mujoco.MjModel) -> None:
+    """Give a body of the pool the mass and shapes of a bunch, with all constants that MuJoCo derives from them.
+
+    ``mj_setConst`` would derive some of them, but neither bounding volumes nor the collision bits of whole bodies; so
+    they are copied from ``derived``, the model of :func:`compile_alone`.
+    """
+    body = world.body(slot_name(slot)).id
+    for name in BODY_ARRAYS:
+        getattr(world, name)[body] = getattr(derived, name)[1]
+    geoms = slice(world.body_geomadr[body], world.body_geomadr[body] + MAX_GEOMS)
+    for name in GEOM_ARRAYS:
+        getattr(world, name)[geoms] = getattr(derived, name)
+    spare = slice(geoms.start + len(bunch.radius), geoms.stop)
+    world.geom_contype[spare] = world.geom_conaffinity[spare] = 0
+    dofs = slice(world.body_dofadr[body], world.body_dofadr[body] + 6)
+    for name in ("dof_M0", "dof_invweight0", "dof_length"):
+        getattr(world, name)[dofs] = getattr(derived, name)
+    volumes = slice(world.body_bvhadr[body], world.body_bvhadr[body] + derived.body_bvhnum[1])
+    for name in ("bvh_aabb", "bvh_child", "bvh_depth"):
+        getattr(world, name)[volumes] = getattr(derived, name)
+    world.bvh_nodeid[volumes] = np.where(derived.bvh_nodeid >= 0, derived.bvh_nodeid + geoms.start, -1)
+
+
+def disable_collision(world: mujoco.MjModel, slot: int) -> None:
+    """Let nothing touch an unused body of the pool; after compiling."""
+    body = world.body(slot_name(slot)).id
+    geoms = slice(world.body_geomadr[body], world.body_geomadr[body] + MAX_GEOMS)
+    world.body_contype[body] = world.body_conaffinity[body] = 0
+    world.geom_contype[geoms] = world.geom_conaffinity[geoms] = 0

@@ -1,0 +1,123 @@
+"""Posture of people: poses of the body parts, the arms and the fingers from the tracked points."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from vinesim.core import frames
+from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.rigid import human_kinematics as kernels
+from vinesim.rigid.human_shapes import (
+    ANKLE_HEIGHT,
+    BODY_PARTS,
+    EYES_TO_HEAD_BACK,
+    HIP_HALF_WIDTH,
+    SHANK_LENGTH,
+    SIDES,
+    THIGH_LENGTH,
+)
+from vinesim.scene import appearance
+from vinesim.scene.appearance import PHALANGES
+from vinesim.scene.values import POINT_NAMES, HumanPose
+
+VISUAL_PARTS = (
+    "neck", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm",
+    *(f"{side}_{finger}_{k + 1}" for side in SIDES for finger in appearance.FINGERS for k in range(PHALANGES)),
+)  # fmt: skip
+"""Parts that are only drawn: they connect head, chest and hands, and touch nothing."""
+EYE_HEIGHT, HIP_HEIGHT = 0.939, 0.53
+"""[1] Heights above the ground of a standing person, as shares of the person's height. READ: Winter 2009."""
+NECK_BELOW_EYES = -0.2
+"""[m] Height of the neck above the eyes. GUESSED."""
+
+
+def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
+    """Tracked points of a person of this ``height`` [m] who stands on ``root`` [7], hands before the hips, palms
+    down."""
+
+    def at(x: float, y: float, z: float) -> np.ndarray:
+        return frames.compose(root, frames.pose(np.array([x, y, z])))
+
+    side, hip = HIP_HALF_WIDTH * height, HIP_HEIGHT * height
+    return HumanPose(
+        root=np.asarray(root, float), head=at(EYES_TO_HEAD_BACK, 0.0, EYE_HEIGHT * height), hips=at(0.0, 0.0, hip),
+        left=at(0.35, 0.2, hip + 0.1), right=at(0.35, -0.2, hip + 0.1),
+        left_foot=at(0.0, side, ANKLE_HEIGHT * height), right_foot=at(0.0, -side, ANKLE_HEIGHT * height),
+    )  # fmt: skip
+
+
+def body_posture(height: float, pose: HumanPose) -> np.ndarray:
+    """Poses [part, 7] of :data:`BODY_PARTS` of a person of this ``height`` [m]; see
+    :meth:`PostureSolver.body_parts`."""
+    return PostureSolver(height).body_parts(pose)
+
+
+class PostureSolver:
+    """Inverse kinematics of one person, in kernels that are bound to the person's arrays."""
+
+    def __init__(self, height: float) -> None:
+        """``height`` [m] of the person."""
+        points, poses = len(POINT_NAMES) - 3, len(BODY_PARTS) + 2 * len(SIDES)
+        self._tracked, self._parts = np.zeros((points, 7)), np.zeros((len(BODY_PARTS), 7))
+        self._start, self._goal = np.zeros((poses, 7)), np.zeros((poses, 7))
+        self._difference = np.zeros((3, poses, 3))
+
+        def shared(data: np.ndarray) -> wp.array:
+            return wp.array(data, dtype=wp.float64, device="cpu", copy=False)
+
+        neck = wp.vec3d(-EYES_TO_HEAD_BACK, 0.0, NECK_BELOW_EYES)
+        self._pose_torso_and_legs = bind_launch(
+            kernels.pose_torso_and_legs,
+            [THIGH_LENGTH * height, SHANK_LENGTH * height, HIP_HALF_WIDTH * height, neck, shared(self._tracked)],
+            [shared(self._parts)],
+        )
+        self._pose_difference = bind_launch(
+            kernels.pose_difference,
+            [shared(self._start), shared(self._goal)],
+            [shared(rows) for rows in self._difference],
+        )
+        looks = appearance.load_human_model(height)
+        self._ends, self._closed = np.zeros((4, 7)), np.zeros(2 * len(appearance.FINGERS))
+        self._visual_parts, limbs = np.zeros((len(VISUAL_PARTS), 7)), looks.limbs
+        bones = [np.ascontiguousarray(table) for table in (looks.root, looks.length, looks.bent)]
+        self._pose_arms_and_fingers = bind_launch(
+            kernels.pose_arms_and_fingers,
+            [
+                limbs.upper_arm, limbs.forearm, *map(wp.vec3d, (limbs.shoulder, limbs.wrist, limbs.elbow)), limbs.neck,
+                wp.vec3d(limbs.nape), *map(shared, bones), shared(self._ends), shared(self._closed),
+            ],
+            [shared(self._visual_parts)],
+        )  # fmt: skip
+
+    def body_parts(self, pose: HumanPose) -> np.ndarray:
+        """Poses [part, 7] of :data:`BODY_PARTS`; knees bend forward as hips and ankles require."""
+        self._tracked[:] = pose.head, pose.hips, pose.left_foot, pose.right_foot
+        self._pose_torso_and_legs(3)
+        return self._parts.copy()
+
+    def visual_parts(
+        self, chest: np.ndarray, head: np.ndarray, hands: np.ndarray, closed: tuple[float, ...]
+    ) -> np.ndarray:
+        """Poses [part, 7] of :data:`VISUAL_PARTS`.
+
+        Args:
+            chest: its pose [7].
+            head: its pose [7].
+            hands: poses [2, 7] of the palms, left and right.
+            closed: [10] how far each finger is bent, 0 to 1, those of the left hand first.
+        """
+        self._ends[0], self._ends[1], self._ends[2:], self._closed[:] = chest, head, hands, closed
+        self._pose_arms_and_fingers(3 + len(self._closed))
+        return self._visual_parts.copy()
+
+    def difference(self, start: tuple[np.ndarray, ...], goal: tuple[np.ndarray, ...]) -> np.ndarray:
+        """From poses to poses [k, 7]: translation [m], rotation vector [rad] in world axes and in start axes; [3, k,
+        3].
+
+        ``start`` and ``goal`` are given in pieces that are concatenated. The array is reused by the next call.
+        """
+        np.concatenate(start, out=self._start)
+        np.concatenate(goal, out=self._goal)
+        self._pose_difference(len(self._start))
+        return self._difference

@@ -1,0 +1,387 @@
+"""One robot in MuJoCo's world: a planar base on servos, driven joints, sensors in links.
+
+MuJoCo's integrator damps a servo as if its D were larger by dt K, which keeps stiff servos and what they hold quiet. A
+compliant joint must swing with its own damping: for these :func:`split_damping` takes the surplus back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mujoco
+import numpy as np
+import warp as wp
+
+from vinesim.core import frames
+from vinesim.core.warp_arrays import SharedArrays, share
+from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.rigid import joint_servos
+from vinesim.rigid import recompile, self_collision
+from vinesim.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction, geom_user
+from vinesim.rigid.urdf import RobotError, check, collision_materials, collision_urdf, link_friction, shapes_of_robot
+from vinesim.scene.materials import Material
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.triangles import to_stl
+from vinesim.scene.values import RobotSpec, Shape
+from vinesim.scene.values.signals import UNLIT, Color
+
+MIN_FRICTION, MAX_FRICTION = 1e-5, 10.0
+"""[1] Bounds of a link's own coefficient: the least that MuJoCo takes, and what hardly slips. Files give up to 1e14 for
+what never does."""
+MAX_HULL_VERTICES = 64
+"""Most vertices of a mesh's convex hull, so that contacts with it have a bounded cost. TUNED."""
+CONTACT_IMPEDANCE = (0.95, 0.99)
+"""[1] Least and largest impedance of a link's contacts (MuJoCo's solimp). TUNED: with MuJoCo's 0.9 and 0.95 an arm that
+pushes against its own torso with all its effort stands 3 mm deep in it, with these less than 1 mm."""
+COPY_EFFORT_SHARE = 0.999
+"""[1] Share of its limit that the servo of a copy uses at most."""
+_PLANAR = ("x", "y", "yaw")
+
+
+class RobotBody:
+    """One robot: targets and gains of its drives, and its indices in MuJoCo's arrays."""
+
+    def __init__(self, spec: RobotSpec, code: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        """``code``: of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
+        check(spec)
+        joints, pose = len(spec.drives), np.asarray(spec.pose, float)
+        self.spec, self.code, self.parameters = spec, code, parameters
+        try:
+            self._parsed = _parse(spec, code, parameters.friction)
+        except ValueError as error:
+            raise build_error(spec, error) from error
+        self.shapes = shapes_of_robot(spec)
+        """By link: what sensors see while the indicator lights are off."""
+        self._shown_shapes: dict[Color | None, dict[str, tuple[Shape, ...]]] = {None: self.shapes}
+        self.indicator_color: Color | None = None
+        self.stiffness = np.array([d.stiffness for d in spec.drives], float)
+        self.damping = np.array([d.damping for d in spec.drives], float)
+        self.servo_limit = np.array([d.effort for d in spec.drives], float)
+        """[joint] N m or N: limit of the servos, at most ``effort_limit``."""
+        self.effort_limit = self.servo_limit.copy()
+        """[joint] N m or N: limit of the drives, servo and gravity compensation together."""
+        self.target = np.array(spec.home, float)
+        """[joint] rad or m: position to which the servos pull."""
+        self.target_velocity = np.zeros(joints)
+        self.feedforward = np.zeros(joints)
+        """[joint] N m or N: effort in addition to that of the servos."""
+        self.control = np.zeros(joints)
+        """[joint] N m or N: MuJoCo's control in the last step; less K q and D v it is the effort of the servo."""
+        self.base_target = np.array([pose[0], pose[1], frames.to_yaw(pose[3:])])
+        """[3] x, y, yaw (m, m, rad) to which the base's servos pull; moves with ``base_velocity``."""
+        self.base_height = float(pose[2])
+        """[m] z of the base; it moves in a plane."""
+        self.base_velocity = np.zeros(3)
+        """[3] vx, vy, wz (m/s, m/s, rad/s) in the base's own axes."""
+        self.base_gains = _base_gains(spec, parameters)
+        """Stiffness and damping [3] of the base's servos along x, y and about z."""
+        self._base_slip = np.array([parameters.base_slip])
+        self.has_exact_damping = np.zeros(joints, bool)
+        """[joint] bool: the integrator must not add to its damping; see :func:`split_damping`."""
+        self.damping_at_start = np.zeros(joints)
+        """[joint] N m s/rad: part of the damping that acts on the velocity at the start of the step."""
+        self.damping_at_end = np.zeros(joints)
+        """[joint] N m s/rad: part that MuJoCo applies to the velocity at its end, like the spring."""
+        self.q = self.v = self.actuator = np.zeros(0, int)
+        """[joint] Indices of the drives in MuJoCo's qpos, qvel and ctrl."""
+        self.inertia_index = np.zeros(0, int)
+        """[joint] Index of the drive's own inertia in MuJoCo's sparse mass matrix."""
+        self.base_q = self.base_v = self.base_actuator = np.zeros(0, int)
+        """[3] The same of the base's x, y and yaw."""
+        self.bodies: dict[str, int] = {}
+        self.sensor_links: list[str] = []
+        """Links with a sensor, see :meth:`RigidWorld.add_link_sensor`."""
+        self._controls_of: mujoco.MjData | None = None
+        self.remote_wrenches: dict[str, np.ndarray] = {}
+        """By link: wrenches [6] of remote people; see :meth:`RigidWorld.set_remote_wrenches`."""
+
+    @property
+    def base_slip(self) -> float:
+        """[m or rad] Offset at which the base's servos give their full effort."""
+        return float(self._base_slip[0])
+
+    @base_slip.setter
+    def base_slip(self, slip: float) -> None:
+        self._base_slip[0] = slip
+
+    @property
+    def shown_shapes(self) -> dict[str, tuple[Shape, ...]]:
+        """By link: what sensors see, with the indicator lights in their present colour; the same objects for the same
+        colour."""
+        color = self.indicator_color
+        if color not in self._shown_shapes:
+            kept = {None: self.shapes, UNLIT: self._shown_shapes.get(UNLIT, _with_lamps(self.shapes, UNLIT))}
+            self._shown_shapes = kept if color == UNLIT else kept | {color: _with_lamps(self.shapes, color)}
+        return self._shown_shapes[color]
+
+    # ------------------------------------------------------------------ in MuJoCo
+
+    def add_to(self, spec: mujoco.MjSpec) -> None:
+        """Add the robot to a world, on a planar base and with its servos."""
+        given, name = self.spec, self.spec.name
+        base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, float(given.pose[2])])
+        slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+        axes = zip(_PLANAR, (slide, slide, hinge), np.eye(3), strict=True)
+        for axis, kind, direction in axes:
+            base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
+        spec.copy_during_attach = True
+        spec.attach(self._parsed, prefix=f"{name}/", frame=base.add_frame())
+        for drive, stiffness, damping in zip(given.drives, self.stiffness, self.damping, strict=True):
+            _add_servo(spec, f"{name}/{drive.joint}", stiffness, damping, drive.effort)
+        stiffness, damping = self.base_gains
+        for i, axis in enumerate(_PLANAR):
+            _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
+
+    def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames) -> None:
+        """Find the robot's bodies and joints in a world that was compiled anew."""
+        name = self.spec.name
+        driven, planar = [f"{name}/{drive.joint}" for drive in self.spec.drives], [f"{name}:{axis}" for axis in _PLANAR]
+        joints, base = ([names.joint[joint] for joint in some] for some in (driven, planar))
+        self.q, self.v = m.jnt_qposadr[joints].astype(int), m.jnt_dofadr[joints].astype(int)
+        self.inertia_index = (m.M_rowadr + m.M_rownnz - 1)[self.v]
+        self.actuator = np.array([names.actuator[joint] for joint in driven], int)
+        self.base_q, self.base_v = m.jnt_qposadr[base].astype(int), m.jnt_dofadr[base].astype(int)
+        self.base_actuator = np.array([names.actuator[joint] for joint in planar], int)
+        mine = name + "/"
+        self.bodies = {n.removeprefix(mine): i for i, n in enumerate(names.bodies) if n.startswith(mine)}
+        self._set_gains(m)
+        self._controls_of = None
+
+    def place(self, m: mujoco.MjModel, d: mujoco.MjData, pose: np.ndarray, position: np.ndarray) -> None:
+        """Put the robot at base ``pose`` [7] and ``position`` [joint], at rest, with its targets there."""
+        self.target[:] = d.qpos[self.q] = position
+        self.base_target[:] = d.qpos[self.base_q] = pose[0], pose[1], frames.to_yaw(pose[3:])
+        d.qvel[self.v] = d.qvel[self.base_v] = 0.0
+        self.target_velocity[:] = self.base_velocity[:] = 0.0
+        self.control[:] = self.stiffness * self.target + self.feedforward
+        for joint, (source, coefficients) in self._mimics(m).items():
+            polynomial = np.polynomial.Polynomial(coefficients)
+            d.joint(joint).qpos[0] = polynomial(d.joint(source).qpos[0])
+
+    def apply_controls(self, d: mujoco.MjData, dt: float) -> None:
+        """Before a step: turn the targets into MuJoCo's controls."""
+        if self._controls_of is not d:
+            self._bind_controls(d, dt)
+        self._apply_controls(1)
+
+    def _bind_controls(self, d: mujoco.MjData, dt: float) -> None:
+        """Bind the kernel that writes MuJoCo's controls: one call instead of twenty on arrays of ten numbers."""
+        self._controls_of, (stiffness, damping) = d, self.base_gains
+        drives = SharedArrays(
+            joint_servos.JointDrives, stiffness=self.stiffness, damping_at_start=self.damping_at_start,
+            damping_at_end=self.damping_at_end, target=self.target, target_velocity=self.target_velocity,
+            feedforward=self.feedforward, v=self.v, actuator=self.actuator,
+        )  # fmt: skip
+        base = SharedArrays(
+            joint_servos.BaseDrive, stiffness=stiffness, damping=damping, velocity=self.base_velocity,
+            slip=self._base_slip, q=self.base_q, actuator=self.base_actuator,
+        )  # fmt: skip
+        self._apply_controls = bind_launch(
+            joint_servos.apply_controls,
+            [dt, drives.struct, base.struct, share(d.qpos, wp.float64), share(d.qvel, wp.float64)],
+            [share(values, wp.float64) for values in (self.control, self.base_target, d.ctrl)],
+        )
+
+    def transmitted_effort(self, d: mujoco.MjData) -> np.ndarray:
+        """[joint] N m or N: effort of the drives in the last step, servo and gravity compensation."""
+        # implicit servos: over the step they give the force of its end, not that of its start
+        servo = self.control - self.stiffness * d.qpos[self.q] - self.damping_at_end * d.qvel[self.v]
+        servo = np.minimum(np.maximum(servo, -self.servo_limit), self.servo_limit)  # in a third of np.clip's time
+        return np.minimum(np.maximum(servo + d.qfrc_gravcomp[self.v], -self.effort_limit), self.effort_limit)
+
+    def take_over(self, other: RobotBody) -> None:
+        """Go on as ``other``, the same robot with other shapes: its targets, gains, limits and sensors."""
+        for name in (
+            "stiffness", "damping", "servo_limit", "target", "target_velocity", "feedforward", "control", "base_target",
+            "base_velocity", "has_exact_damping",
+        ):  # fmt: skip
+            getattr(self, name)[:] = getattr(other, name)
+        self.base_slip, self.base_height = other.base_slip, other.base_height
+        self.indicator_color = other.indicator_color
+        self.sensor_links, self.remote_wrenches = other.sensor_links, other.remote_wrenches
+
+    # ------------------------------------------------------------------ commands
+
+    def command(self, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
+        """Set the targets of the servos: ``position`` [joint] and ``velocity`` [joint] (zero unless given)."""
+        self.target[:] = position
+        self.target_velocity[:] = 0.0 if velocity is None else velocity
+
+    def follow_remote(
+        self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> None:
+        """Pull a copy to the received state: ``base_q`` [7], ``base_qd`` [6] world axes, ``position``, ``velocity``
+        [joint]."""
+        self.command(position, velocity)
+        # MuJoCo does not take a servo as implicit that reaches its limit at the start of the step: a light joint that
+        # catches up would be thrown past its target
+        servo, most, weight = self.servo_limit, self.effort_limit, d.qfrc_gravcomp[self.v]
+        low, high = np.maximum(-servo, -most - weight), np.minimum(servo, most - weight)
+        pull = self.stiffness * (self.target - d.qpos[self.q]) + self.damping * (self.target_velocity - d.qvel[self.v])
+        excess = pull - np.clip(pull, COPY_EFFORT_SHARE * low, COPY_EFFORT_SHARE * high)
+        self.target -= excess / np.where(self.stiffness > 0.0, self.stiffness, np.inf)
+        yaw = frames.to_yaw(base_q[3:])
+        turns = np.round((d.qpos[self.base_q[2]] - yaw) / (2.0 * np.pi))
+        self.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
+        c, s = np.cos(yaw), np.sin(yaw)
+        self.base_velocity[:] = c * base_qd[0] + s * base_qd[1], c * base_qd[1] - s * base_qd[0], base_qd[5]
+        self.base_slip = self.parameters.remote_base_slip
+
+    def set_gains(
+        self,
+        m: mujoco.MjModel,
+        d: mujoco.MjData,
+        gains: tuple[np.ndarray, np.ndarray, np.ndarray],
+        limit: np.ndarray | None,
+        exact: np.ndarray | None,
+    ) -> None:
+        """Take other ``gains``: stiffness, damping, feedforward; see :meth:`RigidWorld.set_gains`.
+
+        The effort of the last step is kept, so that measurements of it do not change.
+        """
+        before = self.stiffness.copy()
+        self.stiffness[:], self.damping[:], self.feedforward[:] = gains
+        if limit is not None:
+            self.servo_limit[:] = np.minimum(limit, self.effort_limit)
+        if exact is not None:
+            self.has_exact_damping[:] = exact
+        q, v = d.qpos[self.q], d.qvel[self.v]
+        given = self.control - before * q - self.damping_at_end * v
+        self._set_gains(m)
+        self.control[:] = given + self.stiffness * q + self.damping_at_end * v
+
+    def set_remote_wrenches(self, d: mujoco.MjData, wrenches: dict[str, np.ndarray]) -> None:
+        """Set the wrenches [6] of remote people by link; :class:`RobotError` if there is no such link."""
+        if unknown := sorted(wrenches.keys() - self.bodies.keys()):
+            raise RobotError(f"robot {self.spec.name!r} is pushed at {unknown[0]!r}, a link that it has not")
+        for link in self.remote_wrenches.keys() - wrenches.keys():
+            d.xfrc_applied[self.bodies[link]] = 0.0
+        for link, wrench in wrenches.items():
+            d.xfrc_applied[self.bodies[link]] = wrench
+        self.remote_wrenches = wrenches
+
+    def remote_effort(self, m: mujoco.MjModel, d: mujoco.MjData) -> np.ndarray:
+        """[dof] generalised force of the wrenches of remote people."""
+        total = np.zeros(m.nv)
+        for link, wrench in self.remote_wrenches.items():
+            body = self.bodies[link]
+            mujoco.mj_applyFT(m, d, wrench[:3], wrench[3:], d.xipos[body], body, total)
+        return total
+
+    # ------------------------------------------------------------------ inside
+
+    def _set_gains(self, m: mujoco.MjModel) -> None:
+        """Write gains and limits into MuJoCo's model."""
+        dt = m.opt.timestep
+        at_end, at_start = split_damping(
+            self.stiffness, self.damping, m.dof_damping[self.v], m.dof_armature[self.v], dt
+        )
+        self.damping_at_end[:] = np.where(self.has_exact_damping, at_end, self.damping)
+        self.damping_at_start[:] = np.where(self.has_exact_damping, at_start, 0.0)
+        m.actuator_biasprm[self.actuator, 1] = -self.stiffness
+        m.actuator_biasprm[self.actuator, 2] = -self.damping_at_end
+        m.actuator_forcerange[self.actuator, 0] = -self.servo_limit
+        m.actuator_forcerange[self.actuator, 1] = self.servo_limit
+
+    def _mimics(self, m: mujoco.MjModel) -> dict[str, tuple[str, np.ndarray]]:
+        """Joints that mimic another joint: name -> (source, coefficients of the polynomial [5])."""
+        joints = {}
+        for e in np.flatnonzero(m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
+            joint, source = m.joint(m.eq_obj1id[e]).name, m.joint(m.eq_obj2id[e]).name
+            if joint.startswith(self.spec.name + "/"):
+                joints[joint] = (source, m.eq_data[e, :5].copy())
+        return joints
+
+
+def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
+    """A robot without base and servos from its URDF; its shapes carry the collision ``code``."""
+    text = collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives))
+    child = mujoco.MjSpec.from_string(text, assets={name: to_stl(corners) for name, corners in given.meshes.items()})
+    own_friction = link_friction(given.urdf)
+    materials = {link: iter(found) for link, found in collision_materials(given.urdf).items()}
+    for geom in child.geoms:
+        geom.contype, geom.conaffinity = code, ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
+        own = own_friction.get(geom.parent.name)
+        geom.friction = contact_friction(friction if own is None else min(max(own, MIN_FRICTION), MAX_FRICTION))
+        material = next(materials.get(geom.parent.name, iter(())), Material.UNKNOWN)
+        geom.userdata = geom_user(material, has_own_friction=own is not None)
+        geom.priority = int(own is not None)  # or MuJoCo would take the larger coefficient of the two in contact
+        geom.solimp[:2] = CONTACT_IMPEDANCE
+    for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        mesh.maxhullvert = MAX_HULL_VERTICES
+    for body in child.bodies[1:]:
+        body.gravcomp = 1.0
+    driven = {drive.joint: drive for drive in given.drives}
+    for joint in child.joints:
+        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
+        if joint.name in driven:
+            joint.actgravcomp = True
+            joint.armature = driven[joint.name].armature
+            joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
+            joint.actfrcrange = [-driven[joint.name].effort, driven[joint.name].effort]
+    if not given.is_copy:
+        self_collision.let_links_collide(child, given, code)
+    return child
+
+
+def _base_gains(spec: RobotSpec, parameters: PhysicsParameters) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness and damping [3] of the base's servos along x, y and about z."""
+    force, moment = spec.base_effort
+    stiffness = np.array([force, force, moment]) / parameters.base_slip
+    return stiffness, parameters.base_damping_time * stiffness
+
+
+def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, effort: float) -> None:
+    """Effort = control - stiffness q - damping v, cut off at ``effort``; the control carries both targets."""
+    bias = np.zeros(10)
+    bias[1:3] = -stiffness, -damping
+    gain = np.zeros(10)
+    gain[0] = 1.0
+    spec.add_actuator(
+        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED, gainprm=gain, biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=bias,
+        forcelimited=True, forcerange=[-effort, effort], ctrllimited=False,
+    )  # fmt: skip
+
+
+def split_damping(
+    stiffness: np.ndarray, damping: np.ndarray, friction: np.ndarray, armature: np.ndarray, dt: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Split a servo's damping so that the joint swings as asked: parts [joint] at the end and at the start of the step.
+
+    With the spring at the end of the step, q + dt v, the scheme damps as if D were larger by dt K. So much is taken
+    from the part at the end, which makes the spring's share explicit. Half of the damping (``friction`` of the joint
+    included) acts on the velocity at the start: the trapezoidal rule, whose decay is right to third order in dt D / M.
+    The price is that the scheme is not stable for every inertia M. A - B >= dt K / 2 - 2 M / dt is needed, A and B
+    being the parts at the end (without - dt K) and at the start; M is at least ``armature``, so B is cut down, and if
+    that does not suffice A is raised: a joint that is too stiff for the step is damped more than asked.
+    """
+    asked = damping + friction
+    needed = np.maximum(0.0, 0.5 * dt * stiffness - 2.0 * armature / dt)
+    late = np.clip(0.5 * (asked - needed), 0.0, 0.5 * armature / dt)
+    return np.maximum(asked, needed) - late - friction - dt * stiffness, late
+
+
+def build_error(spec: RobotSpec, error: ValueError) -> RobotError:
+    """What MuJoCo says against a robot, in one line."""
+    return RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {' '.join(str(error).split())}")
+
+
+def _with_lamps(shapes: dict[str, tuple[Shape, ...]], color: Color | None) -> dict[str, tuple[Shape, ...]]:
+    """Shapes by link with indicator lights of a colour, which shine unless it is :data:`UNLIT`; a link without any
+    keeps its tuple."""
+    if color is None:
+        return shapes
+    red, green, blue = (part / 255.0 for part in color)
+    surface = "plastic" if color == UNLIT else "lamp"
+
+    def lit(pieces: tuple[Shape, ...]) -> tuple[Shape, ...]:
+        if not any(piece.is_indicator for piece in pieces):
+            return pieces
+        return tuple(
+            dataclasses.replace(piece, rgba=(red, green, blue, 1.0), surface=surface) if piece.is_indicator else piece
+            for piece in pieces
+        )
+
+    return {link: lit(pieces) for link, pieces in shapes.items()}

@@ -1,0 +1,102 @@
+"""Batches of primitives laid out in clusters: runs of at most 24 primitives of one kind, tree and bunch."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from vinesim.sensors.primitives.primitive_batches import Batch
+
+MAX_CLUSTER = 24
+"""Most primitives of one cluster."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ClusterLayout:
+    """All primitives in the order of their clusters, in the frames of their carriers."""
+
+    a: np.ndarray
+    """[primitive, 4] float32; ``a`` to ``d`` as in :mod:`vinesim.kernels.raster.primitives`."""
+    b: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    material: np.ndarray
+    """[primitive] int32, a number of :mod:`vinesim.kernels.shading.materials`."""
+    tint: np.ndarray
+    """[primitive, 3] linear RGB reflectance."""
+    organ: np.ndarray
+    """[primitive] int32"""
+    label: np.ndarray
+    """[primitive] int32"""
+    carrier: np.ndarray
+    """[primitive] int32, row of the pose that moves it."""
+    first: np.ndarray
+    """[cluster] int32, index of its first primitive."""
+    size: np.ndarray
+    """[cluster] int32, number of its primitives."""
+    kind: np.ndarray
+    """[cluster] int32"""
+    owner: np.ndarray
+    """[cluster] int32, tree that moves it; -1 for what no tree moves."""
+    bunch: np.ndarray
+    """[cluster] int32, bunch it shows while that hangs; -1 for none."""
+    is_rigid: np.ndarray
+    """[cluster] bool, whether it is part of a rigid body."""
+
+
+def lay_out(fixed: Sequence[Batch], moving: Sequence[Batch], static_carrier: int) -> ClusterLayout:
+    """Clusters of the plants and the static scene (``fixed``), then of rigid bodies (``moving``).
+
+    Neither groups nor bunches mix in a cluster. ``static_carrier`` is the carrier of what never moves.
+    """
+    whole: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
+    }
+    clusters: dict[str, list[np.ndarray]] = {
+        name: [] for name in ("first", "size", "kind", "owner", "bunch", "is_rigid")
+    }
+    total = 0
+    for number, batch in enumerate([*fixed, *moving]):
+        rigid = number >= len(fixed)
+        order = np.lexsort((batch.bunch, batch.group))
+        group, bunch = batch.group[order], batch.bunch[order]
+        first, size = _runs(group, bunch)
+        static = not rigid and bool((batch.carrier == static_carrier).all())
+        clusters["first"].append(total + first)
+        clusters["size"].append(size)
+        clusters["kind"].append(np.full(len(first), batch.kind))
+        clusters["owner"].append(np.full(len(first), -1) if static or rigid else group[first])
+        clusters["bunch"].append(bunch[first])
+        clusters["is_rigid"].append(np.full(len(first), rigid))
+        for name, parts in whole.items():
+            parts.append(getattr(batch, name)[order])
+        total += len(batch)
+    joined = {name: np.concatenate(parts) for name, parts in (whole | clusters).items()}
+    for name in ("material", "organ", "label", "carrier", "first", "size", "kind", "owner", "bunch"):
+        joined[name] = joined[name].astype(np.int32)
+    return ClusterLayout(**joined)
+
+
+def join_rigid(layouts: Sequence[ClusterLayout], carriers: Sequence[int], first_row: int) -> ClusterLayout:
+    """Layouts of rigid bodies, one after the other from the primitive ``first_row`` on, each on its own carrier."""
+    joined = {
+        field.name: np.concatenate([getattr(one, field.name) for one in layouts])
+        for field in dataclasses.fields(ClusterLayout)
+    }
+    rows = [len(one.label) for one in layouts]
+    starts = first_row + np.cumsum(rows) - rows
+    joined["carrier"] = np.repeat(carriers, rows).astype(np.int32)
+    joined["first"] += np.repeat(starts, [len(one.first) for one in layouts]).astype(np.int32)
+    return ClusterLayout(**joined)
+
+
+def _runs(group: np.ndarray, bunch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First index and size [cluster] of runs of equal group and bunch, cut after :data:`MAX_CLUSTER` primitives."""
+    starts = np.flatnonzero(np.r_[True, (group[1:] != group[:-1]) | (bunch[1:] != bunch[:-1])])
+    lengths = np.diff(np.r_[starts, len(group)])
+    parts = (lengths + MAX_CLUSTER - 1) // MAX_CLUSTER
+    inner = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
+    first = np.repeat(starts, parts) + inner * MAX_CLUSTER
+    return first, np.minimum(MAX_CLUSTER, np.repeat(lengths, parts) - inner * MAX_CLUSTER)

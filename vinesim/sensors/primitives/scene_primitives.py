@@ -1,0 +1,430 @@
+"""Everything a camera or lidar can see, as analytic primitives carried by plant bodies and rigid bodies.
+
+:class:`Primitives` is built once from a :class:`~vinesim.scene.model.Model` and follows the world through
+:meth:`Primitives.update`: one Warp launch moves the clusters of the trees and rigid bodies that moved, and nothing
+else. Plants come from :mod:`vinesim.core.disk_cache` where they were laid out before; another list of rigid bodies lays
+out those, and no plant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pathlib
+
+import numpy as np
+import warp as wp
+
+from vinesim.core import disk_cache, frames
+from vinesim.kernels.raster import primitives, transform_primitives
+from vinesim.kernels.shading import materials
+from vinesim.scene import berries
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.scene.state import State
+from vinesim.scene.values import RigidVisual, Shape, Snapshot
+from vinesim.sensors.primitives import textures
+from vinesim.sensors.primitives.bunch_primitives import Ripeness, bunch_batches, bunch_bodies
+from vinesim.sensors.primitives.leaf_area_density import LeafDensity
+from vinesim.sensors.primitives.plant_primitives import cane_batch, leaf_batches
+from vinesim.sensors.primitives.primitive_batches import Batch, placeholder_batch
+from vinesim.sensors.primitives.primitive_clusters import ClusterLayout, join_rigid, lay_out
+from vinesim.sensors.primitives.rigid_primitives import rigid_batches
+from vinesim.sensors.primitives.static_primitives import (
+    grass_batch,
+    litter_batch,
+    row_layout,
+    trellis_batches,
+    wire_batch,
+)
+from vinesim.sensors.raster import renderer_selection
+from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
+from vinesim.wires.wire_segments import wire_segments
+
+_SKY_OF_RIGID = 0.7
+"""Share of the sky that robots, people and boxes see: GUESSED, nothing is baked for them."""
+_RIGID_ROOM = 2048
+"""Rigid primitives for which there is room from the start."""
+_PRIMITIVE_COLUMNS = {
+    **{f"local_{name}": wp.vec4 for name in "abcd"}, **dict.fromkeys("abcd", wp.vec4), "tint": wp.vec3,
+    "lower": wp.vec3, "upper": wp.vec3, "sky": wp.float32,
+    **dict.fromkeys(("kind", "carrier", "label", "organ", "material"), wp.int32),
+}  # fmt: skip
+"""Values of each primitive: ``local_`` in the frame of its carrier, the others in the world."""
+_ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
+"""Fields of :class:`ClusterLayout` with a value for each primitive."""
+_CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
+"""Values of each cluster."""
+_TEXTURES = (
+    "leaf_texture", "noise_texture", "soil_texture", "rows", "ground_sky", "ground_x", "ground_y", "ground_cell",
+)  # fmt: skip
+"""Fields of ``Materials`` that are the same for all primitives."""
+
+
+class Primitives:
+    """All primitives of a vineyard and its actors, posed in the world (see
+    :mod:`vinesim.kernels.raster.primitives`)."""
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        grass: float = 90.0,
+        device: str = "cpu",
+        ripeness: Ripeness | None = None,
+        renderer: str = "warp",
+    ) -> None:
+        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
+        the fruit: all of it is ripe unless given; ``renderer``: see :mod:`~vinesim.sensors.raster.renderer_selection`.
+        """
+        self.model, self.device, self._ripeness = model, device, ripeness
+        self.rasterizer = renderer_selection.create_rasterizer(renderer, device)
+        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`
+        does so itself."""
+        self._bodies, self._wires = len(model.body_mass), wire_segments(model)
+        self._static_carrier = self._bodies + len(self._wires)
+        """Carrier of the static scene; before it are those of plants' bodies and of segments of wires, behind it those
+        of rigid bodies."""
+        self._wires_away = np.zeros(0, int)
+        """Segments [k] that were away from where they were drawn."""
+        self._visuals: tuple[RigidVisual, ...] = ()
+        self._attached = np.ones(len(model.bunch_body), bool)
+        self._picked_shapes: dict[int, np.ndarray] = {}
+        self._rigid: dict[tuple[Organ, int, int], tuple[tuple[Shape, ...], ClusterLayout | None]] = {}
+        """Shapes and clusters of the rigid bodies by organ, index and identity of the shapes."""
+        self._moved = np.zeros(0, np.int64)
+        outline, hull = textures.leaf_outlines()
+        self._outline, self._hull = wp.array(outline, device=device), wp.array(hull, dtype=wp.vec2, device=device)
+        self._body_q = State.at_rest(model).body_q
+        self.pose_version = 0
+        """Counts changes of any pose."""
+        self.layout_version = 0
+        """Counts changes of the set of primitives."""
+        self._columns: dict[str, wp.array] = {}
+        """All values of primitives and clusters by name, with room for more rigid bodies than there are now."""
+        self._poses = np.zeros((0, 7), np.float32)
+        self._textures = materials.Materials()
+        self._textures.rows = wp.vec2(*row_layout(model))
+        self._textures.leaf_texture, self._textures.noise_texture, self._textures.soil_texture = (
+            wp.array(table, dtype=wp.vec4, device=device)
+            for table in (textures.leaf_texture(), textures.noise_texture(), textures.soil_texture())
+        )
+        if ripeness is None:
+            baked = disk_cache.load_or_make("primitives", _digest(model, grass, device), lambda: self._bake(grass))
+        else:
+            baked = self._bake(grass)
+        self._open(baked)
+        self._pose(np.arange(len(self.cluster_first)))
+
+    # -- reading
+
+    @property
+    def count(self) -> int:
+        """How many primitives there are."""
+        return len(self.label)
+
+    def counts_by_kind(self) -> dict[str, int]:
+        """How many there are of each kind."""
+        kinds = self.shapes.kind.numpy()
+        return {name: int((kinds == kind).sum()) for name, kind in KINDS.items()}
+
+    def clusters_shown(self) -> np.ndarray:
+        """Whether each cluster is drawn [cluster]; those of picked bunches are not."""
+        return self.ball.numpy()[:, 3] > 0.0
+
+    def local_columns(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
+        """Some primitives in the frames of their carriers: ``a`` to ``d`` [n, 4] (see
+        :mod:`vinesim.kernels.raster.primitives`), ``tint`` [n, 3], ``sky``, ``material``, ``label``, ``carrier`` [n].
+        """
+        names = {name: f"local_{name}" for name in "abcd"}
+        names |= {name: name for name in ("tint", "sky", "material", "label", "carrier")}
+        return {name: self._columns[column].numpy()[rows] for name, column in names.items()}
+
+    def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
+        """Poses [..., 7] m, 1 of the carriers of some primitives [...]: a body of a plant, a segment of wire, a rigid
+        body, or the world."""
+        return self._poses[self._carrier.numpy()[primitive]].astype(float)
+
+    # -- building
+
+    def _bake(self, grass: float) -> disk_cache.Arrays:
+        """Plants and the static scene laid out in clusters, and the share of the sky that each primitive, the far end
+        of each piece of wood, and the ground see through the leaves, in the shape at rest."""
+        low, high = _ground_extent(self.model)
+        layout = lay_out(self._plant_batches(grass, low, high), [], self._static_carrier)
+        baked = {field.name: getattr(layout, field.name) for field in dataclasses.fields(layout)}
+        baked["sky"] = np.zeros(len(layout.label), np.float32)
+        baked["ground_sky"] = np.zeros((1, 1), np.float32)
+        self._open(baked)
+        self._pose(np.arange(len(self.cluster_first)))
+
+        low, high = low - 3.0, high + 3.0
+        posed, kind = self.shapes.a.numpy(), self.shapes.kind.numpy()
+        blades = posed[(layout.organ == int(Organ.LEAF)) & (kind == LEAF)]
+        canopy = LeafDensity(blades, low, high, self.device)
+        # light runs on from one piece of wood to the next: cones know the sky at their far end too
+        wood = np.flatnonzero(kind == CONE)
+        far = canopy.visible_sky(self.shapes.b.numpy()[wood, :3])
+        baked["c"][wood, 2:] = np.stack([far, np.ones(len(wood))], 1)
+        baked["sky"] = canopy.visible_sky(posed[:, :3])
+        step = _ground_step(low, high)
+        x, y = np.meshgrid(np.arange(low[0], high[0], step), np.arange(low[1], high[1], step))
+        ground = canopy.visible_sky(np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], 1))
+        baked["ground_sky"] = ground.reshape(x.shape)
+        return baked
+
+    def _plant_batches(self, grass: float, low: np.ndarray, high: np.ndarray) -> list[Batch]:
+        """Plants, trellis, grass and fallen leaves on the ground from ``low`` to ``high`` [2] m."""
+        model, static = self.model, self._static_carrier
+        batches = [cane_batch(model), *leaf_batches(model)]
+        every = np.arange(len(model.bunch_body))
+        pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
+        batches += bunch_batches(model, every, None, pieces, model.body_tree[model.bunch_body], self._ripeness)
+        around = [*trellis_batches(model, static), wire_batch(model, self._wires, self._bodies, len(model.tree_first))]
+        if grass > 0.0:
+            age = float(model.leaf_age.mean()) if len(model.leaf_age) else 0.0
+            around += [grass_batch(row_layout(model), low, high, grass, static), litter_batch(low, high, age, static)]
+        batches += [b for b in around if b is not None]
+        return [b for b in batches if len(b)] or [placeholder_batch(static)]
+
+    def _open(self, baked: disk_cache.Arrays) -> None:
+        """Take over what :meth:`_bake` made; poses are not yet applied."""
+        low, high = _ground_extent(self.model)
+        low, high = low - 3.0, high + 3.0
+        self._textures.ground_sky = wp.array(baked["ground_sky"], dtype=float, device=self.device)
+        self._textures.ground_x, self._textures.ground_y = float(low[0]), float(low[1])
+        self._textures.ground_cell = float(_ground_step(low, high))
+        self.plant_count = len(baked["label"])
+        """How many primitives are plants or the static scene; those of rigid bodies follow them."""
+        names = [field.name for field in dataclasses.fields(ClusterLayout)]
+        plants = ClusterLayout(**{name: baked[name] for name in names})
+        self._columns = {}
+        self._reserve(plants, 0)
+        self._write(plants, baked["sky"], 0, 0)
+        self._plant_lamps = np.flatnonzero(plants.material == int(materials.LAMP))
+        nothing = np.zeros(0, np.float32)  # the columns hold these: hundreds of megabytes in a large vineyard
+        self._plants = dataclasses.replace(plants, **dict.fromkeys(_ONLY_IN_COLUMNS, nothing))
+        owners = len(self.model.tree_first) + len(self.model.fixed_start)  # trees, then pieces of wire
+        self._by_owner = np.argsort(self._plants.owner, kind="stable")
+        self._owner_start = np.searchsorted(self._plants.owner[self._by_owner], np.arange(owners + 1))
+        self._poses = np.zeros((0, 7), np.float32)
+        self._build(())
+
+    def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
+        """Lay out the primitives of rigid bodies behind those of the plants, which stay as they are."""
+        plants = self._plants
+        rows, clusters = self.plant_count, len(plants.first)
+        bodies = self._lay_out_rigid(visuals)
+        empty = not bodies
+        rigid = plants if empty else join_rigid([one for _, one in bodies], [carrier for carrier, _ in bodies], rows)
+        if not empty:
+            if rows + len(rigid.label) > len(self._columns["label"]) or clusters + len(rigid.first) > len(
+                self._columns["first"]
+            ):
+                self._reserve(plants, len(rigid.label))
+            self._write(rigid, np.full(len(rigid.label), _SKY_OF_RIGID, np.float32), rows, clusters)
+        parts = [plants] if empty else [plants, rigid]
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts])
+            for name in ("first", "size", "kind", "owner", "bunch")
+        }
+        end = rows if empty else rows + len(rigid.label)
+        self.label, self.organ = (self._columns[name][:end].numpy() for name in ("label", "organ"))
+        self.cluster_first, self.cluster_size, self.cluster_kind = joined["first"], joined["size"], joined["kind"]
+        self._owner, self.cluster_bunch = joined["owner"], joined["bunch"]
+        self.rigid_clusters = np.arange(clusters, len(self.cluster_first))
+        version = np.zeros(len(self.cluster_first), np.int64)
+        if self.layout_version:
+            version[:clusters] = self.cluster_version[:clusters]
+        self.cluster_version = version
+        """:attr:`pose_version` at which each cluster moved last."""
+        lamps = self._plant_lamps
+        if not empty:
+            lamps = np.concatenate([lamps, np.flatnonzero(rigid.material == int(materials.LAMP)) + rows])
+        self.lamp_primitives = lamps
+        """Primitives that emit light."""
+        self._bind()
+        poses = np.zeros((self._static_carrier + 1 + len(visuals), 7), np.float32)
+        poses[:, 6] = 1.0
+        if len(self._poses):
+            poses[: self._static_carrier] = self._poses[: self._static_carrier]
+        else:
+            poses[: self._bodies], poses[self._bodies : self._static_carrier] = self._body_q, self._wires.rest_q
+        self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
+        self._poses = self._pose_array.numpy() if self._pose_array.device.is_cpu else poses
+        """[carrier, 7]; on a CPU the kernels read this very memory."""
+        self._visuals = visuals
+        self.layout_version += 1
+
+    def _lay_out_rigid(self, visuals: tuple[RigidVisual, ...]) -> list[tuple[int, ClusterLayout]]:
+        """Carrier and clusters of each rigid body that has a shape; one that was there before is not laid out anew."""
+        picked, known, found = self._picked_bunch_shapes(visuals), {}, []
+        for number, visual in enumerate(visuals):
+            key = visual.organ, visual.index, id(visual.shapes)
+            if key not in self._rigid:
+                batches = rigid_batches(self.model, (visual,), 0, 0, picked, self._ripeness)
+                layout = lay_out([], batches, -1) if batches else None
+                self._rigid[key] = visual.shapes, layout
+            known[key] = self._rigid[key]
+            if (layout := known[key][1]) is not None:
+                found.append((self._static_carrier + 1 + number, layout))
+        self._rigid = known
+        return found
+
+    def _reserve(self, plants: ClusterLayout, rigid: int) -> None:
+        """Device memory for the plants and twice as many rigid primitives as given; that of the plants is kept."""
+        kept, room = self._columns, max(2 * rigid, _RIGID_ROOM)
+        for names, count in ((_PRIMITIVE_COLUMNS, self.plant_count), (_CLUSTER_COLUMNS, len(plants.first))):
+            for name, kind in names.items():
+                column = wp.zeros(count + room, dtype=kind, device=self.device)
+                if name in kept:
+                    wp.copy(column, kept[name], count=count)
+                self._columns = self._columns | {name: column}
+
+    def _write(self, layout: ClusterLayout, sky: np.ndarray, row: int, cluster: int) -> None:
+        """Write primitives and clusters to the device, from a ``row`` and a ``cluster`` on."""
+        values = {name: getattr(layout, name) for name in ("material", "tint", "organ", "label", "carrier")}
+        values |= {f"local_{name}": getattr(layout, name) for name in "abcd"}
+        values |= {"kind": np.repeat(layout.kind, layout.size), "sky": sky}
+        for name, column in values.items():
+            self._columns[name][row : row + len(sky)].assign(np.ascontiguousarray(column))
+        values = {"first": layout.first, "size": layout.size, "cluster_kind": layout.kind}
+        values["shown"] = _clusters_shown(layout.bunch, self._attached)
+        for name, column in values.items():
+            end = cluster + len(layout.first)
+            self._columns[name][cluster:end].assign(np.ascontiguousarray(column.astype(np.int32)))
+
+    def _bind(self) -> None:
+        """Structs of the primitives and clusters that there are now, in the memory of the columns."""
+        column = {name: self._columns[name][: len(self.label)] for name in _PRIMITIVE_COLUMNS}
+        column |= {name: self._columns[name][: len(self.cluster_first)] for name in _CLUSTER_COLUMNS}
+        self._local, self.shapes, self.clusters = primitives.Shapes(), primitives.Shapes(), primitives.Clusters()
+        for name in "abcd":
+            setattr(self._local, name, column[f"local_{name}"])
+            setattr(self.shapes, name, column[name])
+        for table in (self._local, self.shapes):
+            table.kind, table.outline, table.hull = column["kind"], self._outline, self._hull
+        self.clusters.first, self.clusters.size = column["first"], column["size"]
+        self.clusters.kind, self.clusters.shown = column["cluster_kind"], column["shown"]
+        self._carrier, self.labels, self.organs = column["carrier"], column["label"], column["organ"]
+        self.lower, self.upper, self.ball = column["lower"], column["upper"], column["ball"]
+        self.materials = materials.Materials()
+        self.materials.material, self.materials.tint = column["material"], column["tint"]
+        self.materials.sky = column["sky"]
+        for name in _TEXTURES:
+            setattr(self.materials, name, getattr(self._textures, name))
+
+    def _picked_bunch_shapes(self, visuals: tuple[RigidVisual, ...]) -> dict[int, np.ndarray]:
+        """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
+        picked = {}
+        for bunch in (visual.index for visual in visuals if visual.organ == Organ.BUNCH):
+            q = np.asarray(self._body_q[bunch_bodies(self.model, bunch)], float)
+            picked[bunch] = self._picked_shapes.get(bunch, frames.compose(frames.inverse(q[0]), q))
+        self._picked_shapes = picked
+        return picked
+
+    # -- following the world
+
+    def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
+        """Take over the poses of ``snapshot``; returns the clusters [k] that moved.
+
+        ``moved`` are the trees that may have moved since the last call (default: those of this snapshot and
+        the one before). A caller that skips snapshots must gather them from all of these.
+        """
+        body_q, visual_q = snapshot.body_q, np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
+        trees = np.union1d(snapshot.moved_trees if moved is None else moved, self._moved).astype(np.int64)
+        self._moved = np.asarray(snapshot.moved_trees, np.int64)
+        new_visuals = snapshot.visuals is not self._visuals
+        if new_visuals:
+            self._body_q = body_q
+            self._build(snapshot.visuals)
+            # a world that is new, or was set back, need not say what moved
+            differs = (np.asarray(body_q, np.float32) != self._poses[: self._bodies]).any(1)
+            trees = np.union1d(trees, self.model.body_tree[differs])
+        attached = np.asarray(snapshot.bunch_attached, bool)
+        changed = np.flatnonzero(attached != self._attached)
+        if len(changed):
+            self._attached = attached.copy()
+            self.clusters.shown.assign(_clusters_shown(self.cluster_bunch, attached))
+        wires = np.union1d(self._wires_away, snapshot.wires.segment).astype(int)
+        pieces = np.unique(self._wires.piece[wires])
+        dirty = self._clusters_of(np.concatenate([trees, len(self.model.tree_first) + pieces]))
+        if len(changed):
+            dirty = np.union1d(dirty, np.flatnonzero(np.isin(self.cluster_bunch, changed)))
+        first_visual = self._static_carrier + 1
+        if new_visuals or not np.array_equal(self._poses[first_visual:], visual_q):
+            dirty = np.concatenate([dirty, self.rigid_clusters])
+        if len(dirty):
+            self._poses[: self._bodies] = body_q
+            self._poses[self._bodies + wires] = self._wires.poses(wires, snapshot.wires)
+            self._wires_away = snapshot.wires.segment
+            self._poses[first_visual:] = visual_q
+            self._pose(dirty)
+        return dirty
+
+    def _clusters_of(self, owners: np.ndarray) -> np.ndarray:
+        """Clusters that the given trees, and pieces of wire, which are numbered behind all trees, [k] move."""
+        start, size = self._owner_start[owners], self._owner_start[owners + 1] - self._owner_start[owners]
+        inner = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
+        return self._by_owner[np.repeat(start, size) + inner]
+
+    def _pose(self, dirty: np.ndarray) -> None:
+        if not self._pose_array.device.is_cpu:
+            self._pose_array.assign(self._poses)
+        wp.launch(
+            transform_primitives.pose_clusters,
+            len(dirty),
+            inputs=[
+                self._local,
+                self.clusters,
+                self._carrier,
+                wp.array(dirty.astype(np.int32), device=self.device),
+                self._pose_array,
+            ],
+            outputs=[self.shapes.a, self.shapes.b, self.shapes.c, self.shapes.d, self.lower, self.upper, self.ball],
+            device=self.device,
+        )
+        self.pose_version += 1
+        self.cluster_version[dirty] = self.pose_version
+
+
+def _clusters_shown(bunch: np.ndarray, attached: np.ndarray) -> np.ndarray:
+    """Whether each cluster is to be drawn [cluster] int32, by the bunch that it belongs to (-1 for none) [cluster]: not
+    those of bunches that no longer hang."""
+    if not len(attached):
+        return np.ones(len(bunch), np.int32)
+    return ((bunch < 0) | attached[bunch]).astype(np.int32)
+
+
+def _ground_extent(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest x and y [2] m of vines and posts."""
+    spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2]])
+    return (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
+
+
+def _ground_step(low: np.ndarray, high: np.ndarray) -> float:
+    """Spacing of the table of the sky that the ground sees [m]."""
+    return max(0.2, float((high - low).max()) / 500.0)
+
+
+def _digest(model: Model, grass: float, device: str) -> str:
+    """Of all that the plants' primitives follow from; a GPU rounds their light in its own way."""
+    package = pathlib.Path(__file__).parents[2]
+    folders = ("scene", "sensors/primitives", "sensors/raster", "kernels/raster")
+    code = [package / part for part in (*folders, "core/frames.py", "wires/wire_segments.py")]
+    shading = package / "kernels" / "shading"
+    code += [shading / "materials.py", shading / "shadow_maps.py"]
+    where = device.partition(":")[0]
+    return disk_cache.source_digest(*code, f"{model.digest()} {grass!r} {berries.VARIETIES!r}", where)
+
+
+def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:
+    """Snapshot of the vineyard at rest, for pictures and tests without physics."""
+    return Snapshot(
+        time=0.0,
+        tick=0,
+        body_q=State.at_rest(model).body_q,
+        bunch_attached=np.ones(len(model.bunch_body), bool),
+        visuals=visuals,
+        visual_q=np.zeros((0, 7)) if visual_q is None else np.asarray(visual_q, float),
+        moved_trees=np.zeros(0, np.int64),
+    )

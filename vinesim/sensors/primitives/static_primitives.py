@@ -1,0 +1,166 @@
+"""Posts, wires, trunks and arms as primitives; grass and herbs. Of these only wires under tension move."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.kernels.shading import materials
+from vinesim.scene import leaves
+from vinesim.scene.ids import Organ, label
+from vinesim.scene.model import Model
+from vinesim.sensors.primitives import textures
+from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stack_columns
+from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
+from vinesim.wires.wire_segments import WireSegments, cut
+
+_CELL_SIZE = 2.5
+"""Side of the squares in which things that never move are clustered [m]."""
+_MAX_SEGMENT = 0.5
+"""Longest piece of what never moves [m]."""
+_TRELLIS = {
+    Organ.POLE: (int(materials.POST), (0.36, 0.33, 0.29)),
+    Organ.WIRE: (int(materials.WIRE), (0.33, 0.34, 0.35)),
+    Organ.TRUNK: (int(materials.BARK), (0.20, 0.15, 0.10)),
+    Organ.ARM: (int(materials.BARK), (0.20, 0.14, 0.09)),
+}
+
+
+def _ground_cells(position: np.ndarray, first: int) -> np.ndarray:
+    """A group number for each square of the ground [n]."""
+    cell = np.floor(position[:, :2] / _CELL_SIZE).astype(np.int64)
+    cell -= cell.min(0, initial=0)
+    return (first + cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
+
+
+def trellis_batches(model: Model, static_carrier: int) -> list[Batch]:
+    """All that stands, but for :func:`wire_batch`."""
+    still = np.flatnonzero(model.fixed_tension <= 0.0)
+    if not len(still):
+        return []
+    # long ones in pieces: a box around a whole one holds half of the vineyard
+    length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)[still]
+    whole, begin, stop = cut(length, _MAX_SEGMENT)
+    values = _cones(model, still[whole], begin, stop)
+    middle = 0.5 * (values["a"] + values["b"])
+    return [make_batch(CONE, carrier=static_carrier, group=_ground_cells(middle, 0), **values)]
+
+
+def wire_batch(model: Model, segments: WireSegments, first_carrier: int, first_group: int) -> Batch | None:
+    """The segments of wires that give, each on a carrier of its own, in a group for each piece of wire."""
+    if not len(segments):
+        return None
+    values = _cones(model, segments.piece, segments.start, segments.end)
+    for end in "ab":
+        values[end][:, :3] -= segments.rest_q[:, :3]
+    carrier = first_carrier + np.arange(len(segments))
+    return make_batch(CONE, carrier=carrier, group=first_group + segments.piece, **values)
+
+
+def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray) -> dict[str, np.ndarray]:
+    """Values of the parts of fixed pieces [part] between two shares of their length [part], as drawn."""
+    way = model.fixed_end - model.fixed_start
+    length = np.linalg.norm(way, axis=1)[piece]
+    start, end = (model.fixed_start[piece] + share[:, None] * way[piece] for share in (begin, stop))
+    radius = model.fixed_radius[piece]
+    thick, thin = (radius[:, 0] * (1.0 - share) + radius[:, 1] * share for share in (begin, stop))
+    organ, index = model.fixed_organ[piece], model.fixed_index[piece]
+    table = {o: _TRELLIS[Organ(int(o))] for o in np.unique(organ)}
+    material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
+    rng = np.random.default_rng(3)
+    seed = rng.uniform(size=int(model.fixed_index.max()) + 1)[index] * 7.0
+    # bark runs through from piece to piece: distances count from the foot of a post, along a wire
+    upright = np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1)
+    return {
+        "a": stack_columns(start, thick), "b": stack_columns(end, thin),
+        "c": stack_columns(np.where(upright, start[:, 2], length * begin), seed, 0.0, 0.0),
+        "material": material, "tint": tint, "organ": organ, "label": organ * label(Organ(1), 0) + index,
+    }  # fmt: skip
+
+
+def row_layout(model: Model) -> tuple[float, float]:
+    """Where the first row of vines stands, and the spacing of the rows [m], both along y."""
+    y = np.unique(np.round(model.fixed_start[model.fixed_organ == int(Organ.TRUNK), 1], 1))
+    if len(y) == 0:
+        return 0.0, 2.5
+    return float(y[0]), float(np.median(np.diff(y))) if len(y) > 1 else 2.5
+
+
+def _row_greenness(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
+    """As :func:`vinesim.kernels.shading.materials.row_greenness`, which colours the ground."""
+    lane = (y - rows[0]) / rows[1]
+    away = np.abs(lane - np.round(lane)) * rows[1]
+    track = np.abs(away - 0.5 * rows[1] + 0.7)
+    return 0.16 - 0.26 * textures.smoothstep(0.65, 0.25, away) - 0.14 * textures.smoothstep(0.22, 0.08, track)
+
+
+def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: int) -> Batch | None:
+    """Fallen leaves, more of them when many leaves are old: ``age`` is the mean of :attr:`Model.leaf_age`."""
+    low, high = low - 1.0, high + 1.0
+    n = int(min((1.0 + 12.0 * age) * np.prod(high - low), 30_000))
+    if n == 0:
+        return None
+    rng = np.random.default_rng(29)
+    position = low + (high - low) * rng.uniform(size=(n, 2))
+    turn, tilt = rng.uniform(0.0, 2.0 * np.pi, n), rng.normal(0.0, 0.15, n)
+    rib = np.stack([np.cos(turn), np.sin(turn), tilt], 1) / np.hypot(1.0, tilt)[:, None]
+    up = np.cross(rib, np.stack([np.sin(turn), -np.cos(turn), rng.normal(0.0, 0.15, n)], 1))
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    dry = rng.uniform(size=(n, 1))
+    tint = (1.0 - dry) * np.array([0.30, 0.24, 0.05]) + dry * np.array([0.17, 0.10, 0.045])
+    bend = stack_columns(
+        rng.normal(0.0, 0.25, n), rng.normal(0.0, 0.25, n), rng.uniform(-0.2, 0.4, n), rng.uniform(0.8, 1.0, n)
+    )
+    return make_batch(
+        LEAF,
+        stack_columns(position, np.full(n, 0.012), rng.uniform(0.04, 0.085, n)),
+        b=stack_columns(rib, leaves.blade_shape(np.arange(n))),
+        c=stack_columns(up, rng.uniform(size=n)),
+        d=bend,
+        material=int(materials.FOLIAGE),
+        tint=tint,
+        organ=int(Organ.GROUND),
+        label=label(Organ.GROUND, 0),
+        carrier=static_carrier,
+        group=_ground_cells(position, 0),
+    )
+
+
+def grass_batch(
+    rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, static_carrier: int
+) -> Batch | None:
+    """Tufts of grass and herbs where the ground is green; they carry the ground's label."""
+    low, high = low - 3.0, high + 3.0
+    count = int(min(density * np.prod(high - low), 60_000))
+    if count == 0:
+        return None
+    rng = np.random.default_rng(23)
+    position = low + (high - low) * rng.uniform(size=(count, 2))
+    noise = textures.sample_noise(position[:, 0] * 0.21, position[:, 1] * 0.21)
+    # as the ground is coloured
+    green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125 + _row_greenness(rows, position[:, 1])
+    position = position[green > 0.40 + 0.24 * rng.uniform(size=count)]
+    n = len(position)
+    herb = rng.uniform(size=n) < 0.12
+    size = np.where(herb, rng.uniform(0.03, 0.06, n), 0.06 + 0.17 * rng.uniform(size=n) ** 1.5)
+    yaw = rng.uniform(0.0, 2.0 * np.pi, n)
+    lean = np.where(herb, rng.uniform(0.5, 1.1, n), rng.normal(0.0, 0.2, n))
+    out = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(n)], 1)
+    rib = np.sin(lean)[:, None] * out + np.cos(lean)[:, None] * np.array([0.0, 0.0, 1.0])
+    up = np.cos(lean)[:, None] * out - np.sin(lean)[:, None] * np.array([0.0, 0.0, 1.0])
+    root = stack_columns(position, np.zeros(n)) + 0.74 * size[:, None] * rib
+    tint = np.array([0.075, 0.12, 0.022]) * rng.uniform(0.6, 1.35, (n, 1))
+    tint = tint + np.array([0.10, 0.07, 0.02]) * (rng.uniform(size=(n, 1)) < 0.3) * rng.uniform(size=(n, 1))
+    bend = stack_columns(rng.normal(0.0, 0.3, n), np.zeros(n), np.zeros(n), np.zeros(n))
+    return make_batch(
+        LEAF,
+        stack_columns(root, size),
+        b=stack_columns(rib, np.where(herb, textures.HERB_OUTLINE, textures.GRASS_OUTLINE)),
+        c=stack_columns(up, rng.uniform(size=n)),
+        d=bend,
+        material=int(materials.GRASS),
+        tint=tint,
+        organ=int(Organ.GROUND),
+        label=label(Organ.GROUND, 0),
+        carrier=static_carrier,
+        group=_ground_cells(position, 0),
+    )

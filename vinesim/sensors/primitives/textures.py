@@ -1,0 +1,321 @@
+"""Baked tables that make analytic primitives look like plants: leaf outlines and veins, noise, soil, sky.
+
+All are computed from fixed seeds, tile without seams where they repeat, and hold linear values. They are kept in
+:mod:`vinesim.core.disk_cache`: computing them takes seconds.
+"""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from vinesim.core import disk_cache
+from vinesim.scene import leaves
+
+GRASS_OUTLINE, HERB_OUTLINE = leaves.SHAPE_COUNT, leaves.SHAPE_COUNT + 1
+"""Numbers of the outlines that are not vine leaves: a tuft of grass, a broad weed."""
+OUTLINE_COUNT = leaves.SHAPE_COUNT + 2
+TEXTURE_SIZE = 256
+"""Texels along each side of the tables."""
+_DISTANCE_STEPS = 400.0
+SKY_ROWS, SKY_COLUMNS = 512, 1024
+_SUPERSAMPLING = 4
+
+
+@functools.cache
+def _digest() -> str:
+    """Of the code that makes the tables."""
+    return disk_cache.source_digest(pathlib.Path(__file__), pathlib.Path(leaves.__file__), cv2.__version__)
+
+
+def _on_disk(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
+    """``make``, which computes tables, with what it returns kept on disk."""
+    name = make.__name__.strip("_").replace("_", "-")
+    return lambda: disk_cache.load_or_make(name, _digest(), make)
+
+
+def _cached(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
+    """The same, kept in this process, too."""
+    return functools.cache(_on_disk(make))
+
+
+def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Leaf coordinates u in [-1, 1], v in [-0.75, 1.25] of texel centres; the unit reaches from petiole to tip."""
+    step = (np.arange(side) + 0.5) / side * 2.0
+    u, v = np.meshgrid(step - 1.0, step - 0.75)
+    return u, v
+
+
+def leaf_scale(shape: int | np.ndarray) -> np.ndarray:
+    """Length from petiole to tip in units of ``Model.leaf_size``, by outline [shape]."""
+    tips = np.array([leaves.blade_outline(np.zeros(1), i)[0] for i in range(leaves.SHAPE_COUNT)])
+    return tips[shape]
+
+
+def _signed_distance(mask: np.ndarray) -> np.ndarray:
+    """Signed distance to the edge of a finely sampled mask, positive inside [leaf units], [SIDE, SIDE]."""
+    inside = mask.astype(np.uint8)
+    pixels = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
+    return cv2.resize(pixels, (TEXTURE_SIZE, TEXTURE_SIZE), interpolation=cv2.INTER_AREA) * (
+        2.0 / (TEXTURE_SIZE * _SUPERSAMPLING)
+    )
+
+
+def _grass_mask() -> np.ndarray:
+    """Mask of a tuft of grass: bent blades that taper, rooted along the lower edge."""
+    rng = np.random.default_rng(31)
+    side = TEXTURE_SIZE * _SUPERSAMPLING
+    mask = np.zeros((side, side), np.uint8)
+    along = np.linspace(0.0, 1.0, 20)
+    for _ in range(30):
+        root = rng.uniform(-0.4, 0.4)
+        lean = rng.normal(0.6 * root, 0.4)
+        height = rng.uniform(0.5, 1.8)
+        half = rng.uniform(0.018, 0.036) * (1.0 - along**1.6)
+        x = root + lean * along**2
+        y = -0.75 + height * along * (1.0 - 0.15 * abs(lean) * along)
+        blade = np.concatenate([np.stack([x - half, y], 1), np.stack([x + half, y], 1)[::-1]])
+        cv2.fillPoly(mask, [np.round((blade + np.array([1.0, 0.75])) * 0.5 * side).astype(np.int32)], 1)
+    return mask
+
+
+def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
+    """Signed distances [outline, SIDE, SIDE] int8 in 1/400 leaf unit, and octagons around them [outline, 8, 2]."""
+    baked = _leaf_outlines()
+    return baked["distance"], baked["hull"]
+
+
+@_cached
+def _leaf_outlines() -> disk_cache.Arrays:
+    u, v = _grid(TEXTURE_SIZE * _SUPERSAMPLING)
+    theta, radius = np.arctan2(u, v), np.hypot(u, v)
+    table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE))
+    knots = np.linspace(-np.pi, np.pi, 8193)
+    for shape in range(leaves.SHAPE_COUNT):
+        edge = leaves.blade_outline(knots, shape) / leaf_scale(shape)
+        table[shape] = _signed_distance(radius < np.interp(theta, knots, edge))
+    table[GRASS_OUTLINE] = _signed_distance(_grass_mask())
+    table[HERB_OUTLINE] = _signed_distance((u / 0.42) ** 2 + ((v - 0.45) / 0.55) ** 2 < 1.0)
+    table = np.clip(table * _DISTANCE_STEPS, -127, 127).astype(np.int8)
+    angle = (np.arange(8) + 0.5) * np.pi / 4.0
+    normal = np.stack([np.sin(angle), np.cos(angle)], 1)
+    hull = np.zeros((OUTLINE_COUNT, 8, 2), np.float32)
+    u, v = _grid(TEXTURE_SIZE)
+    for shape in range(OUTLINE_COUNT):
+        inside = table[shape] > -4
+        reach = (np.stack([u[inside], v[inside]], 1) @ normal.T).max(0) + 0.012
+        for k in range(8):
+            sides = [k, (k + 1) % 8]
+            hull[shape, k] = np.linalg.solve(normal[sides], reach[sides])
+    return {"distance": table, "hull": hull}
+
+
+def _smooth_noise(rng: np.random.Generator, sigma: float) -> np.ndarray:
+    """Smooth noise of unit variance [SIDE, SIDE]."""
+    noise = cv2.GaussianBlur(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE)).astype(np.float32), (0, 0), sigma)
+    return noise / noise.std()
+
+
+def leaf_texture() -> np.ndarray:
+    """Vein strength, relief slope along u and v, tone: [outline, SIDE/2, SIDE/2, 4] float32."""
+    return _leaf_texture()["table"]
+
+
+@_cached
+def _leaf_texture() -> disk_cache.Arrays:
+    u, v = _grid(TEXTURE_SIZE)
+    table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE, 4), np.float32)
+    for shape in range(leaves.SHAPE_COUNT):
+        rng = np.random.default_rng(71 + shape)
+        vein, crease = np.zeros_like(u), np.zeros_like(u)
+        for angle, length in ((0.0, 1.0), (54.0, 0.86), (-54.0, 0.86), (112.0, 0.62), (-112.0, 0.62)):
+            turn = np.radians(angle)
+            tip = length * np.array([np.sin(turn), np.cos(turn)])
+            away, along = _segment(u, v, np.zeros(2), tip)
+            vein = np.maximum(vein, np.exp(-((away / (0.021 * (1.0 - 0.7 * along))) ** 2)))
+            crease += 0.03 * np.exp(-((away / 0.05) ** 2))
+            for start in np.linspace(0.15, 0.88, 7):
+                for side in (1.0, -1.0):
+                    root = (start + 0.04 * side) * tip
+                    out = turn + side * np.radians(50.0)
+                    reach = 0.55 * length * (1.0 - 0.7 * abs(start - 0.35))
+                    away, along = _segment(u, v, root, root + reach * np.array([np.sin(out), np.cos(out)]))
+                    vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.012 * (1.0 - 0.6 * along))) ** 2)))
+                    crease += 0.009 * np.exp(-((away / 0.03) ** 2))
+        fine, wide = _smooth_noise(rng, 3.0), _smooth_noise(rng, 8.0)
+        net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
+        slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / TEXTURE_SIZE)
+        table[shape] = np.stack([np.maximum(vein, 0.25 * net), slope_u, slope_v, 0.5 + 0.2 * wide + 0.12 * fine], -1)
+    table[GRASS_OUTLINE, ..., 3] = 0.5 + 0.5 * v
+    table[HERB_OUTLINE, ..., 0] = 0.6 * np.exp(-((u / 0.03) ** 2))
+    table[HERB_OUTLINE, ..., 3] = 0.5
+    half = table.reshape(OUTLINE_COUNT, TEXTURE_SIZE // 2, 2, TEXTURE_SIZE // 2, 2, 4).mean((2, 4))
+    return {"table": np.ascontiguousarray(half, np.float32)}
+
+
+def _segment(u: np.ndarray, v: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance to a segment and position along it, 0 to 1."""
+    d = b - a
+    along = np.clip(((u - a[0]) * d[0] + (v - a[1]) * d[1]) / (d @ d), 0.0, 1.0)
+    return np.hypot(u - a[0] - along * d[0], v - a[1] - along * d[1]), along
+
+
+def _periodic_noise(rng: np.random.Generator, lowest: float, power: float) -> np.ndarray:
+    """Periodic noise with a 1/f^power spectrum above a lowest frequency; zero mean, unit variance."""
+    cycles = np.fft.fftfreq(TEXTURE_SIZE) * TEXTURE_SIZE
+    f = np.hypot(*np.meshgrid(cycles, cycles))
+    gain = np.where(f >= lowest, 1.0 / np.maximum(f, lowest) ** power, 0.0)
+    field = np.fft.ifft2(np.fft.fft2(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE))) * gain).real
+    return field / field.std()
+
+
+def noise_texture() -> np.ndarray:
+    """Four octaves of periodic noise around 0.5, coarse to fine: [SIDE, SIDE, 4] float32 in 0..1."""
+    return _noise_texture()["table"]
+
+
+@_cached
+def _noise_texture() -> disk_cache.Arrays:
+    rng = np.random.default_rng(17)
+    bands = [_periodic_noise(rng, low, power) for low, power in ((1, 1.6), (3, 1.4), (10, 1.1), (30, 0.4))]
+    return {"table": np.clip(0.5 + 0.2 * np.stack(bands, -1), 0.0, 1.0).astype(np.float32)}
+
+
+def soil_texture() -> np.ndarray:
+    """Clods, sod, slope along x and y of 1.25 m of ground: [SIDE, SIDE, 4] float32."""
+    return _soil_texture()["table"]
+
+
+@_cached
+def _soil_texture() -> disk_cache.Arrays:
+    rng = np.random.default_rng(43)
+    clods = (
+        0.55 * _periodic_noise(rng, 3, 1.5)
+        + 0.6 * np.abs(_periodic_noise(rng, 4, 1.5))
+        + 0.35 * _periodic_noise(rng, 20, 1.0)
+    )
+    sod = _periodic_noise(rng, 25, 0.7)
+    straw = np.zeros((TEXTURE_SIZE, TEXTURE_SIZE), np.float32)
+    for x, y, turn, length in zip(*rng.uniform(size=(4, 90)), strict=True):
+        start = np.array([x, y]) * TEXTURE_SIZE
+        step = (6.0 + 14.0 * length) * np.array([np.cos(np.pi * turn), np.sin(np.pi * turn)])
+        end = start + step
+        cv2.line(straw, (int(start[0]), int(start[1])), (int(end[0]), int(end[1])), (1.0,), 1, cv2.LINE_AA)
+    height = 0.5 * clods + 0.35 * sod
+    slope_y, slope_x = (0.5 * (np.roll(height, -1, axis) - np.roll(height, 1, axis)) for axis in (0, 1))
+    tone = np.clip(0.45 + 0.17 * clods + 0.5 * straw, 0.0, 1.0)
+    green = np.clip(0.5 + 0.22 * sod + 0.3 * straw, 0.0, 1.0)
+    return {"table": np.stack([tone, green, -0.9 * slope_x, -0.9 * slope_y], -1).astype(np.float32)}
+
+
+@_on_disk  # 13 MB, for a moment whenever the sun is elsewhere
+def _sky_layers() -> disk_cache.Arrays:
+    """What of the sky no sun changes: ``cloud``, its share; and of ``ridges`` and ``trees`` in front of it, which reach
+    up to some row, the shares and the colour of the trees. float64, as they are mixed."""
+    height, azimuth = (np.ascontiguousarray(part) for part in np.broadcast_arrays(*_sky_directions()))
+    flat = np.sqrt(1.0 - height**2)
+    far = 0.22 / (height + 0.12)
+    cover = sample_noise(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
+    cloud = smoothstep(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * smoothstep(0.02, 0.2, height) * 0.55
+    height, azimuth = height[:_RIDGE_ROWS], azimuth[:_RIDGE_ROWS]
+    turns = azimuth / (2.0 * np.pi)
+    shares = []
+    for base, rise, count in ((0.045, 0.085, 2.0), (0.020, 0.050, 3.0)):
+        ridge = base + rise * (
+            sample_noise(turns * count, np.full_like(turns, 0.13 * count), slice(0, 1))[..., 0] - 0.35
+        )
+        shares.append(smoothstep(0.004, -0.004, height - ridge))
+    crowns = 0.014 + 0.020 * sample_noise(turns * 16.0, np.full_like(turns, 0.71), slice(1, 2))[..., 0]
+    leafy = sample_noise(turns * 20.0, height * 8.0, slice(2, 3))
+    trees = np.array([0.095, 0.14, 0.085]) + (leafy - 0.5) * np.array([0.10, 0.14, 0.05])
+    return {
+        "cloud": cloud,
+        "ridges": np.stack(shares),
+        "trees": trees,
+        "tree_share": smoothstep(0.004, -0.004, height - crowns),
+    }
+
+
+_RIDGE_ROWS = 180
+"""Rows of the sky's table that ridges and trees can reach, up to 0.12 in the sine of elevation."""
+_RIDGE_TONES = np.array([0.36, 0.47, 0.62]), np.array([0.22, 0.32, 0.36])
+"""Linear RGB of the far and the near ridge."""
+_SKY_BAND = 12
+"""Rows of the sky's table that are computed at once, so few that they stay in a core's cache; divides the ridge's."""
+
+
+def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
+    """Sine of elevation [row, 1] and azimuth [1, column] rad of the sky's table."""
+    return np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None]
+
+
+def _clear_sky() -> np.ndarray:
+    """The blue of a sky without clouds [row, 1, 3]: it is the same all around."""
+    height, _ = _sky_directions()
+    horizon = np.exp(-5.5 * height)[..., None]
+    return (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
+
+
+@functools.lru_cache(maxsize=1)  # cameras of one robot see the same sun
+def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
+    """Radiance of the sky by sqrt(sine of elevation) and azimuth: [SKY_ROWS, SKY_COLUMNS, 3] float32.
+
+    Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
+    hills in the haze.
+    """
+    table, layers = np.empty((SKY_ROWS, SKY_COLUMNS, 3), np.float32), _sky_layers()
+    for first in range(0, SKY_ROWS, _SKY_BAND):
+        rows = slice(first, first + _SKY_BAND)
+        table[rows] = _sky_rows(rows, layers, np.array(sun), np.array(colour_of_sun))
+    return table
+
+
+def _sky_rows(rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
+    """Some rows of the sky's table [row, SKY_COLUMNS, 3]; they lie within or beyond :data:`_RIDGE_ROWS`."""
+    height, azimuth = _sky_directions()
+    height, colour = height[rows], _clear_sky()[rows]
+    flat = np.sqrt(1.0 - height**2)
+    x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
+    away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
+    halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
+    colour = colour + halo[..., None] * colour_of_sun
+    colour = _mix(colour, np.array([1.35, 1.33, 1.30]), layers["cloud"][rows])
+    if rows.start < _RIDGE_ROWS:
+        for tone, share in zip(_RIDGE_TONES, layers["ridges"], strict=True):
+            colour = _mix(colour, tone, share[rows])
+        colour = _mix(colour, layers["trees"][rows], layers["tree_share"][rows])
+    return colour
+
+
+def sample_noise(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
+    """Noise at positions of period 1, bilinear [..., 4], or some octaves of it."""
+    table = np.ascontiguousarray(noise_texture()[..., octaves]).reshape(TEXTURE_SIZE**2, -1)
+    fx, fy = (x % 1.0) * TEXTURE_SIZE, (y % 1.0) * TEXTURE_SIZE
+    i, j = fx.astype(int) % TEXTURE_SIZE, fy.astype(int) % TEXTURE_SIZE
+    ax, ay = (fx % 1.0)[..., None], (fy % 1.0)[..., None]
+    right, here, above = (i + 1) % TEXTURE_SIZE, j * TEXTURE_SIZE, (j + 1) % TEXTURE_SIZE * TEXTURE_SIZE
+    upper = table.take(here + i, 0) * (1.0 - ax) + table.take(here + right, 0) * ax
+    lower = table.take(above + i, 0) * (1.0 - ax) + table.take(above + right, 0) * ax
+    return upper * (1.0 - ay) + lower * ay
+
+
+def smoothstep(a: float, b: float, x: np.ndarray) -> np.ndarray:
+    t = np.clip((x - a) / (b - a), 0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _mix(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:
+    return a * (1.0 - t[..., None]) + b * t[..., None]
+
+
+@functools.cache
+def tone_curve() -> np.ndarray:
+    """8-bit sRGB of sqrt(linear) in 0..4, 4096 entries: the filmic curve of Narkowicz (2015), then IEC 61966-2-1."""
+    x = (np.arange(4096) / 1024.0) ** 2
+    film = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
+    srgb = np.where(film <= 0.0031308, 12.92 * film, 1.055 * film ** (1.0 / 2.4) - 0.055)
+    return np.round(srgb * 255.0).astype(np.uint8)

@@ -1,1 +1,0 @@
-"""Exact ground truth of pictures."""

@@ -1,0 +1,137 @@
+"""Wind on the plants: which trees feel it in the simulation, and what is left for cameras to draw.
+
+Gusts let nothing rest, and ten thousand awake trees fit in no step. So only trees near somebody who is there to see are
+simulated in the wind. All others sleep where they last rested; how far the wind moves them is a function of place and
+time that sensors compute for what they look at (:mod:`vinesim.wind.sway`).
+
+Each tree has a phase from 0, its motion is drawn, to 1, it is simulated. It rises while the tree is awake and near: in
+its first half the air of the simulated tree grows to that of the wind, in its second half the drawn motion fades out.
+It falls otherwise, and the tree keeps the air that it felt last. So nothing that is seen jumps.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vinesim.kernels.plants.forces import AIR_DENSITY
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.scene.builder import GRAVITY
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.state import State
+from vinesim.scene.values import WindState
+from vinesim.scene.wind import Wind
+from vinesim.wind.shelter import TreeDrag
+
+FADE_DURATION = 2.0
+"""[s] Half of a change between drawn and simulated, and the time in which wind begins and ends. TUNED: twice the
+period of a slow shoot, so that a simulated tree follows its growing load."""
+
+Observers = tuple[np.ndarray, float]
+"""Points [n, 3] m and a distance [m]: trees whose foot is so near to one of them are simulated in the wind."""
+
+
+class WindOnPlants:
+    """Sets ``plants.tree_air`` before each step, and wakes sleepers near actors that the wind moves."""
+
+    def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        self.plants, self.parameters = plants, parameters
+        model, first = plants.model, plants.model.tree_first
+        number = np.arange(len(model.body_mass)) - first[model.body_tree]
+        core = number < model.tree_core[model.body_tree]  # a bunch's mass has its clusters in it
+        self._foot = model.tree_pose[:, :3].astype(float)
+        self._weight = np.add.reduceat(model.body_mass * core, first) * -GRAVITY[2] if len(first) else np.zeros(0)
+        self.phase = np.zeros(len(first), np.float32)
+        """0: the motion of a tree in the wind is drawn, 1: it is simulated [tree]."""
+        self._drag: TreeDrag | None = None
+        self._wind: Wind | None = None
+        self._strength, self._time, self._round, self._steps = 0.0, 0.0, 0, 0
+
+    def update(self, wind: Wind | None, time: float, observers: Observers | None = None) -> None:
+        """Before a step at a ``time`` [s] of the wind; None for calm. Without ``observers`` all trees are simulated.
+
+        A wind that is there in the first step has always blown; a later one grows, and one that ends dies away.
+        """
+        self._follow(wind)
+        self._time, self._steps = time, self._steps + 1
+        if self._wind is None:
+            return
+        plants = self.plants
+        driven = np.zeros(len(self.phase), bool)
+        driven[awake := self._near(plants.awake, observers)] = True
+        step = 0.5 * self.parameters.dt / FADE_DURATION
+        if self._steps == 1:
+            self.phase[driven] = 1.0
+        fading = np.flatnonzero((self.phase > 0.0) & ~driven)
+        self.phase[fading] = np.maximum(self.phase[fading] - step, 0.0)
+        before = np.minimum(2.0 * self.phase[awake], 1.0)[:, None]
+        self.phase[awake] = np.minimum(self.phase[awake] + step, 1.0)
+        after = np.minimum(2.0 * self.phase[awake], 1.0)[:, None]
+        growth = np.where(before < 1.0, (after - before) / np.maximum(1.0 - before, 1e-6), 1.0)
+        plants.tree_air[awake] += growth * (self._air(awake) - plants.tree_air[awake])
+        if wind is self._wind:
+            self._wake_stirred(observers)
+        else:
+            self._calm(~driven)
+
+    @property
+    def state(self) -> WindState | None:
+        """The wind as sensors need it, None in calm air."""
+        if self._wind is None:
+            return None
+        fade = np.clip(2.0 - 2.0 * self.phase, 0.0, 1.0)
+        drawn = fade * fade * (3.0 - 2.0 * fade)
+        return WindState(self._wind, self._time, self._strength, self.plants.tree_air.copy(), drawn)
+
+    def _follow(self, wind: Wind | None) -> None:
+        """Let the wind that blows end before another begins."""
+        step = self.parameters.dt / FADE_DURATION
+        if wind is self._wind:
+            self._strength = min(self._strength + step, 1.0)
+            return
+        self._strength = max(self._strength - step, 0.0)
+        if self._strength == 0.0:
+            self._wind = wind
+            self.plants.tree_air[:] = 0.0
+            if wind is not None:
+                if self._drag is None:
+                    self._drag = TreeDrag.of(self.plants.model, State.at_rest(self.plants.model).body_q)
+                self._share = self._drag.air_share(wind.mean)
+                self._strength = 1.0 if self._steps == 0 else step
+
+    def _air(self, trees: np.ndarray) -> np.ndarray:
+        """Velocity [k, 3] m/s of the wind at some trees [k]."""
+        assert self._wind is not None
+        velocity = self._wind.velocity_at(self._foot[trees], self._time)
+        return self._strength * self._share[trees, None] * velocity
+
+    def _calm(self, trees: np.ndarray) -> None:
+        """While a wind dies away: let sleepers that still feel their last air come to rest without it."""
+        felt = np.flatnonzero(trees & (self.plants.tree_air != 0.0).any(1))
+        if len(felt):
+            self.plants.wake(felt)
+            ago = self._strength + self.parameters.dt / FADE_DURATION
+            self.plants.tree_air[felt] *= self._strength / ago
+
+    def _wake_stirred(self, observers: Observers | None) -> None:
+        """All sleepers are looked at once in a period, an equal number in each step."""
+        plants, parameters = self.plants, self.parameters
+        rounds = parameters.steps(parameters.wind_check_period)
+        self._round = (self._round + 1) % rounds
+        some = np.arange(self._round, len(self._foot), rounds)
+        assert self._drag is not None
+        area = self._drag.area
+        some = self._near(some[~plants.state.tree_awake[some] & (area[some] > 0.0)], observers)
+        air, felt = self._air(some), plants.tree_air[some].astype(float)
+        change = air * np.linalg.norm(air, axis=-1, keepdims=True) - felt * np.linalg.norm(felt, axis=-1, keepdims=True)
+        force = 0.5 * AIR_DENSITY * area[some] * np.linalg.norm(change, axis=-1)
+        plants.wake(some[force > parameters.wind_wake_load * self._weight[some]])
+
+    def _near(self, trees: np.ndarray, observers: Observers | None) -> np.ndarray:
+        """Those of some trees whose foot is near one of the points."""
+        if observers is None:
+            return trees
+        points, distance = np.atleast_2d(np.asarray(observers[0], float)), observers[1]
+        near = np.zeros(len(trees), bool)
+        for point in points:  # a handful of robots and people
+            near |= ((self._foot[trees] - point) ** 2).sum(-1) < distance * distance
+        return trees[near]

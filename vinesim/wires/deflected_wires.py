@@ -1,0 +1,201 @@
+"""Wires that give to what presses on them: the springs that contacts end at, and where their geoms are.
+
+A wire has no mass here (see :mod:`vinesim.wires.elastic_supports`). So a contact with it is one with a spring
+of the wire's stiffness across itself, which both solvers treat as implicit, as they do any contact. The wire's geom
+follows what presses on it, so that normals and closest points are those of the deflected wire; the spring is measured
+from where the wire would be without that contact's force.
+
+Several contacts share a wire. Each ends at a spring as soft as the sum of the deflections there by all that press, over
+that by the contact itself (as of a string without ties); what the others in fact do follows from the forces of the last
+step. With springs as soft as that, these forces converge: the sums of the rows of a matrix of compliances, weighed by
+any positive numbers, bound its eigenvalues. The weights are means of forces over some time: what follows the forces
+themselves feeds swings.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from vinesim.core.warp_arrays import SharedArrays, share
+from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.wires import wire_contacts as kernels
+from vinesim.scene.model import Model
+from vinesim.wires.elastic_supports import LEAST_SHARE, WIRE_DAMPING_TIME, ElasticSupports
+
+MAX_DEFLECTION = 0.25
+"""[m] The geom of a wire follows no further; what presses on still feels its spring. TUNED: far beyond what the law of
+a taut string holds for."""
+LEAST_DEFLECTION = 1e-6
+"""[m] A wire that is nearer to where it was drawn is put there."""
+LEAST_SPREAD = 0.1
+"""[1] Of a wire's length: contacts that are further apart tilt it; others move it as a whole. TUNED."""
+FOLLOWED, EXTRAPOLATED = 0.7, 0.5
+"""[1] What several contacts with wires know of each other in a step: so much of the deflections by the others' forces,
+and these extrapolated by so many steps; of the rest, its mean over :data:`MEMORY`. DERIVED: the largest share with
+which a mass on two such springs is stable whatever it weighs, with a wire's damping."""
+MEMORY, LEAST_WEIGHT = 0.5, 0.05
+"""[s] over which the forces are averaged by which several contacts share a wire, and [1] the share of the largest with
+which one is taken to press at least. TUNED."""
+TOUCHING = 1e-3
+"""[m] A contact with a larger gap to the geom of a wire does not touch it, however far others deflect it. TUNED."""
+MOST_ALONG, OUT_OF_REACH = 0.5, 1e3
+"""[1] Largest cosine between a contact's normal and the wire; [m] where the wire is taken to be for others."""
+SAME_PLACE = 0.05
+"""[m] Contacts of the same pair of shapes that are further apart in two steps are different ones. TUNED: less than any
+box is long, more than anything slides in a step."""
+ROOM, MOST_PRESSES = 32, 512
+"""Contacts with wires in one solve for which there is room at first; and those of both solvers that count."""
+NO_TREE = int(np.iinfo(np.int32).min)
+"""Tree of presses that do not outlive a step: whose shape is gone, or that was put elsewhere."""
+
+
+class DeflectedWires:
+    """The wires of one model, and what presses on them."""
+
+    def __init__(self, model: Model, supports: ElasticSupports, tree_awake: np.ndarray, dt: float) -> None:
+        """``tree_awake``: [tree] what sleeps presses on as it did."""
+        self._supports = supports
+        self.gives = model.fixed_tension > 0.0
+        """[piece] Whether it is a wire under tension."""
+        self.start, self.end = model.fixed_start.astype(float), model.fixed_end.astype(float)
+        way, count = self.end - self.start, len(self.start)
+        self.offset = np.zeros((count, 2, 3))
+        """[piece, 2, 3] m by which the start and the end of its geom are away from where they were drawn."""
+        axis = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
+        self._geoms = SharedArrays.zeros(
+            kernels.WireGeoms, count, start=self.start, axis=axis, offset=self.offset, count=np.zeros(2, np.int32)
+        )
+        self.presses, self._found = (
+            SharedArrays.zeros(kernels.WirePresses, MOST_PRESSES, count=np.zeros(1, np.int32)) for _ in range(2)
+        )
+        self._numbers, self._load = _numbers(dt), share(supports.load, wp.vec3d)
+        self._tree_awake = share(tree_awake, wp.bool)
+        self._is_loaded = share(np.zeros(supports.count, np.bool_), wp.bool)
+        self.renumber_rigid(lambda _: (0, NO_TREE), 0)
+
+    @property
+    def geoms(self) -> kernels.WireGeoms:
+        """The wires as shapes."""
+        return self._geoms.struct
+
+    @property
+    def deflected(self) -> np.ndarray:
+        """Pieces [k] whose offset is not 0; a view that the next step changes."""
+        return self._geoms.deflected[: self._geoms.count[0]]
+
+    def bind(self, contacts: SharedArrays) -> tuple[Callable[..., None], Callable[..., None]]:
+        """Functions that find the springs of ``contacts``, and that add what presses of them, for one thread each."""
+        wires, nodes, bodies, springs = self._supports.wire_structs
+        find = bind_launch(
+            kernels.find_wire_springs,
+            [self._numbers, wires, nodes, self._geoms.struct, bodies, springs, self._load, self.presses.struct],
+            [contacts.struct],
+        )
+        return find, bind_launch(kernels.add_presses, [self._numbers, contacts.struct], [self._found.struct])
+
+    def end_step(self, rigid_asleep: np.ndarray) -> None:
+        """Move the geoms after what presses on them, let go those that nothing presses on, and load the supports.
+
+        ``rigid_asleep``: [kinematic tree] not negative while it sleeps.
+        """
+        if not (self._found.count[0] or self.presses.count[0] or self._geoms.count[0]):
+            return
+        self._rigid_asleep[:] = rigid_asleep
+        self._deflect(1)
+        self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
+
+    def let_go(self, trees: np.ndarray) -> None:
+        """Trees [k] that slept were put somewhere else: they press on nothing until they wake."""
+        self.presses.tree[np.isin(self.presses.tree, trees)] = NO_TREE
+
+    def renumber_rigid(self, numbers: Callable[[int], tuple[int, int]], trees: int) -> None:
+        """The rigid world was compiled anew: it has so many kinematic ``trees``. ``numbers``: of a key of rigid bodies
+        the new key, and the new tree; :data:`NO_TREE` if the shape is gone."""
+        presses = self.presses
+        for k in np.flatnonzero(presses.tree[: presses.count[0]] < 0).tolist():
+            presses.key[k], presses.tree[k] = numbers(int(presses.key[k]))
+        self._rigid_asleep = np.full(trees, -1, np.int32)
+        self._deflect = bind_launch(
+            kernels.deflect_wires,
+            [self._numbers, *self._supports.wire_structs[:2], self._tree_awake, share(self._rigid_asleep, wp.int32)],
+            [self._found.struct, self.presses.struct, self._load, self._is_loaded, self._geoms.struct],
+        )
+
+
+class WireContacts:
+    """The contacts of one solver with wires, in its last solve."""
+
+    def __init__(self, wires: DeflectedWires) -> None:
+        self._wires = wires
+        self._make_room(ROOM)
+
+    def _make_room(self, room: int) -> None:
+        self._arrays = SharedArrays.zeros(kernels.WireContacts, room, count=np.zeros(1, np.int32))
+        self._find, self._add = self._wires.bind(self._arrays)
+
+    def __len__(self) -> int:
+        return int(self._arrays.count[0])
+
+    @property
+    def stiffness(self) -> np.ndarray:
+        """[contact] N/m of the springs; of several contacts that press on one wire, what is left for each."""
+        return self._arrays.stiffness[: len(self)]
+
+    @property
+    def shift(self) -> np.ndarray:
+        """[contact] m, gap to where the wire would be without the contact's force, less that to its geom."""
+        return self._arrays.shift[: len(self)]
+
+    @property
+    def key(self) -> np.ndarray:
+        """[contact] number of the pair of shapes."""
+        return self._arrays.key[: len(self)]
+
+    def find_springs(
+        self, piece: np.ndarray, point: np.ndarray, normal: np.ndarray, gap: np.ndarray, closing: np.ndarray,
+        key: np.ndarray, tree: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Find the springs of contacts with wires; poses of awake trees must be up to date.
+
+        Args:
+            piece: [k] which fixed pieces; all must give.
+            point: [k, 3] m.
+            normal: [k, 3] from the wire to the other side.
+            gap: [k] m to the geom of the wire.
+            closing: [k] m/s, how fast the gap would get smaller without the contacts.
+            key: [k] number of the pair of shapes, the same in the next step.
+            tree: [k] the tree that presses, or -1 less the kinematic tree of the rigid world.
+        """
+        count = len(piece)
+        if count > len(self._arrays.piece):
+            self._make_room(2 * count)
+        a = self._arrays
+        a.piece[:count], a.point[:count], a.normal[:count] = piece, point, normal
+        a.gap[:count], a.closing[:count], a.key[:count], a.tree[:count] = gap, closing, key, tree
+        a.count[0] = count
+        self._find(1)
+
+    def add_presses(self, force: np.ndarray, velocity: np.ndarray) -> None:
+        """Note what the solve has found.
+
+        Args:
+            force: [contact] N with which they press, 0 for those that are near only.
+            velocity: [contact] m/s along the normal, of what presses, at the end of the step.
+        """
+        self._arrays.force[: len(self)], self._arrays.velocity[: len(self)] = force, velocity
+        self._add(1)
+
+
+def _numbers(dt: float) -> kernels.WireNumbers:
+    made = kernels.WireNumbers()
+    made.dt, made.followed, made.extrapolated = dt, FOLLOWED, EXTRAPOLATED
+    made.forgetting, made.recovery = dt / MEMORY, math.exp(-dt / WIRE_DAMPING_TIME)
+    made.least_weight, made.least_share = LEAST_WEIGHT, LEAST_SHARE
+    made.least_spread, made.least_deflection = LEAST_SPREAD, LEAST_DEFLECTION
+    made.max_deflection, made.touching, made.same_place = MAX_DEFLECTION, TOUCHING, SAME_PLACE
+    made.most_along, made.out_of_reach = MOST_ALONG, OUT_OF_REACH
+    return made

@@ -1,0 +1,254 @@
+"""Elastic supports: wires that shoots are tied to and arms that they stand on give, so that shoots move each other.
+
+See :mod:`vinesim.kernels.wires.elastic_supports`. Only supports of trees that are awake are computed. The
+anchors in the tie table are the wires' places, and the rests of the springs of roots turn with the arms, so that the
+trees, their sleep and joint wrenches need not know of supports.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from vinesim.core import frames
+from vinesim.core.warp_arrays import SharedArrays, share
+from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.wires import elastic_supports as kernels
+from vinesim.plants.articulation_solver import ArticulationSolver, spans
+from vinesim.plants.equilibrium import EquilibriumFinder
+from vinesim.scene.physics_parameters import PhysicsParameters
+
+WAKE_SHARE = 0.25
+"""[1] A sleeping tree wakes when a wire has moved one of its ties by this share of ``sleep_distance``, or its arm
+would move a point of it by as much. TUNED: twenty shoots that sleep on a wire hold it with 2 N until then."""
+
+LEAST_SHARE = 5e-4
+"""[1] Nodes of a support are taken to be by this share of its compliance from each other and from its ends, or more."""
+
+WIRE_DAMPING_TIME = 0.01
+"""[s] Damping of a wire over its stiffness where something presses on it. GUESSED: as ``tie_damping`` of the plants."""
+
+_NO_TREES = _NO_SUPPORTS = np.zeros(0, np.int32)
+
+
+class ElasticSupports:
+    """The supports of one model: pieces of wire under tension to which a tie is bound, and arms with a shoot."""
+
+    def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
+        """``parameters``: ``sleep_distance`` says when a tree wakes."""
+        self._plants, model = plants, plants.model
+        wires, arms = _wire_nodes(plants), _arm_nodes(plants)
+        plants.ties.axis[wires["tie"]] = wires["axis"]
+        nodes = {name: np.concatenate([wires[name], arms[name]]) for name in wires}
+        first = np.flatnonzero(np.diff(nodes["support"], prepend=-1))
+        self._tree = model.body_tree[nodes["body"]].astype(np.int32)
+        self._support = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(self._tree))))
+        by_tree = np.argsort(self._tree, kind="stable")
+        self._tree_supports = self._support[by_tree].astype(np.int32)
+        trees = len(model.tree_first)
+        self._tree_start = np.searchsorted(self._tree[by_tree], np.arange(trees + 1)).astype(np.int32)
+        self.deflection = np.zeros((len(self._tree), 3))
+        """[node, 3] of wires m from where they are when nothing has moved, of arms their twist [rad, 0, 0]; wires
+        first, each from start to end."""
+        self.count = len(first)
+        """Supports in all."""
+        piece = nodes["support"][first]
+        self._piece = np.where(piece < len(model.fixed_start), piece, -1)
+        """[support] The piece of wire that it is, -1 for an arm."""
+        self._was_active = np.zeros(len(first), np.bool_)
+        self._active, self._is_moved = np.zeros(len(first), np.int32), np.zeros(trees, np.bool_)
+        self._active_count, self._moved_count = 0, np.zeros(1, np.int32)
+        self.is_coupled = np.zeros(trees, np.bool_)
+        """[tree] Whether another tree that is awake is on one of its supports."""
+        self._is_placed = np.zeros(trees, np.bool_)
+        self._awake, self._placed, self._is_listed = _NO_TREES, _NO_TREES, False
+        self._loaded = self._unloaded = _NO_SUPPORTS
+        self.load = np.zeros((len(self._tree), 3))
+        """[node, 3] N on wires, but for ties."""
+        first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
+        stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
+        self._bind({
+            "first": np.append(first, len(self._tree)).astype(np.int32), "is_arm": nodes["is_arm"][first],
+            "stiffness": stiffness, "last_stiffness": last_stiffness, "tree": self._tree,
+            "number": np.append(wires["tie"] - first_tie, 0 * arms["body"]).astype(np.int32),
+            "wake_distance": WAKE_SHARE * parameters.sleep_distance / nodes["response"],
+        } | {name: nodes[name] for name in ("axis", "body", "point", "origin")}, self._wires(wires))  # fmt: skip
+
+    def _wires(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The pieces of wire, for :func:`kernels.wire_spring`; ``nodes``: those of wires."""
+        model = self._plants.model
+        tension = model.fixed_tension.astype(float)
+        way = (model.fixed_end - model.fixed_start).astype(float)
+        support = np.full(len(tension), -1, np.int32)
+        support[nodes["support"]] = self._support[: len(nodes["support"])]
+        along = np.zeros(len(self._tree))
+        along[: len(nodes["support"])] = nodes["compliance"] * tension[nodes["support"]]
+        return {
+            "tension": tension, "length": np.linalg.norm(way, axis=1), "support": support, "node_along": along,
+        }  # fmt: skip
+
+    def _bind(self, nodes: dict[str, np.ndarray], wires: dict[str, np.ndarray]) -> None:
+        plants, count = self._plants, len(self._tree)
+        ties, rests, state = plants.ties, plants.root_rests, plants.state
+        shape = {
+            "load": self.load, "deflection": self.deflection, "reference": np.zeros((count, 3)),
+            "ratio": np.zeros(count), "velocity": np.zeros((count, 3)), "share": np.zeros(count),
+        }  # fmt: skip
+        bodies = {
+            "body_q": state.body_q, "body_qd": state.body_qd, "joint_q": state.joint_q, "joint_qd": state.joint_qd,
+            "joint_stiffness": plants.joint_stiffness,
+        }  # fmt: skip
+        springs = {
+            "span": ties.span, "stiffness": ties.stiffness, "anchor": ties.anchor,
+            "anchor_velocity": ties.anchor_velocity, "softening": ties.softening, "root_turn": rests.turn,
+            "root_turn_rate": rests.rate, "root_softening": rests.softening,
+        }  # fmt: skip
+        node_struct = SharedArrays(kernels.SupportNodes, **nodes).struct
+        body_struct = SharedArrays(kernels.SupportedBodies, **bodies).struct
+        spring_struct = SharedArrays(kernels.SupportedSprings, **springs).struct
+        self._solve = bind_launch(
+            kernels.balance_supports,
+            [node_struct, share(self._active, wp.int32), share(state.tree_awake, wp.bool),
+             share(self._is_placed, wp.bool), body_struct],
+            [SharedArrays(kernels.SupportState, **shape).struct, spring_struct, share(self._is_moved, wp.bool),
+             share(self._moved_count, wp.int32)],
+        )  # fmt: skip
+        self.wire_structs = SharedArrays(kernels.Wires, **wires).struct, node_struct, body_struct, spring_struct
+        """What :func:`kernels.wire_spring` asks for, but for the loads."""
+
+    def set_loaded(self, supports: np.ndarray) -> None:
+        """On which supports [k] there are loads from now on; :attr:`load` is theirs."""
+        if not np.array_equal(supports, self._loaded):
+            self._unloaded, self._loaded, self._is_listed = self._loaded, supports.copy(), False
+
+    @property
+    def active(self) -> np.ndarray:
+        """The supports [k] that the last :meth:`update` computed."""
+        return self._active[: self._active_count]
+
+    def moved_pieces(self) -> np.ndarray:
+        """Pieces of wire [k] that were computed since the last call, or will be next: no other has moved."""
+        pieces = self._piece[self._was_active]
+        self._was_active[:] = False
+        self._was_active[self.active] = True
+        return pieces[pieces >= 0]
+
+    def place(self, trees: np.ndarray) -> None:
+        """Let the next :meth:`update` see that sleeping trees [k] were put somewhere else."""
+        self._placed = np.union1d(self._placed, trees).astype(np.int32)
+
+    def update(self) -> None:
+        """Bring the supports to where the trees hold them, and wake the trees that they move. Poses and velocities
+        of awake trees must be up to date."""
+        plants, awake = self._plants, self._plants.awake
+        if awake is not self._awake:
+            self.place(self._awake)  # what fell asleep was put to its resting place by that
+            self._awake, self._is_listed = awake, False
+        if not self._is_listed or len(self._placed):
+            self._is_listed = len(self._placed) == 0 and len(self._unloaded) == 0
+            self._list_supports()
+        if self._active_count == 0:
+            return
+        self._is_placed[self._placed] = True
+        self._solve(self._active_count)
+        self._is_placed[self._placed] = False
+        self._placed, self._unloaded = _NO_TREES, _NO_SUPPORTS
+        if self._moved_count[0]:
+            self._moved_count[0] = 0
+            moved = np.flatnonzero(self._is_moved).astype(np.int32)
+            self._is_moved[moved] = False
+            plants.wake(moved)
+
+    def _list_supports(self) -> None:
+        """List the supports of the trees that are awake or were put somewhere; note who shares them."""
+        trees = np.concatenate([self._awake, self._placed])
+        count = self._tree_start[trees + 1] - self._tree_start[trees]
+        support = self._tree_supports[spans(self._tree_start[trees], count)]
+        supports = np.unique(np.concatenate([support, self._loaded, self._unloaded]))
+        self._active_count = len(supports)
+        self._active[: len(supports)] = supports
+        self._was_active[supports] = True
+        of_awake = count[: len(self._awake)].sum()
+        pairs = np.unique(np.stack([support, np.repeat(trees, count)])[:, :of_awake], axis=1)
+        shared = np.bincount(pairs[0], minlength=len(self._active)) > 1
+        self.is_coupled[:] = False
+        self.is_coupled[pairs[1, shared[pairs[0]]]] = True
+
+
+def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
+    """Ties that are bound to wires that give, wire by wire, and along each."""
+    model, tied = plants.model, plants.ties.on_wire
+    piece = model.tie_wire[tied]
+    start, way = model.fixed_start[piece].astype(float), (model.fixed_end - model.fixed_start)[piece].astype(float)
+    length = np.linalg.norm(way, axis=1)
+    axis = way / length[:, None]
+    along = np.clip(((model.tie_anchor[tied] - start) * axis).sum(1), 0.0, length)
+    order = np.lexsort((along, piece))
+    tie, tension = tied[order], model.fixed_tension[piece[order]].astype(float)
+    return {
+        "support": piece[order], "tie": tie, "is_arm": np.zeros(len(tie), bool), "axis": axis[order],
+        "body": model.tie_body[tie].astype(np.int32), "point": model.tie_point[tie].astype(float),
+        "origin": model.tie_anchor[tie].astype(float), "response": np.ones(len(tie)),
+        "compliance": along[order] / tension, "whole": length[order] / tension,
+    }  # fmt: skip
+
+
+def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
+    """Roots of trees that stand on arms that give, arm by arm, and along each."""
+    model = plants.model
+    pieces, tree = np.flatnonzero(model.arm_gives()), np.flatnonzero(model.is_on_arm())
+    body, here = model.tree_first[tree], np.searchsorted(pieces, model.tree_piece[tree])
+    start, way = model.fixed_start[pieces].astype(float), (model.fixed_end - model.fixed_start)[pieces].astype(float)
+    length = np.linalg.norm(way, axis=1)
+    axis = (way / length[:, None])[here]
+    thick, thin = model.fixed_radius[pieces].astype(float).T
+    modulus = model.fixed_shear_modulus[pieces].astype(float)
+    twist, arm = _twist(length, thick, thin, modulus), model.fixed_index[pieces]
+    _, first, number = np.unique(arm, return_index=True, return_inverse=True)
+    before = np.cumsum(twist) - twist
+    before -= before[first][number]  # the pieces of an arm are neighbours
+    along = np.clip(((model.tree_pose[tree, :3] - start[here]) * axis).sum(1), 0.0, length[here])
+    wide = thick[here] + (thin - thick)[here] * along / length[here]
+    compliance = before[here] + _twist(along, thick[here], wide, modulus[here])
+    drawn = frames.log(model.joint_settled[body].astype(float))
+    joint = frames.multiply(model.tree_pose[tree, 3:].astype(float), model.body_rest[body].astype(float))
+    # the torque of a spring acts in the middle axes
+    axis = frames.rotate(frames.conjugate(frames.multiply(joint, frames.exp(0.5 * drawn))), axis)
+    order = np.lexsort((compliance, arm[here]))
+    nodes = {
+        "support": len(model.fixed_start) + arm[here], "tie": np.full(len(tree), -1),
+        "is_arm": np.ones(len(tree), bool), "axis": axis, "body": body.astype(np.int32),
+        "point": np.zeros((len(tree), 3)), "origin": drawn, "response": _tip_response(plants, tree, axis),
+        "compliance": compliance, "whole": np.bincount(number, twist)[number][here],
+    }  # fmt: skip
+    return {name: value[order] for name, value in nodes.items()}
+
+
+def _twist(length: np.ndarray, thick: np.ndarray, thin: np.ndarray, shear_modulus: np.ndarray) -> np.ndarray:
+    """Twist [...] rad/(N m) of round cones: the integral of 2 / (pi G r^4) along them."""
+    squares = thick * thick + thick * thin + thin * thin
+    return 2.0 * length * squares / (3.0 * np.pi * shear_modulus * (thick * thin) ** 3)
+
+
+def _tip_response(plants: ArticulationSolver, tree: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """By how much the point that moves most moves when arms turn the rests of trees [k] about axes [k, 3], wires held
+    [k] m/rad."""
+    if len(tree) == 0:
+        return np.zeros(0)
+    plants.root_rests.turn[tree] = axis
+    _, distance, _ = EquilibriumFinder(plants).residual_motion(tree.astype(np.int32))
+    plants.root_rests.turn[tree] = 0.0
+    return np.maximum(distance.astype(float), 1e-9)
+
+
+def _springs_in_series(
+    compliance: np.ndarray, whole: np.ndarray, is_free: np.ndarray, first: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Stiffness [node] of what is before each node of a support, and [support] behind its last one, 0 where its end
+    ``is_free`` [node]. ``compliance`` [node]: up to the node; ``whole`` [node]: of all of its support; ``first``
+    [support]: its first node."""
+    before = np.append(0.0, compliance[:-1])[: len(compliance)]
+    before[first] = 0.0
+    last = np.append(first[1:], len(compliance))[: len(first)] - 1
+    behind = np.maximum(whole[last] - compliance[last], LEAST_SHARE * whole[last])
+    return 1.0 / np.maximum(compliance - before, LEAST_SHARE * whole), np.where(is_free[last], 0.0, 1.0 / behind)

@@ -1,0 +1,345 @@
+"""The physics of one vineyard and its step: an ordered list of named stages, see :meth:`Physics.step`.
+
+Both solvers predict velocities without the contacts between them, the contacts are solved for both at once, and both
+integrate with the resulting forces. What detaches or falls asleep is decided afterwards, from the new state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vinesim.contact.contact_solver import ContactSolver
+from vinesim.core import frames
+from vinesim.interaction.detachment import Blade, DetachmentMonitor
+from vinesim.interaction.dormant_bunches import DormantBunches
+from vinesim.interaction.hand_grasp import GraspManager
+from vinesim.interaction.support_tracking import SupportTracker
+from vinesim.plants.articulation_solver import ArticulationSolver
+from vinesim.plants.fault_guard import FaultGuard
+from vinesim.plants.level_of_detail import LevelOfDetail
+from vinesim.plants.sleep import SleepMonitor
+from vinesim.plants.validation import warn_of_raised_damping
+from vinesim.rigid.rigid_world import RigidWorld
+from vinesim.scene.model import Model
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.state import State
+from vinesim.scene.values import (
+    Contact,
+    Detachment,
+    HandSample,
+    HumanPose,
+    HumanSpec,
+    RigidVisual,
+    RobotSpec,
+    Snapshot,
+)
+from vinesim.scene.wind import Wind
+from vinesim.wind.plant_wind import WindOnPlants
+from vinesim.wires.deflected_wires import DeflectedWires
+from vinesim.wires.elastic_supports import ElasticSupports
+from vinesim.wires.wire_shapes import WireShapes
+
+LEAST_SHARED_TREES = 16
+"""Threads are woken for a step of so many trees: two groups of eight, 30 us of work. TUNED."""
+
+
+class Physics:
+    """A vineyard that moves: plants, rigid bodies, and the contacts, grasps and detachments between them.
+
+    One thread owns it. Other threads read :class:`Snapshot` and other frozen values.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        parameters: PhysicsParameters = PhysicsParameters(),
+        device: str = "cpu",
+        threads: int = 1,
+        detachment: bool = True,
+    ) -> None:
+        """Args:
+        model: constants of the vineyard.
+        parameters: all numbers of the physics.
+        device: ``"cpu"`` or ``"cuda"``, see :class:`ArticulationSolver`.
+        threads: of the CPU that share the plants, see :class:`ArticulationSolver`.
+        detachment: whether bunches detach when they are pulled too hard.
+        """
+        p = parameters
+        self.model, self.parameters = model, p
+        self.state = State.at_rest(model)
+        self.plants = ArticulationSolver(model, self.state, p, device=device, threads=threads)
+        warn_of_raised_damping(model, p.dt, p.phi)
+        self.rigid = RigidWorld(model, parameters=p)
+        self.elastic_supports = ElasticSupports(self.plants, p)
+        self.wires = DeflectedWires(model, self.elastic_supports, self.state.tree_awake, p.dt)
+        self.wire_shapes = WireShapes(model, self.elastic_supports, self.wires)
+        wires = self.wires if self.wires.gives.any() else None
+        if wires is not None:
+            self.rigid.let_wires_give(wires)
+        self.contact_solver = ContactSolver(model, self.plants, self.rigid, wires)
+        self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
+        self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
+        self.support_tracker = SupportTracker(self.rigid)
+        self.dormant_bunches = DormantBunches(self.plants, self.rigid, self.contact_solver, self.support_tracker)
+        self.level_of_detail = LevelOfDetail(self.plants, p)
+        self.sleep_monitor = SleepMonitor(self.plants, p)
+        self.fault_guard = FaultGuard(self.plants)
+        self.wind: Wind | None = None
+        """The wind, None for calm; may be set at any time between steps, and then begins or ends in two seconds."""
+        self.wind_time_offset = 0.0
+        """[s] Time of the wind minus :attr:`time`: makes gusts those of other clients."""
+        self.wind_on_plants = WindOnPlants(self.plants, p)
+        """Which trees feel the wind."""
+        self.detachments: tuple[Detachment, ...] = ()
+        """What left its plant in the last step, or by command before it; sorted by body."""
+        self.remotely_posed = np.zeros(0, np.int32)
+        """[k] Trees that were posed by :meth:`apply_remote_rest`; the reader of snapshots clears it."""
+        self.tick = 0
+        """Number of steps so far."""
+        self._detachment = detachment
+        self._visuals: tuple[tuple[RigidVisual, ...], tuple[RigidVisual, ...], tuple[RigidVisual, ...]] = ((), (), ())
+        self._body_q: np.ndarray | None = None
+        self._kinematics_current = True
+        self.stages = self._ordered_stages()
+        """Name and function of each stage of a step; a name begins with the part that does it."""
+
+    def _ordered_stages(self) -> tuple[tuple[str, Callable[[], object]], ...]:
+        return (
+            ("wind: set the air velocity at trees near actors", self._set_wind),
+            ("grasps: close and open hands, pull held plants", self.grasp_manager.begin_step),
+            ("rigid: predict velocities without plant contacts", self.rigid.predict),
+            ("contacts: wake trees near moving geoms", self.contact_solver.wake_near_trees),
+            ("detail: refine bunches near actors", self._refine_bunches),
+            ("elastic supports: balance wires and arms with awake trees, wake others", self._update_elastic_supports),
+            ("plants: predict velocities without contacts", self.plants.predict),
+            ("contacts: wake trees that others touch, solve all together", self.contact_solver.solve),
+            ("plants: integrate with contact wrenches", self._integrate_plants),
+            ("rigid: integrate with contact forces", self._integrate_rigid),
+            ("wires: follow what presses on them", self._deflect_wires),
+            ("faults: stop trees with invalid rates", self.fault_guard.stop_faulty_trees),
+            ("detachment: detach what broke or was cut", self._detach),
+            ("grasps: place hands on held plants, measure forces", self._end_grasps),
+            ("sleep: put quiet trees to sleep", self._put_to_sleep),
+        )
+
+    def step(self) -> None:
+        """Advance by ``dt``. Commands received before the call act in this step."""
+        if len(self.plants.awake) >= LEAST_SHARED_TREES:
+            self.plants.launch_pool.wake()  # while MuJoCo works
+        for _, stage in self.stages:
+            stage()
+        self.tick += 1
+
+    @property
+    def faults(self) -> dict[str, int]:
+        """How often something was stopped or left out so far, by what it was."""
+        return {
+            "trees_stopped": int(self.fault_guard.count.sum()),
+            "trees_slowed": self.fault_guard.slowed,
+            "robots_stopped": self.rigid.faults,
+            "contacts_dropped": self.contact_solver.dropped_contacts,
+            "geoms_skipped": self.contact_solver.skipped_geoms,
+            "grasps_refused": self.grasp_manager.refused_grasps,
+        }
+
+    # ------------------------------------------------------------------ stages that pass values between parts
+
+    def _set_wind(self) -> None:
+        observers = None
+        if self.wind is not None and (actors := self.rigid.actors):
+            observers = np.array([self.rigid.actor_position(name) for name in actors]), self.parameters.wind_radius
+        self.wind_on_plants.update(self.wind, self.time + self.wind_time_offset, observers)
+
+    def _refine_bunches(self) -> None:
+        coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
+        if len(coarsened):  # those that sleep collide with other shapes now
+            self.contact_solver.update_tree_bounds(coarsened)
+
+    def _update_elastic_supports(self) -> None:
+        if self.elastic_supports.count:
+            self.update_kinematics()
+            self.elastic_supports.update()
+
+    def _integrate_plants(self) -> None:
+        self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
+        if len(self.plants.awake):
+            self._body_q, self._kinematics_current = None, False
+
+    def _integrate_rigid(self) -> None:
+        self.rigid.integrate(self.contact_solver.rigid_force)
+
+    def _deflect_wires(self) -> None:
+        self.contact_solver.report_wires()
+        self.wires.end_step(self.rigid.mj_data.tree_asleep)
+
+    def _detach(self) -> None:
+        self.detachments = self.detachment_monitor.update(check_load=self._detachment)
+        if self.detachments:
+            self._body_q = None
+
+    def _end_grasps(self) -> None:
+        self.grasp_manager.end_step(self.detachments)
+        self.detachment_monitor.hand_contacts = self.grasp_manager.contacts
+
+    def _put_to_sleep(self) -> None:
+        if self.parameters.sleep and self.sleep_monitor.watch():
+            keep_awake = self.contact_solver.remote_trees.copy()
+            keep_awake[self.contact_solver.near_trees] = True
+            keep_awake[self.model.body_tree[self.plants.held_bodies]] = True
+            self.sleep_monitor.check(keep_awake, self.contact_solver.contact_pairs, self.elastic_supports.is_coupled)
+
+    # ------------------------------------------------------------------ results of a step
+
+    @property
+    def dt(self) -> float:
+        """[s] Duration of a step; fixed, see :class:`PhysicsParameters`."""
+        return self.parameters.dt
+
+    @property
+    def time(self) -> float:
+        """[s] since the start."""
+        return self.tick * self.dt
+
+    @property
+    def contacts(self) -> tuple[Contact, ...]:
+        """Contacts with plants in the last step, sorted by (tree, body, shape, geom), then hands that held a plant."""
+        return self.contact_solver.contacts + self.grasp_manager.contacts
+
+    @property
+    def touched(self) -> tuple[tuple[int, str], ...]:
+        """(tree, actor) for every tree that was pressed or held in the last step, sorted."""
+        if not self.grasp_manager.contacts:
+            return self.contact_solver.touched_trees
+        held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.grasp_manager.contacts)
+        return tuple(sorted({*self.contact_solver.touched_trees, *held}))
+
+    def update_kinematics(self) -> None:
+        """Bring ``state.body_q`` from the start of the last step to its end."""
+        if not self._kinematics_current:
+            self.plants.forward_kinematics()
+            self._kinematics_current = True
+
+    def wake(self, trees: np.ndarray) -> None:
+        """Wake trees [k] whose joints were written from outside, between steps, and bring their poses up to date.
+
+        :class:`ValueError` if there is no such tree.
+        """
+        self.sleep_monitor.wake(trees)
+        self.plants.forward_kinematics(trees)
+        self._body_q = None
+
+    def snapshot(self) -> Snapshot:
+        """The world after the last step. While no tree is awake, snapshots share one array of plant poses."""
+        if self._body_q is None:
+            self.update_kinematics()
+            self._body_q = self.state.body_q.copy()
+        return Snapshot(
+            time=self.time,
+            tick=self.tick,
+            body_q=self._body_q,
+            bunch_attached=self.state.bunch_attached.copy(),
+            visuals=self.visuals(),
+            visual_q=self.visual_q(),
+            moved_trees=np.union1d(self.plants.awake, self.remotely_posed),
+            wind=self.wind_on_plants.state,
+            wires=self.wire_shapes.poses(),
+        )
+
+    def visuals(self) -> tuple[RigidVisual, ...]:
+        """All rigid bodies and dormant bunches that have a shape; the same tuple until one is added or removed."""
+        rigid, dormant = self.rigid.visuals(), self.dormant_bunches.visuals()
+        if self._visuals[0] is not rigid or self._visuals[1] is not dormant:
+            self._visuals = rigid, dormant, rigid + dormant
+        return self._visuals[2]
+
+    def visual_q(self) -> np.ndarray:
+        """World poses [visual, 7] of :meth:`visuals`."""
+        rigid = self.rigid.visual_q()
+        return np.concatenate([rigid, self.dormant_bunches.visual_q()]) if len(self.dormant_bunches) else rigid
+
+    # ------------------------------------------------------------------ actors
+
+    def add_robot(self, spec: RobotSpec) -> None:
+        """See :meth:`RigidWorld.add_robot`."""
+        self.rigid.add_robot(spec)
+
+    def remove_robot(self, name: str) -> None:
+        """See :meth:`RigidWorld.remove_robot`; its blades go with it."""
+        self.rigid.remove_robot(name)
+        self._remove_blades_of(name)
+
+    def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
+        """See :meth:`RigidWorld.add_human`; a remote one touches only trees whose state its own client sends."""
+        self.rigid.add_human(spec, is_remote=is_remote)
+        if is_remote:
+            self.contact_solver.remote_actors.add(spec.name)
+
+    def remove_human(self, name: str) -> None:
+        """See :meth:`RigidWorld.remove_human`; what the hands held is released, and its blades go with it."""
+        self.rigid.remove_human(name)
+        self._remove_blades_of(name)
+        self.grasp_manager.remove_ties_of(name)
+        self.contact_solver.remote_actors.discard(name)
+
+    def move_human(self, name: str, pose: HumanPose) -> None:
+        """Set where a person's tracked points are at the end of the coming step, and which hands are closed."""
+        self.rigid.move_human(name, pose)
+
+    def hand(self, name: str, side: str) -> HandSample:
+        """A person's ``"left"`` or ``"right"`` hand after the last step."""
+        return self.rigid.hand_sample(name, side)
+
+    # ------------------------------------------------------------------ detachment
+
+    def pick(self, bunch: int) -> None:
+        """Take a bunch off its vine, between steps; see :meth:`DetachmentMonitor.pick`."""
+        self.detachment_monitor.pick(bunch)
+        self._body_q = None
+
+    def cut(self, body: int) -> None:
+        """Cut a piece of wood off its vine, between steps; see :meth:`DetachmentMonitor.cut`."""
+        self.detachment_monitor.cut(body)
+        self._body_q = None
+
+    def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Apply that another client has picked a bunch; see :meth:`DetachmentMonitor.apply_remote_pick`."""
+        self.detachment_monitor.apply_remote_pick(bunch, pose, velocity)
+        self._body_q = None
+
+    def apply_remote_cut(self, body: int) -> None:
+        """Apply that another client has cut a piece of wood off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
+        self.detachment_monitor.apply_remote_cut(body)
+        self._body_q = None
+
+    def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
+        """Apply in which pose trees rest at their owner, without waking them: ``joint_q`` [body of the tree, 4]
+        each. Of a tree that is named several times the last pose counts."""
+        for tree, rotations in zip(trees, joint_q, strict=True):
+            self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(rotations, np.float32))
+        resting = np.unique(trees).astype(np.int32)
+        self.plants.put_to_sleep(resting)
+        self.contact_solver.update_tree_bounds(resting)
+        self.elastic_supports.place(resting)
+        self.wires.let_go(resting)
+        self.remotely_posed = np.union1d(self.remotely_posed, trees).astype(np.int32)
+        self._body_q = None
+
+    def set_detail_focus(self, points: np.ndarray, radius: float) -> None:
+        """Refine the bunches within ``radius`` [m] of ``points`` [k, 3]; see :meth:`LevelOfDetail.set_focus`."""
+        self.level_of_detail.set_focus(points, radius)
+
+    def add_blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
+        """Give a link of an actor a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
+
+        x runs along the blades, y from one to the other. :meth:`Blade.close` cuts what passes through the mouth.
+        """
+        self.rigid.link_pose(actor, link)  # raises an error if there is no such link
+        blade = Blade(actor, link, np.asarray(pose, float), np.asarray(half, float))
+        self.detachment_monitor.blades.append(blade)
+        return blade
+
+    def _remove_blades_of(self, actor: str) -> None:
+        self.detachment_monitor.blades = [blade for blade in self.detachment_monitor.blades if blade.actor != actor]
